@@ -1,0 +1,38 @@
+# Install what is pinned, once, and run the everyday commands. `make help` lists them.
+
+# Any Python that is new enough: make run PYTHON=python3.12
+PYTHON ?= python3
+# Passed on to kedro or pytest: make run ARGS=--env=smoke
+ARGS ?=
+
+.DEFAULT_GOAL := help
+.PHONY: run test check help
+
+run: .venv/.package  ## train and evaluate the augmentation grid, write its tables and figures
+	.venv/bin/kedro run --pipeline=augmentation $(ARGS)
+
+test: .venv/.package  ## run the tests
+	.venv/bin/python -m pytest $(ARGS)
+
+check: .venv/.package  ## lint, formatting and types
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/mypy src
+
+help:  ## list the targets
+	@sed -n 's/^\([a-z]*\):.*## /make \1\t/p' Makefile
+
+# The stamps are written last: an interrupted installation has none, and is started anew.
+.venv/.requirements: requirements.lock
+	@$(PYTHON) -c 'import sys; sys.version_info >= (3, 11) or sys.exit("Python 3.11 or newer is \
+	needed, and $(PYTHON) is " + sys.version.split()[0] + ". Name another: PYTHON=python3.12")'
+	@echo "Installing the pinned requirements into .venv; this takes some minutes, once."
+	$(PYTHON) -m venv --clear .venv
+	.venv/bin/python -m pip install --disable-pip-version-check -r requirements.lock
+	@touch $@
+
+# The build backend comes from the lock as well, so that nothing else is fetched.
+.venv/.package: .venv/.requirements pyproject.toml
+	.venv/bin/python -m pip install --disable-pip-version-check --quiet \
+	    --no-deps --no-build-isolation --editable .
+	@touch $@

@@ -1,0 +1,10 @@
+"""Rapid gyroscope calibration, from raw logs to tracked trainings to tables and figures."""
+
+import os
+
+__version__ = "0.1.0"
+
+# MLflow reads these when it is first imported: runs send nothing over the network, and MLflow's
+# own progress stays out of theirs.
+os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")

@@ -1,0 +1,53 @@
+"""Names, dimensions and units, said once.
+
+Angular rates and biases are in deg/s everywhere inside the package; other units appear only
+where a person reads or types them, and the name then says so (``noise_mdps_rts``, ``window_s``).
+
+Recordings are :class:`xarray.Dataset` objects with
+
+* ``angular_rate`` (imu, recording, axis, sample), float32, deg/s;
+* ``true_bias`` (imu, recording, axis), float64, deg/s, on simulated data only;
+* ``given_split`` (recording), ``"train"`` or ``"test"``, where the source came split;
+* attributes ``sensor``, ``source``, ``simulated`` (0 or 1), ``rate_hz`` and ``data_hash``.
+
+A recording that one IMU lacks is NaN as a whole for that IMU; no other NaN is allowed.
+"""
+
+from dataclasses import dataclass
+
+AXES = ("x", "y", "z")
+DIMENSIONS = ("imu", "recording", "axis", "sample")
+
+MDPS = 1e-3
+"""deg/s in one mdps."""
+
+HOLD_OUT = -1
+"""The ``fold`` of a run on the fixed hold-out split."""
+
+TRAIN, VALIDATION, TEST = "train", "validation", "test"
+"""The roles a recording can have. It has exactly one of them in each fold."""
+
+TEST_IMU = 1
+"""All published results are on the three gyroscopes of IMU 1 (paper, section IV-B)."""
+
+PAPER, DISJOINT, TRUE = "paper", "disjoint", "true"
+"""The truths an estimate is judged against: (a) mean of the whole recording, (b) mean of the
+samples outside the window, (c) the drawn bias of simulated data."""
+
+
+FIRST, ALL = "first", "all"
+"""Test windows: the first of each recording (the paper's way), or all non-overlapping ones."""
+
+LAST, BEST = "last", "best"
+"""Weights at the last epoch (the paper's way), or at the best validation epoch."""
+
+
+class InputError(ValueError):
+    """Input that cannot be used; the message says what, where, and what to do."""
+
+
+@dataclass(frozen=True)
+class Missing:
+    """In place of a result: what it could not be made from."""
+
+    reasons: tuple[str, ...]

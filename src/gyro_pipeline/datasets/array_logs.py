@@ -1,0 +1,295 @@
+"""Logs in the array layout of the published authors' files."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from itertools import permutations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from kedro.io import AbstractDataset, DatasetError
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from gyro_pipeline.conventions import AXES, DIMENSIONS, InputError
+from gyro_pipeline.parameters import Sensor
+
+LAYOUT = ("recording", "gyroscope", "sample")
+"""What the three axes of a file are, in the order in which the published files have them."""
+
+WHOLE = "all"
+"""The key of a file whose recordings are not split into train and test."""
+
+_DOMINANCE = 4
+"""So many times more samples than recordings or gyroscopes tell the sample axis from the others."""
+
+Order = tuple[str, ...]
+
+
+class ArrayLogs(AbstractDataset[xr.Dataset, xr.Dataset]):
+    """Reads 3-D ``.npy`` files of recordings, gyroscopes and samples, in any axis order, deg/s.
+
+    Gyroscopes come three to an IMU, IMU by IMU, in the order x, y, z. Counts are read from the
+    files, never required. An IMU that only one of the two files holds is NaN in the recordings
+    of the other one.
+
+    Args:
+        sensor: Name of the sensor the files are of.
+        sensors: All sensors, as in ``conf/base/globals.yml``.
+        source: Where the logs come from, as stored paths name it.
+        path: Folder of the files.
+        files: Names of the files: ``{"train": name, "test": name}``, or ``{"all": name}``.
+        axes_order: ``recording``, ``gyroscope`` and ``sample`` in the order of the files'
+            axes; needed only where their shapes leave it open.
+        metadata: For other tools, such as Kedro-Viz.
+
+    Raises:
+        InputError: An unknown sensor, or an entry that is not as described here.
+    """
+
+    def __init__(
+        self,
+        sensor: str,
+        sensors: Mapping[str, Mapping[str, Any]],
+        source: str,
+        path: str,
+        files: Mapping[str, str],
+        axes_order: Sequence[str] | None = None,
+        metadata: dict[str, Any] | None = None,
+    ) -> None:
+        self.entry = sensor_entry(sensor, sensors)
+        _check_entry(sensor, files, axes_order)
+        self._sensor = sensor
+        self._source = source
+        self._path = Path(path)
+        self._files = {split: files[split] for split in ("train", "test", WHOLE) if split in files}
+        self._axes_order = None if axes_order is None else tuple(axes_order)
+        self.metadata = metadata
+
+    def load(self) -> xr.Dataset:
+        """Read all files into one set of labelled recordings.
+
+        Returns:
+            ``angular_rate`` as :mod:`gyro_pipeline.conventions` describes it; recordings of the
+            train file come first and those of the test file are numbered on.
+
+        Raises:
+            InputError: As the cause of Kedro's ``DatasetError``, a file that cannot be used.
+        """
+        arrays = {name: self._open(name) for name in self._files.values()}
+        shapes = {name: array.shape for name, array in arrays.items()}
+        order = self._order(shapes)
+        parts = [_by_imu(array, order) for array in arrays.values()]
+        if len({part.shape[-1] for part in parts}) > 1:
+            raise InputError(
+                f"{self._sensor} {self._path}: expected as many samples in the test file as in the "
+                f"train file, got {' and '.join(_shapes(shapes))}; cut the longer one"
+            )
+        rates = _merged(parts)
+        self._check_values(rates, [part.shape[:2] for part in parts])
+        return self._labelled(rates, [part.shape[1] for part in parts])
+
+    def save(self, data: xr.Dataset) -> None:
+        """Refuse: logs are read only."""
+        raise DatasetError(f"{self._sensor}: logs are read only, {self._path} is not written to")
+
+    def _exists(self) -> bool:
+        return all((self._path / name).is_file() for name in self._files.values())
+
+    def _describe(self) -> dict[str, Any]:
+        return {
+            "sensor": self._sensor,
+            "source": self._source,
+            "path": str(self._path),
+            "files": self._files,
+            "axes_order": self._axes_order,
+        }
+
+    def _open(self, name: str) -> NDArray[Any]:
+        """Map one file, refusing what is not three axes of real numbers."""
+        where = f"{self._sensor} {name}"
+        if not (self._path / name).is_file():
+            raise InputError(
+                f"{where}: no such file in {self._path}; put it there, or choose another source"
+            )
+        try:
+            # reads the header only, and unlike numpy.load can never unpickle
+            array: NDArray[Any] = np.lib.format.open_memmap(self._path / name, mode="r")
+        except Exception as error:  # a damaged header fails in many ways
+            raise InputError(
+                f"{where}: expected a plain numeric .npy file as numpy.save writes it, but: "
+                f"{error}. It is truncated, of another format, or holds pickled objects, which are "
+                f"never loaded; replace or delete {self._path / name}"
+            ) from error
+        if array.dtype.kind not in "iuf":
+            raise InputError(f"{where}: expected real numbers in deg/s, got dtype {array.dtype}")
+        if array.ndim != len(LAYOUT):
+            raise InputError(
+                f"{where}: expected 3 axes (recordings, gyroscopes, samples in any order), got "
+                f"shape {array.shape}"
+            )
+        if array.size == 0:
+            raise InputError(f"{where}: expected recordings, got none: shape {array.shape}")
+        return array
+
+    def _order(self, shapes: Mapping[str, tuple[int, ...]]) -> Order:
+        """Tell which axis is which, from the shapes where they allow only one answer."""
+        candidates = [
+            order
+            for order in permutations(LAYOUT)
+            if all(_plausible(order, shape) for shape in shapes.values())
+        ]
+        given = self._axes_order
+        if len(candidates) == 1 and given in (None, candidates[0]):
+            return candidates[0]
+        if given is None:
+            problem = f"cannot tell which axis is which; add axes_order: {_listed(LAYOUT)}, sorted"
+            problem += " as the axes of the file are, to the catalog entry"
+        elif len(candidates) == 1:
+            problem = f"axes_order says {_listed(given)}, the shape something else; correct it"
+        elif not all(_in_threes(given, shape) for shape in shapes.values()):
+            problem = f"axes_order says {_listed(given)}, which makes gyroscopes not divisible by 3"
+        else:
+            return given
+        files = ", ".join(_shapes(shapes))
+        found = " or ".join(_listed(order) for order in candidates) or "none"
+        raise InputError(
+            f"{self._sensor} {files}: {problem}. Orders with gyroscopes divisible by 3 and at "
+            f"least {_DOMINANCE} times more samples than recordings or gyroscopes: {found}"
+        )
+
+    def _check_values(self, rates: NDArray[np.float32], counts: Sequence[tuple[int, ...]]) -> None:
+        """Refuse recordings with NaN or infinity, or with an axis that never changes."""
+        first = 0
+        for name, (imus, recordings) in zip(self._files.values(), counts, strict=True):
+            part = rates[:imus, first : first + recordings]
+            low, high = part.min(axis=-1), part.max(axis=-1)  # NaN and infinity show up in these
+            for problem, found in (
+                ("NaN or infinite samples", ~np.isfinite(low) | ~np.isfinite(high)),
+                ("zero variance, all samples are the same", low == high),
+            ):
+                if found.any():
+                    imu, recording, axis = np.argwhere(found)[0]
+                    raise InputError(
+                        f"{self._sensor} {name} recording {recording + 1}, IMU {imu + 1}, axis "
+                        f"{AXES[axis]}: {problem}; remove this recording from the file (affected "
+                        f"recordings: {_numbers(found.any(axis=(0, 2)))})"
+                    )
+            first += recordings
+
+    def _labelled(self, rates: NDArray[np.float32], counts: Sequence[int]) -> xr.Dataset:
+        """Name the dimensions and say where the recordings come from."""
+        imus, recordings = rates.shape[:2]
+        coordinates: dict[str, Any] = {
+            "imu": np.arange(1, imus + 1),
+            "recording": np.arange(1, recordings + 1),
+            "axis": list(AXES),
+        }
+        if WHOLE not in self._files:
+            coordinates["given_split"] = ("recording", np.repeat(list(self._files), counts))
+        logs = xr.Dataset(
+            {"angular_rate": (DIMENSIONS, rates, {"units": "deg/s"})}, coords=coordinates
+        )
+        logs.attrs = {
+            "sensor": self._sensor,
+            "source": self._source,
+            "simulated": 0,
+            "rate_hz": self.entry.rate_hz,
+        }
+        return logs.assign_attrs(data_hash=_data_hash(logs))
+
+
+def sensor_entry(sensor: str, sensors: Mapping[str, Mapping[str, Any]]) -> Sensor:
+    """Look up a sensor and check its entry.
+
+    Args:
+        sensor: Its name.
+        sensors: All sensors, as in ``conf/base/globals.yml``.
+
+    Returns:
+        The typed entry.
+
+    Raises:
+        InputError: No such sensor, or its entry is not usable.
+    """
+    if sensor not in sensors:
+        raise InputError(
+            f"unknown sensor {sensor!r}; conf/base/globals.yml knows {', '.join(sensors)}"
+        )
+    try:
+        return Sensor.model_validate(sensors[sensor])
+    except ValidationError as error:
+        raise InputError(f"sensor {sensor} in conf/base/globals.yml: {error}") from error
+
+
+def _check_entry(sensor: str, files: Mapping[str, str], axes_order: Sequence[str] | None) -> None:
+    if set(files) not in ({"train", "test"}, {WHOLE}):
+        raise InputError(f"{sensor}: files: expected train and test, or all, got {sorted(files)}")
+    if len(set(files.values())) < len(files):
+        raise InputError(
+            f"{sensor}: files: train and test name the same file, {files['train']}; recordings "
+            "to test on must be others than those trained on. Name it all to have it split"
+        )
+    if axes_order is not None and sorted(axes_order) != sorted(LAYOUT):
+        raise InputError(
+            f"{sensor}: axes_order: expected {', '.join(LAYOUT)} in the order of the file's "
+            f"axes, got {list(axes_order)}"
+        )
+
+
+def _plausible(order: Order, shape: tuple[int, ...]) -> bool:
+    size = dict(zip(order, shape, strict=True))
+    others = max(size["recording"], size["gyroscope"])
+    return _in_threes(order, shape) and size["sample"] >= _DOMINANCE * others
+
+
+def _in_threes(order: Order, shape: tuple[int, ...]) -> bool:
+    return shape[order.index("gyroscope")] % len(AXES) == 0
+
+
+def _by_imu(array: NDArray[Any], order: Order) -> NDArray[Any]:
+    """View a file as (imu, recording, axis, sample)."""
+    recordings_first = array.transpose([order.index(name) for name in LAYOUT])
+    recordings, gyroscopes, samples = recordings_first.shape
+    imus = gyroscopes // len(AXES)
+    split = recordings_first.reshape(recordings, imus, len(AXES), samples)
+    return split.swapaxes(0, 1)
+
+
+def _merged(parts: Sequence[NDArray[Any]]) -> NDArray[np.float32]:
+    """Put parts one after the other along the recordings; IMUs that a part lacks are NaN."""
+    imus = max(part.shape[0] for part in parts)
+    recordings = sum(part.shape[1] for part in parts)
+    rates = np.full((imus, recordings, *parts[0].shape[2:]), np.nan, dtype=np.float32)
+    first = 0
+    with np.errstate(over="ignore"):  # becomes infinite, and is refused as such
+        for part in parts:
+            rates[: part.shape[0], first : first + part.shape[1]] = part
+            first += part.shape[1]
+    return rates
+
+
+def _data_hash(logs: xr.Dataset) -> str:
+    """SHA-256 of the samples and of all that says what they are."""
+    labels: dict[str, Any] = {
+        str(name): label.values.tolist() for name, label in logs.coords.items()
+    }
+    labels |= {"shape": logs.angular_rate.shape, "rate_hz": logs.attrs["rate_hz"]}
+    labels |= {"sensor": logs.attrs["sensor"]}
+    digest = hashlib.sha256(json.dumps(labels, sort_keys=True).encode())
+    digest.update(np.ascontiguousarray(logs.angular_rate.values).data)
+    return digest.hexdigest()
+
+
+def _shapes(shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
+    return [f"{name} of shape {shape}" for name, shape in shapes.items()]
+
+
+def _listed(order: Order) -> str:
+    return f"[{', '.join(order)}]"
+
+
+def _numbers(found: NDArray[np.bool_]) -> str:
+    return ", ".join(str(number) for number in np.flatnonzero(found) + 1)

@@ -1,0 +1,203 @@
+"""The stand-in for sensors whose logs are not at hand."""
+
+import json
+import logging
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from kedro.io import AbstractDataset, DatasetError
+from numpy.typing import NDArray
+
+from gyro_pipeline.conventions import AXES, MDPS, InputError
+from gyro_pipeline.datasets.array_logs import LAYOUT, ArrayLogs
+from gyro_pipeline.datasets.atomic import replacing
+from gyro_pipeline.datasets.recordings import Recordings
+from gyro_pipeline.parameters import Sensor
+from gyro_pipeline.physics.noise import simulate_noise
+
+_LOG = logging.getLogger(__name__)
+
+
+class SimulatedLogs(AbstractDataset[xr.Dataset, xr.Dataset]):
+    """Writes simulated logs once, in the published layout, and reads them as any such files.
+
+    Each gyroscope has a unit bias, uniform in plus or minus ``unit_bias_dps``; each power-on adds
+    a normal deviation with the turn-on spread; samples are that bias plus noise. What was drawn
+    is kept beside the logs and read with them.
+
+    Args:
+        sensor: Name of the sensor to stand in for.
+        sensors: All sensors, as in ``conf/base/globals.yml``.
+        source: Where the logs come from, as stored paths name it.
+        path: Folder of the files.
+        seed: Of all draws, together with the sensor's name; 0 or more.
+        metadata: For other tools, such as Kedro-Viz.
+
+    Raises:
+        InputError: An unknown sensor, or an entry that is not usable.
+    """
+
+    def __init__(
+        self,
+        sensor: str,
+        sensors: Mapping[str, Mapping[str, Any]],
+        source: str,
+        path: str,
+        seed: int,
+        metadata: dict[str, Any] | None = None,
+    ) -> None:
+        files = {split: f"{sensor}_{split}.npy" for split in ("train", "test")}
+        self._arrays = ArrayLogs(sensor, sensors, source, path, files, axes_order=LAYOUT)
+        self._sensor = sensor
+        self._source = source
+        self._seed = seed
+        self._train, self._test = (Path(path) / name for name in files.values())
+        self._truth = Path(path) / f"{sensor}_truth.nc"
+        self.metadata = metadata
+
+    def load(self) -> xr.Dataset:
+        """Read the logs, writing them first where they are missing or of other settings.
+
+        Returns:
+            Recordings as :mod:`gyro_pipeline.conventions` describes them, and what was drawn, in
+            deg/s: ``true_bias`` (imu, recording, axis), ``true_unit_bias`` (imu, axis),
+            ``true_turn_on_spread`` (axis), and ``true_noise`` (axis), N in deg/s * sqrt(s).
+
+        Raises:
+            InputError: As the cause of Kedro's ``DatasetError``, files that cannot be written, or
+                that were damaged since.
+        """
+        found = self._settings_on_disk()
+        if found != self._settings():
+            why = "" if found is None else " anew, since their settings have changed"
+            _LOG.info("writing simulated %s logs%s: %s", self._sensor, why, self._train.parent)
+            self._write()
+        truth = Recordings(str(self._truth)).load().load()
+        logs = self._arrays.load()
+        if truth.attrs["data_hash"] != logs.attrs["data_hash"]:
+            raise InputError(
+                f"simulated {self._sensor}: {self._train.name} or {self._test.name} has changed "
+                f"since it was written, so {self._truth} is not its truth; delete that file and "
+                "run again. Logs of your own belong to another source"
+            )
+        return logs.assign(truth.data_vars).assign_attrs(simulated=1)
+
+    def save(self, data: xr.Dataset) -> None:
+        """Refuse: logs are read only."""
+        raise DatasetError(f"{self._sensor}: logs are read only, nothing is written to them")
+
+    def _exists(self) -> bool:
+        return self._truth.is_file() and self._arrays.exists()
+
+    def _describe(self) -> dict[str, Any]:
+        return {
+            "sensor": self._sensor,
+            "source": self._source,
+            "path": str(self._train.parent),
+            "seed": self._seed,
+        }
+
+    def _settings(self) -> str:
+        """All that the files depend on."""
+        entry = self._arrays.entry.model_dump(mode="json", exclude={"datasheet"})
+        return json.dumps({**entry, "seed": self._seed}, sort_keys=True)
+
+    def _settings_on_disk(self) -> str | None:
+        """What the files were written with; None where they are not complete."""
+        if not self._exists():
+            return None
+        try:
+            with Recordings(str(self._truth)).load() as truth:
+                return truth.attrs.get("settings")
+        except DatasetError:  # damaged: as good as not written
+            return None
+
+    def _write(self) -> None:
+        """Write the logs, then what was drawn, which marks them as complete."""
+        name = zlib.crc32(self._sensor.encode())  # sensors with one seed get different draws
+        generator = np.random.default_rng(np.random.SeedSequence([self._seed, name]))
+        truth = draw_biases(generator, self._arrays.entry)
+        with replacing(self._train) as train, replacing(self._test) as test:
+            write_logs(generator, self._arrays.entry, truth.true_bias.values, train, test)
+            # from here on the old mark would vouch for the new arrays
+            self._truth.unlink(missing_ok=True)
+        data_hash = self._arrays.load().attrs["data_hash"]
+        truth.attrs = {"settings": self._settings(), "data_hash": data_hash}
+        Recordings(str(self._truth)).save(truth)
+
+
+def draw_biases(generator: np.random.Generator, entry: Sensor) -> xr.Dataset:
+    """Draw the bias of every gyroscope at every power-on.
+
+    Args:
+        generator: Source of randomness.
+        entry: The sensor.
+
+    Returns:
+        ``true_bias``, ``true_unit_bias``, ``true_turn_on_spread`` and ``true_noise``, as
+        :meth:`SimulatedLogs.load` describes them.
+    """
+    model = entry.simulated
+    spread = np.array(model.turn_on_spread_mdps) * MDPS
+    limit = model.unit_bias_dps
+    unit_bias = generator.uniform(-limit, limit, (entry.imus, len(AXES)))
+    turn_on = generator.normal(0, spread, (entry.imus, entry.recordings, len(AXES)))
+    return xr.Dataset(
+        {
+            "true_bias": (("imu", "recording", "axis"), unit_bias[:, None] + turn_on),
+            "true_unit_bias": (("imu", "axis"), unit_bias),
+            "true_turn_on_spread": ("axis", spread),
+            "true_noise": ("axis", np.array(model.noise_mdps_rts) * MDPS),
+            "true_flicker": model.flicker_mdps * MDPS,
+        },
+        coords={
+            "imu": np.arange(1, entry.imus + 1),
+            "recording": np.arange(1, entry.recordings + 1),
+            "axis": list(AXES),
+        },
+    )
+
+
+def write_logs(
+    generator: np.random.Generator,
+    entry: Sensor,
+    bias: NDArray[np.float64],
+    train: Path,
+    test: Path,
+) -> None:
+    """Write the samples of all gyroscopes, one gyroscope in memory at a time.
+
+    Args:
+        generator: Source of randomness.
+        entry: The sensor.
+        bias: (imu, recording, axis), deg/s.
+        train: File for the first ``entry.train_recordings`` recordings.
+        test: File for the other recordings.
+    """
+    cut = entry.train_recordings
+    train_array = _new_array(train, cut, entry)
+    test_array = _new_array(test, entry.recordings - cut, entry)
+    model = entry.simulated
+    for gyroscope in range(entry.imus * len(AXES)):
+        imu, axis = divmod(gyroscope, len(AXES))
+        noise = simulate_noise(
+            generator,
+            (entry.recordings, entry.samples),
+            entry.rate_hz,
+            model.noise_mdps_rts[axis] * MDPS,
+            lag1_correlation=model.lag1_correlation,
+            flicker_dps=model.flicker_mdps * MDPS,
+        )
+        rates = bias[imu, :, axis, None] + noise
+        train_array[:, gyroscope], test_array[:, gyroscope] = rates[:cut], rates[cut:]
+    train_array.flush()
+    test_array.flush()
+
+
+def _new_array(path: Path, recordings: int, entry: Sensor) -> np.memmap[Any, np.dtype[Any]]:
+    shape = (recordings, entry.imus * len(AXES), entry.samples)
+    return np.lib.format.open_memmap(path, mode="w+", dtype=np.float32, shape=shape)

@@ -1,0 +1,53 @@
+"""Tables as CSV files."""
+
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from kedro.io import AbstractDataset
+from kedro_datasets._typing import TablePreview
+
+from gyro_pipeline.datasets.atomic import replacing
+
+
+class Table(AbstractDataset[pd.DataFrame, pd.DataFrame]):
+    """Keeps a table as CSV, without its index; numbers come back exactly as they were.
+
+    Args:
+        filepath: The CSV file.
+        metadata: For other tools, such as Kedro-Viz.
+    """
+
+    def __init__(self, filepath: str, metadata: dict[str, Any] | None = None) -> None:
+        self._filepath = Path(filepath)
+        self.metadata = metadata
+
+    def load(self) -> pd.DataFrame:
+        """Read the table; an empty cell is a missing value, and nothing else is."""
+        return pd.read_csv(self._filepath, keep_default_na=False, na_values=[""])
+
+    def save(self, data: pd.DataFrame) -> None:
+        """Write the table.
+
+        Args:
+            data: Its columns are stored, its index is not.
+        """
+        with replacing(self._filepath) as temporary:
+            data.to_csv(temporary, index=False)
+
+    def preview(self, nrows: int = 40) -> TablePreview:
+        """Show the first rows in Kedro-Viz.
+
+        Args:
+            nrows: How many.
+
+        Returns:
+            Columns and rows as Kedro-Viz takes them.
+        """
+        return TablePreview(self.load().head(nrows).to_dict(orient="split"))
+
+    def _exists(self) -> bool:
+        return self._filepath.is_file()
+
+    def _describe(self) -> dict[str, Any]:
+        return {"filepath": str(self._filepath)}

@@ -1,0 +1,265 @@
+"""Runs in an MLflow store as catalog datasets."""
+
+import json
+import os
+import sqlite3
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Mapping
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import psutil
+from kedro.io import AbstractDataset
+from mlflow import MlflowClient
+from mlflow.entities import Metric, Param, Run, RunStatus, RunTag, ViewType
+from mlflow.exceptions import MlflowException
+
+from gyro_pipeline.conventions import InputError
+from gyro_pipeline.tracking import EvaluatedRun, StoredRun, TrainedRun
+
+_TRAINED = "trained"
+"""Tag, set last: the run holds all that its training made. Without it, a run is unfinished."""
+
+_OWNER = "process"
+"""Tag: the process that writes a run, as ``pid started``."""
+
+# One bar for each small artifact would bury everything else on a terminal.
+os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+
+_CURVE_POINTS = 50
+_LOG_BATCH = 1000  # most metrics that one call takes
+
+
+class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
+    """Trained runs of one study, or of all, narrowed to a sensor and a source.
+
+    Loading returns the trained runs, newest first, and ends what dead processes left half
+    written as KILLED. Saving takes one run at a time: a :class:`TrainedRun` becomes a run that
+    waits for its evaluation, an :class:`EvaluatedRun` completes it and sets it FINISHED.
+    """
+
+    def __init__(
+        self,
+        path: str,
+        source: str,
+        sensor: str | None = None,
+        study: str | None = None,
+        metadata: dict[str, Any] | None = None,
+    ) -> None:
+        """Describe a part of the store.
+
+        Args:
+            path: SQLite file of the store; ``MLFLOW_TRACKING_URI`` wins where set.
+            source: Only runs on logs from there.
+            sensor: Only runs on this sensor; None for all.
+            study: Only runs of this study, which is the MLflow experiment; None for all.
+            metadata: For Kedro plugins.
+        """
+        self._path = Path(path)
+        self._only = {"source": source} | ({"sensor": sensor} if sensor else {})
+        self._study = study
+        self.metadata = metadata
+        self.provenance: dict[str, str] = {}
+        """Tags that every new run gets; set once per ``kedro run``."""
+
+    def load(self) -> list[StoredRun]:
+        """Trained runs, newest first.
+
+        Raises:
+            InputError: If the store is damaged or is no MLflow store.
+        """
+        experiments = {e.experiment_id: e.name for e in self._experiments()}
+        if not experiments:
+            return []
+        wanted = " and ".join(f"params.{key} = '{value}'" for key, value in self._only.items())
+        stored = []
+        for run in _pages(partial(self._client.search_runs, list(experiments), wanted)):
+            if run.info.status == RunStatus.to_string(RunStatus.RUNNING):
+                alive = _is_alive(run.data.tags.get(_OWNER, ""))
+                if _TRAINED not in run.data.tags and not alive:
+                    self._client.set_terminated(run.info.run_id, "KILLED")
+            if _TRAINED in run.data.tags:
+                stored.append(self._stored(run, experiments[run.info.experiment_id]))
+        return sorted(stored, key=lambda run: run.started_ms, reverse=True)
+
+    def save(self, data: TrainedRun | EvaluatedRun) -> None:
+        """Add a trained run, or complete an evaluated one."""
+        if isinstance(data, TrainedRun):
+            self._save_trained(data)
+        else:
+            self._save_evaluated(data)
+
+    @cached_property
+    def _client(self) -> MlflowClient:
+        uri = os.environ.get("MLFLOW_TRACKING_URI")
+        if not uri:
+            _check_store(self._path)
+            uri = f"sqlite:///{self._path}"
+        try:
+            return MlflowClient(tracking_uri=uri)
+        except Exception as error:  # alembic and SQLAlchemy have no common base
+            raise InputError(
+                f"{uri}: not a run store that this MLflow can open ({error}); move it away, or "
+                "run `mlflow db upgrade` on it"
+            ) from error
+
+    def _experiments(self) -> list[Any]:
+        experiments = _pages(partial(self._client.search_experiments, ViewType.ACTIVE_ONLY))
+        return [e for e in experiments if self._study in (None, e.name)]
+
+    def _stored(self, run: Run, study: str) -> StoredRun:
+        return StoredRun(
+            run_id=run.info.run_id,
+            study=study,
+            finished=run.info.status == RunStatus.to_string(RunStatus.FINISHED),
+            started_ms=run.info.start_time,
+            params=run.data.params,
+            tags=run.data.tags,
+            metrics=run.data.metrics,
+            load=partial(self._load_artifact, run.info.run_id),
+        )
+
+    def _load_artifact(self, run_id: str, name: str) -> Any:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(self._client.download_artifacts(run_id, name, folder))
+            return _READERS[path.suffix](path)
+
+    def _save_trained(self, trained: TrainedRun) -> None:
+        owner = psutil.Process()
+        tags = self.provenance | dict(trained.tags) | {_OWNER: f"{owner.pid} {owner.create_time()}"}
+        run = self._client.create_run(
+            self._experiment_id(trained.study), trained.started_ms, tags, _run_name(trained.params)
+        )
+        run_id = run.info.run_id
+        params = [Param(key, str(value)) for key, value in trained.params.items()]
+        self._client.log_batch(run_id, params=params)
+        if trained.history is not None:
+            self._log_metrics(run_id, _thinned(trained.history, trained.ended_ms))
+        self._log_artifacts(run_id, trained.artifacts)
+        self._client.log_batch(run_id, tags=[RunTag(_TRAINED, str(trained.ended_ms))])
+
+    def _save_evaluated(self, evaluated: EvaluatedRun) -> None:
+        run = self._client.get_run(evaluated.run_id)
+        now_ms = int(time.time() * 1000)  # MLflow shows the newest value of a metric
+        metrics = [Metric(key, value, now_ms, 0) for key, value in evaluated.metrics.items()]
+        self._log_metrics(evaluated.run_id, metrics)
+        self._log_artifacts(evaluated.run_id, evaluated.artifacts)
+        tags = [RunTag(key, value) for key, value in evaluated.tags.items()]
+        self._client.log_batch(evaluated.run_id, tags=tags)
+        trained_ms = int(run.data.tags[_TRAINED])
+        self._client.set_terminated(evaluated.run_id, "FINISHED", trained_ms)
+
+    def _experiment_id(self, study: str) -> str:
+        existing = self._client.get_experiment_by_name(study)
+        if existing is not None:
+            return str(existing.experiment_id)
+        location = None
+        if not os.environ.get("MLFLOW_TRACKING_URI"):
+            location = (self._path.parent / "mlruns" / study).as_uri()
+        return str(self._client.create_experiment(study, location))
+
+    def _log_metrics(self, run_id: str, metrics: list[Metric]) -> None:
+        for start in range(0, len(metrics), _LOG_BATCH):
+            self._client.log_batch(run_id, metrics=metrics[start : start + _LOG_BATCH])
+
+    def _log_artifacts(self, run_id: str, artifacts: Mapping[str, Any]) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            for name, content in artifacts.items():
+                path = Path(folder, name)
+                _WRITERS[path.suffix](content, path)
+            self._client.log_artifacts(run_id, folder)
+
+    def _exists(self) -> bool:
+        return bool(os.environ.get("MLFLOW_TRACKING_URI")) or self._path.exists()
+
+    def _describe(self) -> dict[str, Any]:
+        return {"path": str(self._path), "study": self._study, **self._only}
+
+
+def _check_store(path: Path) -> None:
+    """Refuse a file that is no MLflow store before MLflow would write into it."""
+    if not path.exists():
+        return
+    advice = "move it away to start a new store"
+    try:
+        with sqlite3.connect(f"file:{path}?mode=ro", uri=True) as connection:
+            tables = {name for (name,) in connection.execute("select name from sqlite_master")}
+            sound = [row[0] for row in connection.execute("pragma quick_check(1)")]
+    except sqlite3.DatabaseError as error:
+        raise InputError(f"{path}: not a readable SQLite file ({error}); {advice}") from error
+    if sound != ["ok"]:
+        raise InputError(f"{path}: a damaged SQLite file ({sound[0]}); {advice}")
+    if tables and not {"experiments", "alembic_version"} <= tables:
+        raise InputError(
+            f"{path}: expected an MLflow store, got an SQLite file with tables "
+            f"{', '.join(sorted(tables)[:5])}; {advice}"
+        )
+
+
+def _pages(search: Callable[..., Any]) -> Iterable[Any]:
+    token = None
+    while True:
+        page = search(page_token=token)
+        yield from page
+        token = page.token
+        if not token:
+            return
+
+
+def _is_alive(owner: str) -> bool:
+    pid, _, created = owner.partition(" ")
+    try:
+        return str(psutil.Process(int(pid)).create_time()) == created
+    except (psutil.Error, ValueError):
+        return False
+
+
+def _run_name(params: Mapping[str, Any]) -> str:
+    """Readable at a glance in a list of runs."""
+    if params["estimator"] == "mean":
+        return f"{params['sensor']} mean {params['window_s']:g} s"
+    fold = f" fold {params['fold']}" if params["fold"] >= 0 else ""
+    return (
+        f"{params['sensor']} {params['real_gyros']}+{params['virtual_gyros']} "
+        f"{params['window_s']:g} s seed {params['seed']}{fold}"
+    )
+
+
+def _thinned(history: pd.DataFrame, ended_ms: int) -> list[Metric]:
+    """About 50 points of each curve: the whole history is an artifact."""
+    step = -(-len(history) // _CURVE_POINTS)
+    rows = history.iloc[::-step].iloc[::-1]  # the last epoch is always among them
+    return [
+        Metric(name, float(value), ended_ms, int(epoch))
+        for name in rows.columns.drop("epoch")
+        for epoch, value in zip(rows["epoch"], rows[name], strict=True)
+    ]
+
+
+def _write_weights(content: Any, path: Path) -> None:
+    import torch  # noqa: PLC0415 - 2 s that only runs with weights need
+
+    torch.save(content, path)
+
+
+def _read_weights(path: Path) -> Any:
+    import torch  # noqa: PLC0415
+
+    return torch.load(path, weights_only=True)
+
+
+_WRITERS: dict[str, Callable[[Any, Path], Any]] = {
+    ".parquet": lambda content, path: content.to_parquet(path),
+    ".csv": lambda content, path: content.to_csv(path, index=False),
+    ".json": lambda content, path: path.write_text(json.dumps(content, indent=1)),
+    ".pt": _write_weights,
+}
+_READERS: dict[str, Callable[[Path], Any]] = {
+    ".parquet": pd.read_parquet,
+    ".csv": pd.read_csv,
+    ".json": lambda path: json.loads(path.read_text()),
+    ".pt": _read_weights,
+}

@@ -1,0 +1,136 @@
+"""What happens around a run: checks before it, provenance for its runs, directions after it."""
+
+import hashlib
+import logging
+import platform
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from kedro.framework.context import KedroContext
+from kedro.framework.hooks import hook_impl
+from kedro.io import CatalogProtocol
+from kedro.pipeline import Pipeline
+from pydantic import ValidationError
+
+from gyro_pipeline import pipeline_registry
+from gyro_pipeline.conventions import InputError
+from gyro_pipeline.datasets.atomic import check_writable
+from gyro_pipeline.datasets.tracked_runs import TrackedRuns
+from gyro_pipeline.parameters import Parameters
+
+logger = logging.getLogger(__name__)
+
+
+class Preflight:
+    """Refuses what cannot end well, before any node runs."""
+
+    def __init__(self) -> None:
+        self._parameters: Parameters | None = None
+        self._project = Path()
+
+    @hook_impl
+    def after_context_created(self, context: KedroContext) -> None:
+        """Check all parameters, and register pipelines for what they leave to do."""
+        self._project = Path(context.project_path)
+        sys.excepthook = _explain
+        given = context.config_loader["parameters"]
+        try:
+            self._parameters = Parameters(**given)
+        except ValidationError as error:
+            raise InputError(_explained(error)) from None
+        pipeline_registry.select(self._parameters)
+
+    @hook_impl
+    def before_pipeline_run(self, pipeline: Pipeline, catalog: CatalogProtocol) -> None:
+        """Check that something is left to do and that every result can be written."""
+        if self._parameters is not None and not pipeline.nodes:
+            only = self._parameters.only.model_dump(exclude_none=True)
+            raise InputError(f"only={only} matches nothing in this pipeline; see `studies` and `seeds`")
+        for name in sorted(pipeline.all_outputs()):
+            for path in _paths(catalog.get(name)):
+                check_writable(path)
+
+    @hook_impl
+    def after_pipeline_run(self, pipeline: Pipeline, catalog: CatalogProtocol) -> None:
+        """Say where the results are and how to look at them."""
+        tables = [name for name in pipeline.all_outputs() if ".reporting.tables." in name]
+        folders = {path.parent.parent for name in tables for path in _paths(catalog.get(name))}
+        for folder in sorted(folders):
+            logger.info("tables and figures: %s", _relative(folder, self._project))
+        logger.info("compare runs:       mlflow ui")
+        logger.info("see the lineage:    kedro viz")
+
+
+class Provenance:
+    """Marks every new run with the code, packages and command that made it."""
+
+    @hook_impl
+    def before_pipeline_run(
+        self, run_params: dict[str, Any], pipeline: Pipeline, catalog: CatalogProtocol
+    ) -> None:
+        """Hand the tags to the datasets that create runs."""
+        project = Path(run_params["project_path"])
+        tags = {
+            "kedro_run": run_params["run_id"],
+            "kedro_env": run_params["env"] or "base",
+            "python": platform.python_version(),
+            **{name: version(name) for name in ("torch", "numpy", "gyro-pipeline")},
+            "lock_hash": _file_hash(project / "requirements.lock"),
+            "mlflow.source.git.commit": _git(project, "rev-parse", "HEAD"),
+            "git_dirty": str(bool(_git(project, "status", "--porcelain"))),
+        }
+        for name in pipeline.datasets():
+            dataset = catalog.get(name)
+            if isinstance(dataset, TrackedRuns):
+                dataset.provenance |= tags
+
+
+def _explain(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """Print what is wrong with an input without the way Kedro took to find it."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, InputError):
+        cause = cause.__cause__
+    if cause is None:
+        sys.__excepthook__(kind, error, trace)
+    else:
+        logger.error("error: %s", cause)
+
+
+def _explained(error: ValidationError) -> str:
+    lines = []
+    for problem in error.errors():
+        where = ".".join(str(part) for part in problem["loc"]) or "parameters"
+        message = problem["msg"].removeprefix("Value error, ")
+        if problem["type"] == "extra_forbidden":
+            message = "unknown key; see conf/base for the keys there are"
+        lines.append(f"{where}: {message}" if problem["loc"] else message)
+    return "parameters: " + "\n  ".join(lines)
+
+
+def _paths(dataset: Any) -> list[Path]:
+    """Where a dataset is stored; nowhere if it is kept in memory."""
+    described = dataset._describe()
+    return [Path(described[key]) for key in ("filepath", "path") if key in described]
+
+
+def _relative(path: Path, project: Path) -> Path:
+    return path.relative_to(project) if path.is_relative_to(project) else path
+
+
+def _file_hash(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16] if path.exists() else "no lock file"
+
+
+def _git(project: Path, *arguments: str) -> str:
+    """What git says; nothing where the project is no checkout or git is absent."""
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(project), *arguments], capture_output=True, text=True, check=False
+        )
+    except OSError:
+        return ""
+    return done.stdout.strip()

@@ -1,0 +1,131 @@
+"""From recordings to scaled training examples, one recording in memory at a time."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from gyro_pipeline.learning.network import Architecture
+from gyro_pipeline.learning.packing import pack, packed_shape
+from gyro_pipeline.protocol.windows import cut_windows
+
+
+@dataclass(frozen=True)
+class Device:
+    """IMUs seen side by side as one input of the network, and their recordings to use.
+
+    Attributes:
+        recordings: ``angular_rate`` (imu, recording, axis, sample); may be backed by a file.
+        bias: Bias of each recording, (imu, recording, axis), deg/s.
+        imus: The IMUs side by side, one for Method 2.
+        numbers: Recording numbers to use.
+    """
+
+    recordings: xr.DataArray
+    bias: xr.DataArray
+    imus: tuple[int, ...]
+    numbers: tuple[int, ...]
+
+    def biases(self) -> np.ndarray:
+        """Biases of the recordings, shape (recordings, gyroscopes), deg/s."""
+        chosen = self.bias.sel(imu=list(self.imus), recording=list(self.numbers))
+        return chosen.transpose("recording", "imu", "axis").to_numpy().reshape(len(self.numbers), -1)
+
+    def samples(self) -> Iterator[np.ndarray]:
+        """The recordings one by one, shape (gyroscopes, samples), deg/s."""
+        for number in self.numbers:
+            chosen = self.recordings.sel(imu=list(self.imus), recording=number)
+            yield chosen.transpose("imu", "axis", "sample").to_numpy().reshape(
+                len(self.imus) * chosen.sizes["axis"], -1
+            )
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Fitted on training data only: the network sees (x - centre) / scale.
+
+    One scale for all gyroscopes keeps the paper's loss, the mean squared error in deg/s, up to a
+    constant factor.
+
+    Attributes:
+        centres: Subtracted from each device's gyroscopes, inputs and targets, deg/s.
+        input_scale: Root mean square of the centred samples, deg/s.
+        target_scale: Root mean square of the centred biases, deg/s.
+    """
+
+    centres: list[np.ndarray]
+    input_scale: float
+    target_scale: float
+
+
+@dataclass(frozen=True)
+class Examples:
+    """Scaled examples: inputs (n, blocks, width) and targets (n, gyroscopes), float32."""
+
+    inputs: np.ndarray
+    targets: np.ndarray
+
+
+def device_centres(devices: Sequence[Device], centring: str) -> list[np.ndarray]:
+    """What to subtract from each device: its own gyroscopes' means, or one mean for all.
+
+    Args:
+        devices: Training devices.
+        centring: ``per_device`` or ``global``.
+
+    Returns:
+        Shape (gyroscopes,) for each device, deg/s.
+    """
+    means = [device.biases().mean(axis=0) for device in devices]
+    if centring == "per_device":
+        return means
+    weights = [len(device.numbers) for device in devices]
+    overall = np.average([mean.mean() for mean in means], weights=weights)
+    return [np.full_like(mean, overall) for mean in means]
+
+
+def training_examples(
+    devices: Sequence[Device], architecture: Architecture, centring: str
+) -> tuple[Examples, Scaling]:
+    """All windows of the training devices, and the scaling that they fix."""
+    centres = device_centres(devices, centring)
+    examples = _centred(devices, centres, architecture)
+    input_scale = _root_mean_square(examples.inputs, architecture)
+    target_scale = float(np.sqrt(np.mean(np.square(examples.targets, dtype=np.float64))))
+    examples.inputs[...] /= input_scale
+    examples.targets[...] /= target_scale
+    return examples, Scaling(centres, input_scale, target_scale)
+
+
+def scaled_examples(device: Device, architecture: Architecture, scaling: Scaling) -> Examples:
+    """Windows of other recordings of the first training device, scaled as in training."""
+    examples = _centred([device], scaling.centres[:1], architecture)
+    examples.inputs[...] /= scaling.input_scale
+    examples.targets[...] /= scaling.target_scale
+    return examples
+
+
+def _centred(
+    devices: Sequence[Device], centres: Sequence[np.ndarray], architecture: Architecture
+) -> Examples:
+    per_recording = devices[0].recordings.sizes["sample"] // architecture.window
+    n = per_recording * sum(len(device.numbers) for device in devices)
+    inputs = np.zeros((n, *packed_shape(architecture)), np.float32)
+    targets = np.empty((n, architecture.gyroscopes), np.float32)
+    start = 0
+    for device, centre in zip(devices, centres, strict=True):
+        for samples, bias in zip(device.samples(), device.biases(), strict=True):
+            rows = slice(start, start + per_recording)
+            centred = samples - centre[:, None].astype(np.float32)
+            pack(cut_windows(centred, architecture.window), architecture, out=inputs[rows])
+            targets[rows] = bias - centre
+            start = rows.stop
+    return Examples(inputs, targets)
+
+
+def _root_mean_square(inputs: np.ndarray, architecture: Architecture) -> float:
+    """Over samples, not over the zeros that pad them."""
+    seen = min(architecture.window, packed_shape(architecture)[0] * architecture.stride)
+    squares = sum(float(np.vdot(window, window)) for window in inputs)
+    return float(np.sqrt(squares / (len(inputs) * architecture.gyroscopes * seen)))

@@ -1,0 +1,154 @@
+"""One training as a pure job: everything it needs comes in, everything it makes goes out."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+
+from gyro_pipeline.learning.examples import (
+    Device,
+    Scaling,
+    scaled_examples,
+    training_examples,
+)
+from gyro_pipeline.learning.network import Architecture, CalibrationNetwork
+from gyro_pipeline.learning.packing import pack
+from gyro_pipeline.learning.trainer import predict, train
+from gyro_pipeline.parameters import Training
+
+_STEP_OVERHEAD = 80_000
+"""What an optimiser step costs beside its samples, in samples; measured at batches of 64."""
+
+
+@dataclass(frozen=True)
+class TrainingJob:
+    """A network to train.
+
+    Attributes:
+        name: Shown while it runs.
+        devices: Training devices and recordings; the first holds the test IMU.
+        validation: The test device on the validation recordings; None without.
+        window: Samples.
+        settings: The network's sizes and schedule.
+        seed: Of the initial weights and the order of examples.
+    """
+
+    name: str
+    devices: Sequence[Device]
+    validation: Device | None
+    window: int
+    settings: Training
+    seed: int
+
+    @property
+    def architecture(self) -> Architecture:
+        """Sizes of the network."""
+        s = self.settings
+        gyroscopes = len(self.devices[0].imus) * self.devices[0].recordings.sizes["axis"]
+        return Architecture(
+            gyroscopes, self.window, s.channels, s.kernel, s.stride, s.pool, s.hidden
+        )
+
+    @property
+    def epoch_work(self) -> float:
+        """Estimated cost of an epoch, in samples of three gyroscopes."""
+        per_recording = self.devices[0].recordings.sizes["sample"] // self.window
+        windows = per_recording * sum(len(device.numbers) for device in self.devices)
+        steps = -(-windows // self.settings.batch_size)
+        return windows * self.window * len(self.devices[0].imus) + steps * _STEP_OVERHEAD
+
+    @property
+    def work(self) -> float:
+        """Estimated cost of the training, in samples of three gyroscopes."""
+        return self.epoch_work * self.settings.epochs
+
+
+@dataclass(frozen=True)
+class TrainedNetwork:
+    """What a training leaves: an artifact to store, the losses, and when it started (epoch, s)."""
+
+    artifact: Mapping[str, Any]
+    history: pd.DataFrame
+    started: float
+
+
+def run_training(job: TrainingJob, report: Callable[[float], None]) -> TrainedNetwork:
+    """Run one training on one thread, or on the GPU where there is one.
+
+    Args:
+        job: What to train.
+        report: Told the work done after every epoch.
+
+    Returns:
+        Weights at the last and the best validation epoch with all that an estimate needs.
+    """
+    started = time.time()
+    torch.set_num_threads(1)
+    torch.use_deterministic_algorithms(True)
+    architecture = job.architecture
+    examples, scaling = training_examples(job.devices, architecture, job.settings.centring)
+    validation = (
+        None if job.validation is None else scaled_examples(job.validation, architecture, scaling)
+    )
+    network = initial_network(architecture, job.seed)
+    network.to("cuda" if torch.cuda.is_available() else "cpu")
+    shuffling = torch.Generator().manual_seed(job.seed)
+    trained = train(
+        network, examples, validation, job.settings, shuffling, lambda: report(job.epoch_work)
+    )
+    artifact = {
+        "architecture": asdict(architecture),
+        "scaling": {
+            "centre": torch.from_numpy(scaling.centres[0]),
+            "input_scale": scaling.input_scale,
+            "target_scale": scaling.target_scale,
+        },
+        "last": trained.last,
+        "best": trained.best,
+        "best_epoch": trained.best_epoch,
+    }
+    return TrainedNetwork(artifact, trained.history, started)
+
+
+def initial_network(architecture: Architecture, seed: int) -> CalibrationNetwork:
+    """PyTorch's default initial weights, drawn from ``seed`` without touching the global state."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return CalibrationNetwork(architecture)
+
+
+class NetworkEstimator:
+    """A stored network as an estimator: windows in, biases out."""
+
+    def __init__(self, artifact: Mapping[str, Any], weights: str) -> None:
+        """Restore a network.
+
+        Args:
+            artifact: From :class:`TrainedNetwork`.
+            weights: ``last`` or ``best``.
+        """
+        scaling = artifact["scaling"]
+        self._scaling = Scaling(
+            [scaling["centre"].numpy()], scaling["input_scale"], scaling["target_scale"]
+        )
+        self._network = CalibrationNetwork(Architecture(**artifact["architecture"]))
+        self._network.load_state_dict(artifact[weights])
+
+    def estimate(self, windows: np.ndarray) -> np.ndarray:
+        """Biases of all gyroscopes the network sees.
+
+        Args:
+            windows: Shape (n, gyroscopes, window), deg/s.
+
+        Returns:
+            Shape (n, gyroscopes), deg/s.
+        """
+        centre = self._scaling.centres[0]
+        scaled = (windows - centre[:, None].astype(np.float32)) / self._scaling.input_scale
+        packed = pack(scaled.transpose(1, 0, 2), self._network.architecture)
+        outputs = predict(self._network, torch.from_numpy(packed)).double().numpy()
+        return centre + self._scaling.target_scale * outputs

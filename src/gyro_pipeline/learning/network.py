@@ -1,0 +1,92 @@
+"""The paper's network (section III-D), on windows as they are or packed for speed."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+SLOPE = 0.1
+"""Of the LeakyReLU (paper, section III-D)."""
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """Sizes of the network; all but the first two are left open by the paper."""
+
+    gyroscopes: int
+    window: int
+    channels: int
+    kernel: int
+    stride: int
+    pool: int
+    hidden: int
+
+    @property
+    def convolved(self) -> int:
+        """Outputs of the convolution, per channel."""
+        return (self.window - self.kernel) // self.stride + 1
+
+    @property
+    def pooled(self) -> int:
+        """Outputs of the pooling, per channel."""
+        return self.convolved // self.pool
+
+
+class CalibrationNetwork(nn.Module):
+    """Convolution, LeakyReLU, max-pool, flatten, linear, LeakyReLU, linear.
+
+    LeakyReLU rises monotonically, so it gives the same after the pooling as before it, on a
+    quarter of the values; and features are flattened time by time, which packed windows have
+    without a copy. Neither changes the function the network computes.
+    """
+
+    def __init__(self, architecture: Architecture) -> None:
+        super().__init__()
+        a = architecture
+        if a.window < a.kernel or a.pooled < 1:
+            raise ValueError(
+                f"a window of {a.window} samples is too short for kernel {a.kernel}, "
+                f"stride {a.stride} and pool {a.pool}; choose smaller ones under training"
+            )
+        self.architecture = architecture
+        self.convolution = nn.Conv1d(a.gyroscopes, a.channels, a.kernel, a.stride)
+        self.hidden = nn.Linear(a.pooled * a.channels, a.hidden)
+        self.output = nn.Linear(a.hidden, a.gyroscopes)
+
+    def forward(self, windows: Tensor) -> Tensor:
+        """Biases of plain windows.
+
+        Args:
+            windows: Shape (n, gyroscopes, window), scaled.
+
+        Returns:
+            Shape (n, gyroscopes), scaled.
+        """
+        convolved = self.convolution(windows)  # (n, channels, convolved)
+        pooled = functional.max_pool1d(convolved, self.architecture.pool)
+        return self._head(pooled.transpose(1, 2))
+
+    def forward_packed(self, packed: Tensor) -> Tensor:
+        """Biases of windows from :func:`gyro_pipeline.learning.packing.pack`, several times faster.
+
+        Args:
+            packed: Shape (n, blocks, width), scaled.
+
+        Returns:
+            Shape (n, gyroscopes), scaled.
+        """
+        a = self.architecture
+        taps, width = -(-a.kernel // a.stride), packed.shape[2]
+        # (channels, gyroscopes, kernel) -> (channels, width, taps, 1): one tap is one block.
+        weight = functional.pad(self.convolution.weight, (0, taps * a.stride - a.kernel))
+        weight = weight.unflatten(2, (taps, a.stride)).permute(0, 1, 3, 2).flatten(1, 2)
+        weight = functional.pad(weight, (0, 0, 0, width - weight.shape[1])).unsqueeze(3)
+        image = packed.unsqueeze(2).permute(0, 3, 1, 2)  # (n, width, blocks, 1), channels last
+        convolved = functional.conv2d(image, weight, self.convolution.bias)
+        pooled = functional.max_pool2d(convolved, (a.pool, 1))  # (n, channels, pooled, 1)
+        return self._head(pooled.squeeze(3).transpose(1, 2))
+
+    def _head(self, pooled: Tensor) -> Tensor:
+        features = functional.leaky_relu(pooled, SLOPE).flatten(1)  # (n, pooled * channels)
+        return self.output(functional.leaky_relu(self.hidden(features), SLOPE))

@@ -1,0 +1,47 @@
+"""Windows packed for training: one block of ``stride`` samples of all gyroscopes per row.
+
+In this layout the strided convolution over samples becomes one with stride 1 over blocks, with
+the samples of a block as channels that lie side by side in memory. That is 2 to 3 times faster
+than the plain layout and holds the same numbers, padded with zeros.
+"""
+
+import numpy as np
+
+from gyro_pipeline.learning.network import Architecture
+
+_ALIGNMENT = 8
+"""Floats that a row is padded to a multiple of: one AVX2 register."""
+
+
+def packed_shape(architecture: Architecture) -> tuple[int, int]:
+    """Blocks and width of one packed window."""
+    a = architecture
+    blocks = a.convolved - 1 + -(-a.kernel // a.stride)
+    return blocks, -(-a.gyroscopes * a.stride // _ALIGNMENT) * _ALIGNMENT
+
+
+def pack(windows: np.ndarray, architecture: Architecture, out: np.ndarray | None = None) -> np.ndarray:
+    """Pack windows; samples that no convolution output sees are left out.
+
+    Args:
+        windows: Shape (gyroscopes, n, window), as cut from a recording.
+        architecture: The network's sizes.
+        out: Zeros of shape (n, blocks, width), float32, to write into.
+
+    Returns:
+        ``out``.
+    """
+    a = architecture
+    gyroscopes, n, _ = windows.shape
+    blocks, width = packed_shape(a)
+    if out is None:
+        out = np.zeros((n, blocks, width), np.float32)
+    # (n, blocks, gyroscopes, stride) view of the used part of each row
+    cells = out[:, :, : gyroscopes * a.stride].reshape(n, blocks, gyroscopes, a.stride)
+    full = min(a.window // a.stride, blocks)
+    whole = windows[:, :, : full * a.stride].reshape(gyroscopes, n, full, a.stride)
+    cells[:, :full] = whole.transpose(1, 2, 0, 3)
+    if full < blocks:  # the last block is cut short by the window's end
+        rest = windows[:, :, full * a.stride :]
+        cells[:, full, :, : rest.shape[2]] = rest.transpose(1, 0, 2)
+    return out

@@ -1,0 +1,220 @@
+"""Typed parameters: every key that ``conf/*/parameters`` may hold, with its unit and source.
+
+An unknown key, a value out of bounds or a study that asks for what a sensor cannot give is
+refused before any node runs (see :class:`gyro_pipeline.hooks.Preflight`).
+"""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from gyro_pipeline.conventions import AXES
+
+PerAxis = tuple[float, float, float]
+Gyroscopes = Annotated[int, Field(ge=0, multiple_of=len(AXES), description="a count of axes")]
+
+
+class Parameter(BaseModel):
+    """Base of all groups: no unknown keys, no change after loading."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Datasheet(Parameter):
+    """What the manufacturer states (paper, table of sensor specifications)."""
+
+    rate_hz: tuple[float, float] = Field(description="lowest and highest sample rate, Hz")
+    noise_density_mdps_rthz: float | None = Field(description="one-sided, mdps/sqrt(Hz)")
+    bias_stability_dph: float | None = Field(description="bias instability, deg/h")
+
+
+class SimulatedNoise(Parameter):
+    """The stand-in for a sensor whose files are not at hand; values and sources in conf/base/globals.yml."""
+
+    noise_mdps_rts: PerAxis = Field(description="N per axis: the mean of t s scatters by N/sqrt(t)")
+    turn_on_spread_mdps: PerAxis = Field(description="tau per axis: bias from power-on to power-on")
+    unit_bias_dps: float = Field(ge=0, description="unit-to-unit biases are uniform in +- this")
+    lag1_correlation: float = Field(0.0, gt=-0.5, lt=0.5, description="of successive samples")
+    flicker_mdps: float = Field(0.0, ge=0, description="bias instability B; 0 is white noise")
+
+
+class Sensor(Parameter):
+    """One brand of gyroscope: how it was recorded, its datasheet, and its simulated stand-in."""
+
+    imus: int = Field(ge=1)
+    recordings: int = Field(ge=2, description="power-ons per IMU")
+    train_recordings: int = Field(ge=1, description="of these, the ones in the training file")
+    samples: int = Field(ge=2, description="per recording and axis")
+    recording_s: float = Field(gt=0, description="T, seconds (paper, section IV-A)")
+    datasheet: Datasheet
+    simulated: SimulatedNoise
+
+    @property
+    def rate_hz(self) -> float:
+        """Sample rate that the counts imply, Hz."""
+        return self.samples / self.recording_s
+
+    @model_validator(mode="after")
+    def _some_recordings_are_for_testing(self) -> Self:
+        if self.train_recordings >= self.recordings:
+            raise ValueError("train_recordings must leave at least one recording for testing")
+        return self
+
+
+class GroundTruth(Parameter):
+    """How the bias of a recording and the noise of a gyroscope are measured."""
+
+    tolerance_mdps: float = Field(gt=0, description="band that the running mean must stay within")
+
+
+class VirtualGyros(Parameter):
+    """Dataset-3 and Dataset-4 (paper, section IV-A)."""
+
+    imus: int = Field(ge=1, description="virtual IMUs of three gyroscopes each")
+    recordings: int = Field(ge=1)
+    train_recordings: int = Field(ge=1, description="the first so many are trained on")
+    turn_on_jitter_mdps: float = Field(
+        ge=0, description="0: one bias for all recordings of a virtual gyroscope, as in the paper"
+    )
+    seed: int
+
+
+class Splits(Parameter):
+    """Which recordings train, validate and test."""
+
+    test_fraction: float = Field(gt=0, lt=1, description="of recordings, where none is given")
+    validation_recordings: int = Field(ge=0, description="of the training ones; 0: the paper's")
+    fold_validation_recordings: int = Field(ge=0, description="the same in each fold of a k-fold")
+    k_fold_below: int = Field(ge=0, description="fewer recordings than this: k-fold by recording")
+    leave_one_out_up_to: int = Field(ge=0, description="so many recordings: one fold each")
+    folds: int = Field(ge=2, description="of a k-fold that is not leave-one-out")
+    split_seed: int
+
+
+class Training(Parameter):
+    """The network's sizes and its schedule (paper, sections III-D and IV)."""
+
+    centring: Literal["per_device", "global"] = Field(
+        description="subtract each gyroscope's own training mean, or one mean for all"
+    )
+    channels: int = Field(ge=1)
+    kernel: int = Field(ge=1, description="samples")
+    stride: int = Field(ge=1, description="samples")
+    pool: int = Field(ge=1, description="convolution outputs")
+    hidden: int = Field(ge=1)
+    epochs: int = Field(ge=1)
+    batch_size: int = Field(ge=1)
+    learning_rate: float = Field(gt=0)
+    decay: float = Field(gt=0, le=1, description="factor on the learning rate ...")
+    decay_every: int = Field(ge=1, description="... after so many epochs")
+
+
+class Execution(Parameter):
+    """How the trainings are run; has no effect on their results."""
+
+    executor: Literal["processes", "serial"]
+    workers: int | None = Field(ge=1, description="processes; null: one per core")
+
+
+class Evaluation(Parameter):
+    """Intervals over test recordings."""
+
+    resamples: int = Field(ge=100, description="of the clustered bootstrap")
+    bootstrap_seed: int
+
+
+class Grid(Parameter):
+    """The networks one study trains on one sensor: all combinations of the lists."""
+
+    method: Literal[1, 2] = Field(description="1: input channels; 2: training data")
+    real_gyros: list[Gyroscopes]
+    virtual_gyros: list[Gyroscopes] = [0]
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        if min(self.real_gyros) < len(AXES):
+            raise ValueError("real_gyros: at least one IMU, 3 gyroscopes, is needed")
+        if self.method == 1 and any(self.virtual_gyros):
+            raise ValueError("method 1 has no virtual gyroscopes")
+        return self
+
+
+class Study(Parameter):
+    """A part of the paper: networks to compare, tracked in one MLflow experiment."""
+
+    experiment: str = Field(description="name of the MLflow experiment; the study's own name")
+    sensors: dict[str, Grid]
+
+
+class Only(Parameter):
+    """Narrows every study to the cells that match; an absent key matches everything."""
+
+    sensor: str | None = None
+    real_gyros: Gyroscopes | None = None
+    virtual_gyros: Gyroscopes | None = None
+    window_s: float | None = None
+    seed: int | None = None
+    fold: int | None = None
+
+
+class Published(Parameter):
+    """One published result; numbers that no run made are typed in here and nowhere else."""
+
+    table: str = Field(description="our name of the paper's table")
+    section: str = Field(description="where the paper says so")
+    approach: str
+    sensor: str
+    real_gyros: Gyroscopes
+    virtual_gyros: Gyroscopes
+    window_s: float
+    time_saving_pct: float
+    accuracy_gain_pct: float
+
+
+class Parameters(Parameter):
+    """All of it, as one tree."""
+
+    source: str = Field(pattern=r"^[a-z0-9_]+$", description="where the logs come from")
+    sensors: dict[str, Sensor]
+    ground_truth: GroundTruth
+    virtual_gyros: VirtualGyros
+    splits: Splits
+    training: Training
+    execution: Execution
+    evaluation: Evaluation
+    windows_s: list[float]
+    seeds: list[int]
+    studies: dict[str, Study]
+    only: Only
+    published: list[Published]
+
+    @model_validator(mode="after")
+    def _studies_ask_for_what_sensors_give(self) -> Self:
+        known = f"conf/base/globals.yml knows {', '.join(self.sensors)}"
+        for study, asked in self.studies.items():
+            if asked.experiment != study:
+                raise ValueError(f"studies.{study}.experiment: expected {study!r}")
+            for name, grid in asked.sensors.items():
+                if name not in self.sensors:
+                    raise ValueError(f"studies.{study}: unknown sensor {name!r}; {known}")
+                available = len(AXES) * self.sensors[name].imus
+                if max(grid.real_gyros) > available:
+                    raise ValueError(
+                        f"studies.{study}.{name}: {max(grid.real_gyros)} real gyroscopes asked, "
+                        f"{name} has {available}"
+                    )
+                virtual = len(AXES) * self.virtual_gyros.imus
+                if max(grid.virtual_gyros) > virtual:
+                    raise ValueError(
+                        f"studies.{study}.{name}: {max(grid.virtual_gyros)} virtual gyroscopes "
+                        f"asked, virtual_gyros.imus makes {virtual}"
+                    )
+        if self.only.sensor is not None and self.only.sensor not in self.sensors:
+            raise ValueError(f"only.sensor: unknown sensor {self.only.sensor!r}; {known}")
+        for name, sensor in self.sensors.items():
+            if max(self.windows_s) > sensor.recording_s:
+                raise ValueError(
+                    f"windows_s: a window of {max(self.windows_s):g} s is longer than a "
+                    f"recording of {name}, {sensor.recording_s:g} s"
+                )
+        return self

@@ -1,0 +1,83 @@
+"""Simulated gyroscope noise: white, correlated from sample to sample, and flicker."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import fft
+
+from gyro_pipeline.conventions import InputError
+
+_MA1_LIMIT = 0.5
+
+
+def simulate_noise(
+    generator: np.random.Generator,
+    shape: tuple[int, ...],
+    rate_hz: float,
+    white_dps_rts: ArrayLike,
+    lag1_correlation: float = 0.0,
+    flicker_dps: float = 0.0,
+) -> NDArray[np.float32]:
+    """Zero-mean noise of stationary gyroscopes, every recording independent of the others.
+
+    The mean of t seconds of the white part scatters by N / sqrt(t), so sigma = N sqrt(rate).
+    With a lag-1 correlation it is the moving average x_i = e_i + theta e_(i-1), scaled so that N,
+    its level at frequency zero, stays what was asked for: sigma = N sqrt(rate / (1 + 2 lag1)).
+
+    Args:
+        generator: Source of randomness.
+        shape: (..., n), n samples per recording.
+        rate_hz: Samples per second.
+        white_dps_rts: N, deg/s * sqrt(s), broadcast against ``shape[:-1]``.
+        lag1_correlation: Of successive samples of the white part, between -0.5 and 0.5.
+        flicker_dps: Bias instability B, deg/s: the Allan deviation has its floor at 0.664 B.
+
+    Returns:
+        (..., n), deg/s.
+
+    Raises:
+        InputError: The lag-1 correlation is not between -0.5 and 0.5.
+    """
+    if not -_MA1_LIMIT < lag1_correlation < _MA1_LIMIT:
+        raise InputError(
+            f"lag1_correlation: expected between -0.5 and 0.5, got {lag1_correlation}; no noise "
+            "that is correlated over one sample only has more"
+        )
+    noise = generator.standard_normal(shape, dtype=np.float32)
+    theta = 2 * lag1_correlation / (1 + np.sqrt(1 - 4 * lag1_correlation**2))
+    if theta:
+        _correlate(generator, noise, theta)
+    scale = np.asarray(white_dps_rts, dtype=np.float64) * np.sqrt(rate_hz) / (1 + theta)
+    noise *= scale[..., None].astype(np.float32)
+    if flicker_dps:
+        _add_flicker(generator, noise, flicker_dps)
+    return noise
+
+
+def _correlate(generator: np.random.Generator, noise: NDArray[np.float32], theta: float) -> None:
+    """Turn white samples e into e_i + theta e_(i-1), in place."""
+    for row in noise.reshape(-1, noise.shape[-1]):  # by recording: temporaries stay small
+        before = generator.standard_normal(dtype=np.float32)
+        row[1:] += np.float32(theta) * row[:-1]
+        row[0] += np.float32(theta) * before
+
+
+def _add_flicker(
+    generator: np.random.Generator, noise: NDArray[np.float32], instability_dps: float
+) -> None:
+    """Add noise of one-sided spectral density B^2 / (pi f), in place.
+
+    That density has the Allan variance (2 ln 2 / pi) B^2 at every averaging time (IEEE Std 952
+    writes the two-sided half of it). Frequencies below one in two recordings are left out: over
+    one recording they are a constant, which is the turn-on spread's to give. A spectrum of
+    twice the length is drawn and half of the signal kept, because the inverse transform is
+    periodic: kept whole, a recording would end where it began.
+    """
+    length = fft.next_fast_len(2 * noise.shape[-1], real=True)
+    k = np.arange(1, length // 2 + 1)
+    # one-sided density = 2 |X_k|^2 length / rate for x_i = sum of X_k exp(2 pi j i k / length)
+    amplitude = (instability_dps / (2 * np.sqrt(np.pi * k))).astype(np.float32)
+    spectrum = np.zeros(k.size + 1, dtype=np.complex64)
+    for row in noise.reshape(-1, noise.shape[-1]):
+        parts = generator.standard_normal((k.size, 2), dtype=np.float32)
+        spectrum[1:] = amplitude * parts.view(np.complex64)[:, 0]
+        row[:] += fft.irfft(spectrum, length, norm="forward")[: row.size]

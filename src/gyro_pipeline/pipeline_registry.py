@@ -1,0 +1,74 @@
+"""The pipelines by name: a table of contents."""
+
+from pathlib import Path
+
+from kedro.config import OmegaConfigLoader
+from kedro.framework.project import settings
+from kedro.pipeline import Pipeline
+
+from gyro_pipeline.parameters import Parameters
+from gyro_pipeline.pipelines import (
+    evaluation,
+    ground_truth,
+    raw_logs,
+    reporting,
+    training,
+    virtual_gyros,
+    windowed_splits,
+)
+from gyro_pipeline.studies import used_sensors
+
+_selected: Parameters | None = None
+
+
+def select(parameters: Parameters) -> None:
+    """Register pipelines for the studies, sensors and ``only`` of these parameters.
+
+    Kedro builds pipelines after the context of a run, which is where this is called from.
+    """
+    global _selected  # noqa: PLW0603 - Kedro calls register_pipelines without arguments
+    _selected = parameters
+
+
+def register_pipelines() -> dict[str, Pipeline]:
+    """All pipelines; each study ends by writing its own tables and figures."""
+    parameters = _selected or base_parameters()
+    sensors = used_sensors(parameters)
+    every_sensor = {study: list(asked.sensors) for study, asked in parameters.studies.items()}
+    wanted = parameters.only.sensor
+    pipelines = {
+        study: _runs(parameters, {study: sensors[study]})
+        + reporting.create_pipeline({study: every_sensor[study]})
+        for study in parameters.studies
+    }
+    pipelines["ground_truth"] = sum(
+        (
+            raw_logs.create_pipeline(sensor) + ground_truth.create_pipeline(sensor)
+            for sensor in parameters.sensors
+            if wanted in (None, sensor)
+        ),
+        Pipeline([]),
+    )
+    pipelines["reporting"] = reporting.create_pipeline(every_sensor)
+    pipelines["__default__"] = _runs(parameters, sensors) + pipelines["reporting"]
+    return pipelines
+
+
+def _runs(parameters: Parameters, studies: dict[str, list[str]]) -> Pipeline:
+    """From raw logs to evaluated runs."""
+    whole = Pipeline([])
+    for study, sensors in studies.items():
+        for sensor in sensors:
+            virtual = any(parameters.studies[study].sensors[sensor].virtual_gyros)
+            whole += raw_logs.create_pipeline(sensor) + ground_truth.create_pipeline(sensor)
+            whole += windowed_splits.create_pipeline(sensor)
+            whole += virtual_gyros.create_pipeline(sensor) if virtual else Pipeline([])
+            whole += training.create_pipeline(study, sensor, virtual)
+            whole += evaluation.create_pipeline(study, sensor)
+    return whole
+
+
+def base_parameters() -> Parameters:
+    """Parameters of ``conf/base``, for commands that run nothing (``kedro registry list``)."""
+    conf = OmegaConfigLoader(str(Path.cwd() / settings.CONF_SOURCE), **settings.CONFIG_LOADER_ARGS)
+    return Parameters(**conf["parameters"])

@@ -1,0 +1,108 @@
+"""Nodes of the evaluation stage."""
+
+import logging
+from collections.abc import Iterator
+
+import pandas as pd
+import xarray as xr
+
+from gyro_pipeline import estimators
+from gyro_pipeline.conventions import ALL, BEST, FIRST, LAST
+from gyro_pipeline.estimators import Estimator, RunningMean
+from gyro_pipeline.fingerprints import code_hash, fingerprint
+from gyro_pipeline.learning.jobs import NetworkEstimator
+from gyro_pipeline.parameters import Evaluation
+from gyro_pipeline.physics import allan as allan_module
+from gyro_pipeline.physics import ceiling
+from gyro_pipeline.pipelines.evaluation import bench as bench_module
+from gyro_pipeline.pipelines.evaluation.bench import (
+    Bench,
+    describe_device,
+    known_recordings,
+    test_recordings,
+)
+from gyro_pipeline.protocol import scores, truths, windows
+from gyro_pipeline.studies import MEAN
+from gyro_pipeline.tracking import (
+    CURVE,
+    ERRORS,
+    EVALUATED_WITH,
+    FINGERPRINT,
+    WEIGHTS,
+    EvaluatedRun,
+    StoredRun,
+    metric_name,
+)
+
+logger = logging.getLogger(__name__)
+
+_CODE = (allan_module, ceiling, bench_module, estimators, scores, truths, windows)
+
+
+def evaluate(
+    cells: pd.DataFrame,
+    runs: list[StoredRun],
+    recordings: xr.Dataset,
+    bias: pd.DataFrame,
+    allan: xr.Dataset,
+    roles: pd.DataFrame,
+    evaluation: Evaluation,
+) -> Iterator[EvaluatedRun]:
+    """Judge every run of the plan that was not judged this way before.
+
+    Args:
+        cells: The plan.
+        runs: The study's trained runs on this sensor.
+        recordings: Real recordings.
+        bias: Their ground truth.
+        allan: Their Allan variances.
+        roles: Which recordings test, in each fold.
+        evaluation: Resamples and seed of the intervals.
+
+    Yields:
+        Metrics and per-window errors, to be added to each run.
+    """
+    trained = {run.fingerprint: run for run in reversed(runs)}
+    judged_with = fingerprint([code_hash(_CODE), evaluation.model_dump()])
+    seed = evaluation.bootstrap_seed
+    device = describe_device(recordings, bias, allan, known_recordings(roles), seed)
+    benches: dict[tuple[float, int], Bench] = {}
+    skipped = 0
+    for cell in cells.to_dict("records"):
+        run = trained[cell[FINGERPRINT]]
+        if run.finished and run.tags.get(EVALUATED_WITH) == judged_with:
+            skipped += 1
+            continue
+        key = cell["window_s"], cell["fold"]
+        if key not in benches:
+            numbers = test_recordings(roles, cell["fold"])
+            benches[key] = Bench(recordings, device, numbers, cell["window_s"], evaluation)
+        yield _judge(run, benches[key], judged_with)
+    logger.info("%s: %d runs evaluated, %d skipped", recordings.attrs["sensor"], len(cells) - skipped, skipped)
+
+
+def _judge(run: StoredRun, bench: Bench, judged_with: str) -> EvaluatedRun:
+    artifacts = {}
+    if run.params["estimator"] == MEAN:
+        judged: dict[str, Estimator] = {LAST: RunningMean()}
+        artifacts[CURVE] = bench.curve
+    else:
+        stored = run.load(WEIGHTS)
+        judged = {which: NetworkEstimator(stored, which) for which in (LAST, BEST) if stored[which]}
+    side_by_side = int(run.params["real_gyros"]) // 3 if run.params["method"] == "1" else 1
+    metrics, tables = {}, []
+    for which, estimator in judged.items():
+        errors = bench.errors(estimator, side_by_side)
+        metrics |= bench.metrics(errors, which)
+        tables.append(errors.assign(weights=which))
+    artifacts[ERRORS] = pd.concat(tables, ignore_index=True)
+    logger.info(
+        "%s %s: RMSE %.7f deg/s in the first window, %.6f in all (last epoch)",
+        *(run.study, _title(run)),
+        *(metrics[metric_name("test_rmse_dps", windows)] for windows in (FIRST, ALL)),
+    )
+    return EvaluatedRun(run.run_id, metrics, {EVALUATED_WITH: judged_with}, artifacts)
+
+
+def _title(run: StoredRun) -> str:
+    return run.tags["mlflow.runName"]

@@ -1,0 +1,28 @@
+"""Wiring of the evaluation stage."""
+
+from kedro.pipeline import Node, Pipeline
+
+from gyro_pipeline.pipelines.evaluation.nodes import evaluate
+
+
+def create_pipeline(study: str, sensor: str) -> Pipeline:
+    """Evaluation of one study's runs on one sensor."""
+    return Pipeline(
+        [
+            Node(
+                evaluate,
+                {
+                    "cells": f"{study}.{sensor}.training.cells",
+                    "runs": f"{study}.{sensor}.training.runs",
+                    "recordings": f"{sensor}.raw_logs.recordings",
+                    "bias": f"{sensor}.ground_truth.bias",
+                    "allan": f"{sensor}.ground_truth.allan",
+                    "roles": f"{sensor}.windowed_splits.roles",
+                    "evaluation": "params:evaluation",
+                },
+                f"{study}.{sensor}.evaluation.runs",
+                name=f"evaluate_{study}_{sensor}",
+                namespace="evaluation",
+            )
+        ]
+    )

@@ -1,0 +1,5 @@
+"""The bias of every recording, and the noise of every gyroscope."""
+
+from gyro_pipeline.pipelines.ground_truth.pipeline import create_pipeline
+
+__all__ = ["create_pipeline"]

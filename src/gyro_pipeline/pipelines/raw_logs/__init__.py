@@ -1,0 +1,5 @@
+"""Logs in, labelled recordings out."""
+
+from gyro_pipeline.pipelines.raw_logs.pipeline import create_pipeline
+
+__all__ = ["create_pipeline"]

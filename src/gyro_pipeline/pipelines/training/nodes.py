@@ -1,0 +1,218 @@
+"""Nodes of the training stage."""
+
+import logging
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pandas as pd
+import xarray as xr
+
+from gyro_pipeline.conventions import TEST_IMU, TRAIN, VALIDATION, InputError
+from gyro_pipeline.fingerprints import code_hash, fingerprint
+from gyro_pipeline.learning import examples, jobs, network, packing, trainer
+from gyro_pipeline.learning.examples import Device
+from gyro_pipeline.learning.executors import run_jobs
+from gyro_pipeline.learning.jobs import TrainingJob, run_training
+from gyro_pipeline.parameters import Execution, Only, Splits, Study, Training, VirtualGyros
+from gyro_pipeline.protocol.splits import check_roles, with_role
+from gyro_pipeline.protocol.windows import window_size
+from gyro_pipeline.studies import CNN, Cell, over_folds, run_params, study_cells
+from gyro_pipeline.tracking import FINGERPRINT, HISTORY, TRAINED_IN, WEIGHTS, StoredRun, TrainedRun
+
+logger = logging.getLogger(__name__)
+
+
+def plan(
+    study: Study,
+    recordings: xr.Dataset,
+    roles: pd.DataFrame,
+    windows_s: list[float],
+    seeds: list[int],
+    only: Only,
+    training: Training,
+    virtual: xr.Dataset | None = None,
+) -> pd.DataFrame:
+    """List the runs that the study needs on this sensor, before anything is trained.
+
+    Args:
+        study: Its grid.
+        recordings: Real recordings.
+        roles: Which of them train, validate and test, in each fold.
+        windows_s: Calibration times, seconds.
+        seeds: Of the networks.
+        only: Narrows the grid.
+        training: Hyper-parameters; part of each fingerprint.
+        virtual: Virtual recordings, where the study uses some.
+
+    Returns:
+        A row per run: the fields of :class:`~gyro_pipeline.studies.Cell`, ``folds`` and the
+        ``fingerprint`` of all that its training depends on.
+
+    Raises:
+        InputError: If the recordings cannot give what the grid asks for.
+    """
+    check_roles(roles)
+    sensor, source = recordings.attrs["sensor"], recordings.attrs["source"]
+    folds = sorted(roles.fold.unique().tolist())
+    cells = study_cells(study, sensor, source, windows_s, seeds, only)
+    cells = over_folds(cells, folds, only)
+    for cell in cells:
+        _check(cell, recordings)
+    code = code_hash([examples, jobs, network, packing, trainer])
+    rows = []
+    for cell in cells:
+        content = cell.content | {"recordings": recordings.attrs["data_hash"]}
+        if cell.estimator == CNN:
+            content |= {"training": training.model_dump(), "code": code}
+            content |= {"roles": roles[roles.fold == cell.fold].role.tolist()}
+        if cell.virtual_gyros and virtual is not None:
+            content |= {"virtual": virtual.attrs["data_hash"]}
+        hashed = fingerprint(content)
+        rows.append({name: getattr(cell, name) for name in Cell.names()} | {FINGERPRINT: hashed})
+    return pd.DataFrame(rows).assign(folds=len(folds))
+
+
+def train(  # noqa: PLR0913 - a node's arguments are its datasets
+    cells: pd.DataFrame,
+    tracked: list[StoredRun],
+    recordings: xr.Dataset,
+    bias: pd.DataFrame,
+    roles: pd.DataFrame,
+    training: Training,
+    splits: Splits,
+    virtual_gyros: VirtualGyros,
+    execution: Execution,
+    virtual: xr.Dataset | None = None,
+) -> Iterator[TrainedRun]:
+    """Train what the plan asks for and no study has trained yet; each run is saved when it ends.
+
+    Args:
+        cells: From :func:`plan`.
+        tracked: All trained runs on these logs, of any study.
+        recordings: Real recordings; workers read only what they need of them.
+        bias: Their ground truth.
+        roles: Which of them train and validate, in each fold.
+        training: Hyper-parameters.
+        splits: Recorded with each run.
+        virtual_gyros: Which virtual recordings train.
+        execution: How trainings are run.
+        virtual: Virtual recordings, where the study uses some.
+
+    Yields:
+        Runs that wait for their evaluation.
+    """
+    planned = {row[FINGERPRINT]: _cell(row) for row in cells.to_dict("records")}
+    folds = int(cells.folds.iloc[0])
+    data = {"data_hash": recordings.attrs["data_hash"], "simulated": str(recordings.attrs["simulated"])}
+
+    def run(fp: str, started: float, tags: dict[str, str], **left: Any) -> TrainedRun:
+        params = run_params(planned[fp], folds, training, splits, virtual_gyros)
+        tags = data | {FINGERPRINT: fp} | tags
+        return TrainedRun(planned[fp].study, params, tags, _ms(started), _ms(time.time()), **left)
+
+    study = next(iter(planned.values())).study
+    here = {run.fingerprint for run in tracked if run.study == study}
+    elsewhere = {run.fingerprint: run for run in tracked}
+    missing = [fp for fp in planned if fp not in here]
+    shared = [fp for fp in missing if fp in elsewhere]
+    to_train = [fp for fp in missing if fp not in elsewhere and planned[fp].estimator == CNN]
+    label = f"{study} {recordings.attrs['sensor']}"
+    logger.info(
+        "%s: %d runs planned, %d skipped (trained before), %d shared with another study, %d to train",
+        *(label, len(planned), len(planned) - len(missing), len(shared), len(to_train)),
+    )
+    for fp in missing:
+        if fp in shared:
+            twin = elsewhere[fp]
+            left = _copied(twin) if planned[fp].estimator == CNN else {}
+            yield run(fp, time.time(), {TRAINED_IN: twin.tags.get(TRAINED_IN, twin.study)}, **left)
+        elif fp not in to_train:
+            yield run(fp, time.time(), {})
+    devices = Devices(recordings, _labelled(bias), roles, virtual, virtual_gyros)
+    todo = [devices.job(fp, planned[fp], training) for fp in to_train]
+    for job, trained in run_jobs(todo, run_training, execution, label):
+        artifacts = {WEIGHTS: trained.artifact, HISTORY: trained.history}
+        ended = {"best_epoch": str(trained.artifact["best_epoch"])}
+        yield run(job.name, trained.started, ended, history=trained.history, artifacts=artifacts)
+
+
+class Devices:
+    """Training devices of each cell: real IMUs first, the test IMU first of all."""
+
+    def __init__(
+        self,
+        recordings: xr.Dataset,
+        bias: xr.DataArray,
+        roles: pd.DataFrame,
+        virtual: xr.Dataset | None,
+        virtual_gyros: VirtualGyros,
+    ) -> None:
+        self._recordings, self._bias, self._roles = recordings, bias, roles
+        self._virtual, self._virtual_gyros = virtual, virtual_gyros
+
+    def job(self, name: str, cell: Cell, training: Training) -> TrainingJob:
+        """The training of a cell, under a name of the caller's choice."""
+        samples, rate_hz = self._recordings.sizes["sample"], self._recordings.attrs["rate_hz"]
+        imus = tuple(range(TEST_IMU, TEST_IMU + cell.real_imus))
+        inputs = [imus] if cell.method == 1 else [(imu,) for imu in imus]
+        devices = [self._real(side_by_side, cell.fold, TRAIN) for side_by_side in inputs]
+        devices += [self._virtual_imu(imu) for imu in range(1, 1 + cell.virtual_imus)]
+        validation = self._real(inputs[0], cell.fold, VALIDATION)
+        return TrainingJob(
+            name=name,
+            devices=devices,
+            validation=validation if validation.numbers else None,
+            window=window_size(cell.window_s, rate_hz, samples, cell.sensor),
+            settings=training,
+            seed=cell.seed,
+        )
+
+    def _real(self, imus: tuple[int, ...], fold: int, role: str) -> Device:
+        rates, numbers = self._recordings.angular_rate, with_role(self._roles, fold, role)
+        present = ~rates.isel(sample=0).sel(imu=list(imus)).isnull().any(["imu", "axis"])
+        with_data = set(rates.recording[present.to_numpy()].to_numpy().tolist())
+        return Device(rates, self._bias, imus, tuple(n for n in numbers if n in with_data))
+
+    def _virtual_imu(self, imu: int) -> Device:
+        if self._virtual is None:
+            raise InputError("virtual gyroscopes asked of a pipeline that makes none")
+        numbers = range(1, 1 + self._virtual_gyros.train_recordings)
+        return Device(
+            self._virtual.angular_rate, self._virtual.recording_mean.load(), (imu,), tuple(numbers)
+        )
+
+
+def _check(cell: Cell, recordings: xr.Dataset) -> None:
+    samples, rate_hz = recordings.sizes["sample"], recordings.attrs["rate_hz"]
+    window_size(cell.window_s, rate_hz, samples, cell.sensor)
+    if cell.real_imus > recordings.sizes["imu"]:
+        available = 3 * recordings.sizes["imu"]
+        raise InputError(
+            f"{cell.sensor}: {cell.real_gyros} gyroscopes asked by {cell.study}, the "
+            f"{cell.source} recordings hold {available}; narrow with --params=only.real_gyros=..."
+        )
+    side_by_side = recordings.imu <= (cell.real_imus if cell.method == 1 else TEST_IMU)
+    absent = recordings.angular_rate.isel(sample=0, imu=side_by_side.to_numpy()).isnull()
+    for number in recordings.recording[absent.any(["imu", "axis"]).to_numpy()].to_numpy():
+        raise InputError(
+            f"{cell.sensor} recording {number}: expected IMUs 1 to {max(cell.real_imus, 1)} side "
+            f"by side for {cell.study} (method {cell.method}), not all are there"
+        )
+
+
+def _cell(row: dict[str, Any]) -> Cell:
+    return Cell(**{name: row[name] for name in Cell.names()})
+
+
+def _labelled(bias: pd.DataFrame) -> xr.DataArray:
+    return bias.set_index(["imu", "recording", "axis"]).bias_dps.to_xarray()
+
+
+def _copied(twin: StoredRun) -> dict[str, Any]:
+    history = twin.load(HISTORY)
+    return {"history": history, "artifacts": {WEIGHTS: twin.load(WEIGHTS), HISTORY: history}}
+
+
+def _ms(seconds: float) -> int:
+    return int(1000 * seconds)

@@ -1,0 +1,67 @@
+"""Nodes of the virtual-gyroscopes stage."""
+
+import zlib
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from gyro_pipeline.conventions import AXES, DIMENSIONS, HOLD_OUT, MDPS, TRAIN, InputError
+from gyro_pipeline.fingerprints import data_hash
+from gyro_pipeline.parameters import VirtualGyros
+from gyro_pipeline.physics.bias import recording_mean
+from gyro_pipeline.protocol.splits import with_role
+
+
+def synthesise(
+    recordings: xr.Dataset, bias: pd.DataFrame, roles: pd.DataFrame, virtual_gyros: VirtualGyros
+) -> xr.Dataset:
+    """Virtual gyroscopes like the real ones in training (paper, section IV-A).
+
+    Each has one bias, drawn uniformly between the smallest and the largest measured one, and
+    white noise of the real gyroscopes' sample sigma around it, in every recording.
+
+    Args:
+        recordings: The real ones, for their rate and length.
+        bias: Their ground truth; only training recordings are used.
+        roles: Which recordings train.
+        virtual_gyros: Counts, turn-on jitter and seed.
+
+    Returns:
+        Recordings in the layout of the real ones, with ``recording_mean`` (imu, recording, axis).
+
+    Raises:
+        InputError: If the split is a k-fold: each fold would need gyroscopes of its own.
+    """
+    sensor = recordings.attrs["sensor"]
+    if (roles.fold != HOLD_OUT).any():
+        raise InputError(
+            f"{sensor}: virtual gyroscopes need a hold-out split, got a k-fold of "
+            f"{roles.recording.nunique()} recordings; set virtual_gyros to 0 in this study"
+        )
+    training = bias[bias.recording.isin(with_role(roles, HOLD_OUT, TRAIN))]
+    sigma = np.sqrt(np.mean(training.sample_sigma_dps**2))
+    generator = np.random.default_rng([virtual_gyros.seed, zlib.crc32(sensor.encode())])
+    shape = (virtual_gyros.imus, virtual_gyros.recordings, len(AXES))
+    drawn = generator.uniform(
+        training.bias_dps.min(), training.bias_dps.max(), size=(shape[0], 1, shape[2])
+    )
+    jitter = generator.standard_normal(shape) * virtual_gyros.turn_on_jitter_mdps * MDPS
+    samples = generator.standard_normal((*shape, recordings.sizes["sample"]), dtype=np.float32)
+    samples *= np.float32(sigma)
+    samples += (drawn + jitter)[..., None].astype(np.float32)
+    labels = {"imu": np.arange(1, shape[0] + 1), "recording": np.arange(1, shape[1] + 1)}
+    return xr.Dataset(
+        {
+            "angular_rate": (DIMENSIONS, samples),
+            "recording_mean": (DIMENSIONS[:-1], recording_mean(samples)),
+        },
+        coords=labels | {"axis": list(AXES)},
+        attrs={
+            "sensor": sensor,
+            "source": recordings.attrs["source"],
+            "simulated": 1,
+            "rate_hz": recordings.attrs["rate_hz"],
+            "data_hash": data_hash(samples, [sensor, "virtual"]),
+        },
+    )

@@ -1,0 +1,212 @@
+"""From squared errors to RMSE, time saving and accuracy gain, with intervals over recordings.
+
+Squared errors are pooled over windows, axes and recordings; signed errors are never averaged
+first, which would make even the running mean look several times better. Intervals resample whole
+recordings, since windows and axes of one recording share its history.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from gyro_pipeline.conventions import FIRST
+
+CONFIDENCE_PCT = 95
+_TAILS = np.array([0.5 - CONFIDENCE_PCT / 200, 0.5 + CONFIDENCE_PCT / 200])
+
+
+@dataclass(frozen=True)
+class SquaredErrors:
+    """Sums of squared errors by recording, and how many squares each sum holds.
+
+    Attributes:
+        sums: (deg/s)^2, shape (recordings,) or (recordings, times).
+        counts: Same shape.
+    """
+
+    sums: np.ndarray
+    counts: np.ndarray
+
+    def mean(self, weights: np.ndarray) -> np.ndarray:
+        """Pooled mean square for each weighting of the recordings, (deg/s)^2.
+
+        Args:
+            weights: Shape (resamples, recordings).
+
+        Returns:
+            Shape (resamples,) or (resamples, times).
+        """
+        return (weights @ self.sums) / (weights @ self.counts)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value with its 95 % interval; the ends are None where the data carry no interval."""
+
+    value: float
+    lo: float | None = None
+    hi: float | None = None
+
+
+def squared_errors(errors: pd.DataFrame, truth: str, windows: str) -> SquaredErrors:
+    """Squares of the chosen errors by recording, in order of recording number.
+
+    Args:
+        errors: Columns ``recording, window, truth, error_dps, truth_variance``; several runs of
+            the same windows (seeds, folds) may be concatenated.
+        truth: One of the truths.
+        windows: ``first`` or ``all``.
+    """
+    chosen = errors[errors.truth == truth]
+    if windows == FIRST:
+        chosen = chosen[chosen.window == 0]
+    squares = chosen.error_dps**2 - chosen.truth_variance
+    by_recording = squares.groupby(chosen.recording).agg(["sum", "count"])
+    return SquaredErrors(by_recording["sum"].to_numpy(), by_recording["count"].to_numpy())
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Squared errors of the running mean against its length.
+
+    Attributes:
+        times_s: Shape (times,), increasing, seconds.
+        squares: With shapes (recordings, times).
+    """
+
+    times_s: np.ndarray
+    squares: SquaredErrors
+
+
+def curve_errors(curve: pd.DataFrame, truth: str, windows: str) -> Curve:
+    """The chosen running-mean curve by recording, in order of recording number.
+
+    Args:
+        curve: From :func:`gyro_pipeline.protocol.truths.running_mean_curve`, concatenated.
+        truth: One of the truths.
+        windows: ``first`` or ``all``.
+    """
+    chosen = curve[(curve.truth == truth) & (curve.windows == windows)]
+    table = chosen.pivot(index="recording", columns="time_s", values=["sum_sq", "count"])
+    squares = SquaredErrors(table["sum_sq"].to_numpy(), table["count"].to_numpy())
+    return Curve(table["sum_sq"].columns.to_numpy(float), squares)
+
+
+def resampled_weights(recordings: int, resamples: int, seed: int) -> np.ndarray:
+    """Weights of a bootstrap over recordings: first row the data themselves, then resamples.
+
+    Returns:
+        Shape (1 + resamples, recordings); only the first row for a single recording, which
+        carries no interval.
+    """
+    plain = np.ones((1, recordings))
+    if recordings == 1:
+        return plain
+    draws = np.random.default_rng(seed).multinomial(
+        recordings, np.full(recordings, 1 / recordings), size=resamples
+    )
+    return np.concatenate([plain, draws])
+
+
+def with_interval(values: np.ndarray) -> Estimate:
+    """The first value, with the central 95 % of the others as its interval.
+
+    Args:
+        values: Shape (1 + resamples,), may hold infinities.
+    """
+    if len(values) == 1:
+        return Estimate(float(values[0]))
+    # "inverted_cdf" never interpolates, so that infinities stay what they are.
+    lo, hi = np.quantile(values[1:], _TAILS, method="inverted_cdf")
+    return Estimate(float(values[0]), float(lo), float(hi))
+
+
+def equivalent_time(times_s: np.ndarray, curves: np.ndarray, levels: np.ndarray) -> np.ndarray:
+    """First time at which the running mean is as good as a level, linearly interpolated.
+
+    Args:
+        times_s: Shape (times,), increasing.
+        curves: RMSE of the running mean, shape (n, times), deg/s.
+        levels: RMSE to reach, shape (n,), deg/s.
+
+    Returns:
+        Shape (n,), seconds; 0 where the curve starts at or below the level, inf where it never
+        gets there (t* of the paper, section IV-C).
+    """
+    reached = curves <= levels[:, None]
+    after = reached.argmax(axis=1)
+    before = np.maximum(after - 1, 0)
+    rows = np.arange(len(levels))
+    high, low = curves[rows, before], curves[rows, after]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        fraction = np.where(high > low, (high - levels) / (high - low), 0.0)
+    times = times_s[before] + fraction * (times_s[after] - times_s[before])
+    return np.where(~reached.any(axis=1), np.inf, np.where(after == 0, 0.0, times))
+
+
+def score(
+    errors: SquaredErrors,
+    mean_errors: SquaredErrors,
+    curve: Curve,
+    window_s: float,
+    weights: np.ndarray,
+) -> dict[str, Estimate]:
+    """The paper's figures of merit, each with its interval over recordings.
+
+    Args:
+        errors: Of the estimator judged.
+        mean_errors: Of the running mean on the same windows.
+        curve: Of the running mean.
+        window_s: T0, seconds.
+        weights: From :func:`resampled_weights`.
+
+    Returns:
+        ``test_mse_dps2`` always; ``test_rmse_dps``, ``mean_rmse_dps``, ``accuracy_gain_pct``,
+        ``equivalent_time_s`` and ``time_saving_pct`` where their squares are positive. A truth
+        whose own noise was taken off can leave a negative square: it is reported, not clipped.
+    """
+    mse, mean_mse = errors.mean(weights), mean_errors.mean(weights)
+    scores = {"test_mse_dps2": with_interval(mse)}
+    lowest = [s.lo if s.lo is not None else s.value for s in map(with_interval, (mse, mean_mse))]
+    if min(lowest) < 0:
+        return scores
+    rmse, mean_rmse, curves = (
+        np.sqrt(np.maximum(square, 0.0)) for square in (mse, mean_mse, curve.squares.mean(weights))
+    )
+    scores["test_rmse_dps"] = with_interval(rmse)
+    scores["mean_rmse_dps"] = with_interval(mean_rmse)
+    times = equivalent_time(curve.times_s, curves, rmse)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        gains = np.where(rmse == mean_rmse, 0.0, 1 - rmse / mean_rmse)
+        savings = 1 - window_s / times
+    scores["equivalent_time_s"] = with_interval(times)
+    scores["time_saving_pct"] = with_interval(100 * savings)
+    scores["accuracy_gain_pct"] = with_interval(100 * gains)
+    return scores
+
+
+def beats_oracle(errors: SquaredErrors, oracle: SquaredErrors) -> float:
+    """One-sided p value that an estimator is better than the oracle on the same windows.
+
+    Paired over recordings: under the null the mean square of the oracle is not the larger one.
+
+    Returns:
+        Small values speak against the evaluation: nothing honest can beat the oracle.
+    """
+    difference = errors.sums / errors.counts - oracle.sums / oracle.counts
+    if np.ptp(difference) == 0:
+        return 1.0
+    return float(stats.ttest_1samp(difference, 0.0, alternative="less").pvalue)
+
+
+def holm(p_values: Sequence[float]) -> np.ndarray:
+    """Holm's step-down correction for the number of checks; shape as given."""
+    p = np.asarray(p_values, dtype=float)
+    order = np.argsort(p)
+    steps = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
+    corrected = np.empty_like(p)
+    corrected[order] = np.minimum(steps, 1.0)
+    return corrected

@@ -1,0 +1,123 @@
+"""The truths an estimate is judged against, and the running mean's error against each."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pandas as pd
+
+from gyro_pipeline.conventions import ALL, AXES, DISJOINT, FIRST, PAPER, TRUE
+
+CURVE_STEP_S = 0.25
+"""Resolution of the running-mean curve; the equivalent time is interpolated between points."""
+
+LAST_DISJOINT_FRACTION = 0.75
+"""The disjoint curve ends here: what is left of a recording later is too short to be a truth."""
+
+
+@dataclass(frozen=True)
+class TestRecording:
+    """One recording of the test IMU, with all that is needed to judge an estimate on it.
+
+    Attributes:
+        number: Recording number.
+        samples: Shape (3, n), deg/s.
+        rate_hz: Sample rate, Hz.
+        noise: N per axis from training recordings (drawn, if simulated), (3,), deg/s sqrt(s).
+        true_bias: Drawn bias, shape (3,), deg/s; None on measured data.
+    """
+
+    number: int
+    samples: np.ndarray
+    rate_hz: float
+    noise: np.ndarray
+    true_bias: np.ndarray | None
+
+    @cached_property
+    def running_sums(self) -> np.ndarray:
+        """Sum of the first i samples in float64, shape (3, n + 1)."""
+        sums = np.cumsum(self.samples, axis=-1, dtype=np.float64)
+        return np.concatenate([np.zeros((len(AXES), 1)), sums], axis=-1)
+
+    def window_sums(self, size: int) -> np.ndarray:
+        """Sums of all non-overlapping windows, shape (windows, 3)."""
+        count = self.samples.shape[-1] // size
+        return np.diff(self.running_sums[:, :: size][:, : count + 1]).T
+
+    def truths(self, size: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """The truth for every window, with that truth's own averaging variance.
+
+        ``PAPER``, the mean of the whole recording, counts as exact (the paper's definition).
+        ``DISJOINT``, the mean of the samples outside the window, is off by N^2 / (T - T0), which
+        is to be taken off the squared error. ``TRUE`` is the drawn bias of simulated data.
+
+        Args:
+            size: Samples per window.
+
+        Returns:
+            For each truth its value, shape (windows, 3) in deg/s, and variance, shape (3,).
+        """
+        n = self.samples.shape[-1]
+        sums, total = self.window_sums(size), self.running_sums[:, -1]
+        exact = np.zeros(len(AXES))
+        truths = {PAPER: (np.broadcast_to(total / n, sums.shape), exact)}
+        if size < n:
+            variance = self.noise**2 * self.rate_hz / (n - size)
+            truths[DISJOINT] = ((total - sums) / (n - size), variance)
+        if self.true_bias is not None:
+            truths[TRUE] = (np.broadcast_to(self.true_bias, sums.shape), exact)
+        return truths
+
+
+def error_table(recording: TestRecording, size: int, estimates: np.ndarray) -> pd.DataFrame:
+    """Errors of the estimates on one recording, a row per window, axis and truth.
+
+    Args:
+        recording: What was estimated.
+        size: Samples per window.
+        estimates: Shape (windows, 3), deg/s.
+
+    Returns:
+        Columns ``recording, window, axis, truth, error_dps, truth_variance``.
+    """
+    n = len(estimates)
+    return pd.concat(
+        pd.DataFrame(
+            {
+                "recording": recording.number,
+                "window": np.repeat(np.arange(n), len(AXES)),
+                "axis": np.tile(AXES, n),
+                "truth": truth,
+                "error_dps": (estimates - value).ravel(),
+                "truth_variance": np.tile(variance, n),
+            }
+        )
+        for truth, (value, variance) in recording.truths(size).items()
+    )
+
+
+def running_mean_curve(recording: TestRecording, size: int) -> pd.DataFrame:
+    """Squared error of the running mean against its length, for one recording.
+
+    Args:
+        recording: What is averaged.
+        size: Samples of the study's window; a point of the curve lies exactly there.
+
+    Returns:
+        Columns ``recording, truth, windows`` (``first`` or ``all``), ``time_s``, ``sum_sq`` in
+        (deg/s)^2 with the truth's own variance taken off, and ``count`` of squares in the sum.
+    """
+    n = recording.samples.shape[-1]
+    step = max(1, round(CURVE_STEP_S * recording.rate_hz))
+    rows = []
+    for length in np.unique([*range(step, n, step), size, n]).tolist():
+        estimates = recording.window_sums(length) / length
+        time_s = length / recording.rate_hz
+        for truth, (value, variance) in recording.truths(length).items():
+            if truth == DISJOINT and length > LAST_DISJOINT_FRACTION * n:
+                continue
+            squares = (estimates - value) ** 2 - variance
+            for windows, part in ((FIRST, squares[:1]), (ALL, squares)):
+                rows.append((recording.number, truth, windows, time_s, part.sum(), part.size))
+    columns = ["recording", "truth", "windows", "time_s", "sum_sq", "count"]
+    return pd.DataFrame(rows, columns=columns)

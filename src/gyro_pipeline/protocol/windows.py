@@ -1,0 +1,41 @@
+"""Windows: what an estimator sees of a recording."""
+
+import numpy as np
+
+from gyro_pipeline.conventions import InputError
+
+
+def window_size(window_s: float, rate_hz: float, recording_samples: int, where: str) -> int:
+    """Samples of a window.
+
+    Args:
+        window_s: Calibration time T0, seconds.
+        rate_hz: Sample rate, Hz.
+        recording_samples: Samples of a whole recording.
+        where: What an error message calls the recordings, e.g. the sensor.
+
+    Raises:
+        InputError: If the window is longer than the recording.
+    """
+    size = round(window_s * rate_hz)
+    if not 1 <= size <= recording_samples:
+        raise InputError(
+            f"{where}: a window of {window_s:g} s is {size} samples at {rate_hz:.5g} Hz, but a "
+            f"recording has {recording_samples} ({recording_samples / rate_hz:.4g} s); "
+            "choose windows_s within it"
+        )
+    return size
+
+
+def cut_windows(samples: np.ndarray, size: int) -> np.ndarray:
+    """All non-overlapping windows from the start of a recording, as a view.
+
+    Args:
+        samples: Shape (..., n).
+        size: Samples per window.
+
+    Returns:
+        Shape (..., n // size, size); the last n % size samples are in no window.
+    """
+    count = samples.shape[-1] // size
+    return samples[..., : count * size].reshape(*samples.shape[:-1], count, size)

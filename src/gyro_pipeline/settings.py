@@ -1,0 +1,12 @@
+"""Kedro settings (https://docs.kedro.org)."""
+
+from gyro_pipeline.hooks import Preflight, Provenance
+
+HOOKS = (Preflight(), Provenance())
+
+CONFIG_LOADER_ARGS = {
+    "base_env": "base",
+    "default_run_env": "local",
+    # Environments hold differences only, at any depth.
+    "merge_strategy": {"parameters": "soft", "globals": "soft"},
+}

@@ -1,0 +1,295 @@
+import os
+import pickle
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from kedro.io import DatasetError
+
+from gyro_pipeline.conventions import InputError
+from gyro_pipeline.datasets.array_logs import LAYOUT, ArrayLogs
+
+SENSORS = {
+    "memsense": {
+        "imus": 2,
+        "recordings": 100,
+        "train_recordings": 80,
+        "samples": 13000,
+        "recording_s": 52,
+        "datasheet": {
+            "rate_hz": [250, 250],
+            "noise_density_mdps_rthz": 14.8,
+            "bias_stability_dph": 2.6,
+        },
+        "simulated": {
+            "noise_mdps_rts": [5.3, 4.7, 6.0],
+            "turn_on_spread_mdps": [0.4, 0, 2.0],
+            "unit_bias_dps": 0.02,
+        },
+    }
+}
+TRAIN_TEST = {"train": "train.npy", "test": "test.npy"}
+
+
+def array_logs(folder, files=None, **options):
+    options = {"sensor": "memsense", "sensors": SENSORS, "source": "array"} | options
+    return ArrayLogs(path=str(folder), files=files or {"all": "all.npy"}, **options)
+
+
+def made(recordings, gyroscopes, samples, seed=0):
+    return np.random.default_rng(seed).normal(size=(recordings, gyroscopes, samples))
+
+
+def ramps(recordings, gyroscopes, samples):
+    """Every value tells its recording, gyroscope and sample: 11.0207 is 10, 1 and 207."""
+    r, g, s = np.ogrid[:recordings, :gyroscopes, :samples]
+    return 100.0 * r + g + s / 10_000
+
+
+def refusal(logs):
+    with pytest.raises(DatasetError) as caught:
+        logs.load()
+    assert isinstance(caught.value.__cause__, InputError)
+    return str(caught.value.__cause__)
+
+
+@pytest.mark.parametrize("order", list(permutations(LAYOUT)))
+def test_any_axis_order_gives_the_same_labelled_recordings(tmp_path, order):
+    array = ramps(5, 6, 200)
+    np.save(tmp_path / "all.npy", array.transpose([LAYOUT.index(name) for name in order]))
+    logs = array_logs(tmp_path).load()
+    rate = logs.angular_rate
+    assert rate.dims == ("imu", "recording", "axis", "sample")
+    assert rate.dtype == np.float32
+    # gyroscope 4 (0-based) is IMU 2's y axis
+    picked = rate.sel(imu=2, recording=5, axis="y")
+    np.testing.assert_array_equal(picked, array[4, 4].astype(np.float32))
+    np.save(tmp_path / "plain.npy", array)
+    plain = array_logs(tmp_path, {"all": "plain.npy"}).load()
+    xr.testing.assert_identical(logs, plain)
+
+
+def test_labels_and_provenance(tmp_path):
+    np.save(tmp_path / "all.npy", made(5, 6, 200))
+    logs = array_logs(tmp_path).load()
+    assert logs.imu.values.tolist() == [1, 2]
+    assert logs.recording.values.tolist() == [1, 2, 3, 4, 5]
+    assert logs.axis.values.tolist() == ["x", "y", "z"]
+    assert "given_split" not in logs.coords
+    digest = logs.attrs.pop("data_hash")
+    assert len(digest) == 64
+    assert logs.attrs == {"sensor": "memsense", "source": "array", "simulated": 0, "rate_hz": 250}
+
+
+def test_train_and_test_are_numbered_on_and_missing_imus_are_nan(tmp_path):
+    train, test = ramps(7, 6, 200), 1000 + ramps(2, 3, 200)
+    np.save(tmp_path / "train.npy", train)
+    np.save(tmp_path / "test.npy", test)
+    logs = array_logs(tmp_path, {"test": "test.npy", "train": "train.npy"}).load()
+    assert logs.given_split.values.tolist() == ["train"] * 7 + ["test"] * 2
+    assert logs.recording.values.tolist() == list(range(1, 10))
+    np.testing.assert_array_equal(
+        logs.angular_rate.sel(imu=1, recording=9, axis="z"), test[1, 2].astype(np.float32)
+    )
+    np.testing.assert_array_equal(
+        logs.angular_rate.sel(imu=2, recording=7, axis="z"), train[6, 5].astype(np.float32)
+    )
+    lacking = np.isnan(logs.angular_rate).all(("axis", "sample"))
+    assert lacking.values.tolist() == [[False] * 9, [False] * 7 + [True] * 2]
+    assert int(np.isnan(logs.angular_rate).sum()) == 2 * 3 * 200
+
+
+def test_hash_changes_with_one_sample_the_split_and_the_sensor(tmp_path):
+    array = made(7, 3, 200).astype(np.float32)
+    np.save(tmp_path / "all.npy", array)
+    np.save(tmp_path / "train.npy", array[:4])
+    np.save(tmp_path / "test.npy", array[4:])
+    whole = array_logs(tmp_path).load()
+    split = array_logs(tmp_path, TRAIN_TEST).load()
+    np.testing.assert_array_equal(whole.angular_rate, split.angular_rate)
+    other = array_logs(tmp_path, sensor="ng", sensors={"ng": SENSORS["memsense"]}).load()
+    array[5, 2, 199] = np.nextafter(array[5, 2, 199], np.float32(9))
+    np.save(tmp_path / "all.npy", array)
+    changed = array_logs(tmp_path).load()
+    assert len({logs.data_hash for logs in (whole, split, other, changed)}) == 4
+
+
+def test_integers_and_fortran_order_are_read(tmp_path):
+    array = np.asfortranarray(np.arange(5 * 3 * 60, dtype=np.int16).reshape(5, 3, 60))
+    np.save(tmp_path / "all.npy", array)
+    rate = array_logs(tmp_path).load().angular_rate
+    np.testing.assert_array_equal(rate.squeeze("imu"), array)
+
+
+def test_the_other_file_settles_an_ambiguous_shape(tmp_path):
+    np.save(tmp_path / "train.npy", made(9, 6, 200))
+    assert "[recording, gyroscope, sample] or [gyroscope, recording, sample]" in refusal(
+        array_logs(tmp_path, {"all": "train.npy"})
+    )
+    np.save(tmp_path / "test.npy", made(2, 6, 200))
+    assert dict(array_logs(tmp_path, TRAIN_TEST).load().sizes)["recording"] == 11
+
+
+def test_ambiguous_shape_is_refused_with_the_way_out_and_axes_order_settles_it(tmp_path):
+    np.save(tmp_path / "all.npy", ramps(9, 6, 200))
+    message = refusal(array_logs(tmp_path))
+    assert message.startswith("memsense all.npy of shape (9, 6, 200): cannot tell which axis")
+    assert "axes_order: [recording, gyroscope, sample]" in message
+    logs = array_logs(tmp_path, axes_order=["gyroscope", "recording", "sample"]).load()
+    assert logs.sizes == {"imu": 3, "recording": 6, "axis": 3, "sample": 200}
+    assert logs.angular_rate.sel(imu=3, recording=2, axis="x")[7] == np.float32(601.0007)
+
+
+def test_axes_order_reads_shapes_that_do_not_look_like_logs(tmp_path):
+    np.save(tmp_path / "all.npy", made(50, 3, 60))
+    assert "sample] or" not in refusal(array_logs(tmp_path))
+    assert refusal(array_logs(tmp_path)).endswith(": none")
+    assert array_logs(tmp_path, axes_order=LAYOUT).load().sizes["recording"] == 50
+
+
+@pytest.mark.parametrize(
+    ("order", "said"),
+    [
+        (["sample", "gyroscope", "recording"], "the shape something else"),
+        (["recording", "sample", "gyroscope"], "the shape something else"),
+    ],
+)
+def test_axes_order_against_an_unambiguous_shape_is_refused(tmp_path, order, said):
+    np.save(tmp_path / "all.npy", made(5, 3, 200))
+    message = refusal(array_logs(tmp_path, axes_order=order))
+    assert said in message
+    assert message.endswith("[recording, gyroscope, sample]")
+
+
+def test_axes_order_with_gyroscopes_not_in_threes_is_refused(tmp_path):
+    np.save(tmp_path / "all.npy", made(5, 4, 200))
+    assert "not divisible by 3" in refusal(array_logs(tmp_path, axes_order=LAYOUT))
+
+
+def test_wrong_rank(tmp_path):
+    np.save(tmp_path / "memsense_test_real.npy", np.zeros((2, 600)))
+    assert refusal(array_logs(tmp_path, {"all": "memsense_test_real.npy"})) == (
+        "memsense memsense_test_real.npy: expected 3 axes (recordings, gyroscopes, samples in any "
+        "order), got shape (2, 600)"
+    )
+
+
+def test_missing_file(tmp_path):
+    logs = array_logs(tmp_path, TRAIN_TEST)
+    np.save(tmp_path / "train.npy", made(5, 6, 200))
+    assert not logs.exists()
+    assert f"memsense test.npy: no such file in {tmp_path}" in refusal(logs)
+    np.save(tmp_path / "test.npy", made(2, 3, 200))
+    assert logs.exists()
+
+
+class Trap:
+    """Unpickling one leaves a file behind."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_pickles_are_refused_without_being_loaded(tmp_path):
+    sprung = tmp_path / "sprung"
+    np.save(tmp_path / "all.npy", np.array([[[Trap(sprung)]]], dtype=object), allow_pickle=True)
+    assert "pickled objects, which are never loaded" in refusal(array_logs(tmp_path))
+    (tmp_path / "all.npy").write_bytes(pickle.dumps(Trap(sprung)))
+    assert "pickled objects, which are never loaded" in refusal(array_logs(tmp_path))
+    assert not sprung.exists()
+
+
+def damaged_files():
+    yield "empty", lambda whole: b""
+    yield "truncated header", lambda whole: whole[:40]
+    yield "truncated samples", lambda whole: whole[:-1]
+    yield "text", lambda whole: b"time,w_x,w_y,w_z\n" * 10
+    yield "negative shape", lambda whole: whole.replace(b"(5, 3, 200)", b"(5,3,-200)")
+    yield "unbalanced header", lambda whole: whole.replace(b"(5, 3, 200)", b"(5, 3, 200}")
+
+
+@pytest.mark.parametrize("damage", [pytest.param(f, id=name) for name, f in damaged_files()])
+def test_damaged_files_are_refused_by_name(tmp_path, damage):
+    file = tmp_path / "all.npy"
+    np.save(file, made(5, 3, 200))
+    file.write_bytes(damage(file.read_bytes()))
+    message = refusal(array_logs(tmp_path))
+    assert message.startswith("memsense all.npy: expected a plain numeric .npy file")
+    assert message.endswith(f"replace or delete {file}")
+
+
+@pytest.mark.parametrize("dtype", ["complex64", "bool", "U3", "m8[s]", [("x", "f4")]])
+def test_other_dtypes_are_refused(tmp_path, dtype):
+    np.save(tmp_path / "all.npy", np.zeros((5, 3, 200), dtype))
+    assert refusal(array_logs(tmp_path)) == (
+        f"memsense all.npy: expected real numbers in deg/s, got dtype {np.dtype(dtype)}"
+    )
+
+
+def test_zero_sized(tmp_path):
+    np.save(tmp_path / "all.npy", np.zeros((0, 3, 200)))
+    assert "memsense all.npy: expected recordings, got none" in refusal(array_logs(tmp_path))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300])  # 1e300 overflows float32
+def test_nan_and_infinity_are_located(tmp_path, value):
+    array = made(7, 6, 200)
+    array[[3, 5], 4, 123] = value
+    np.save(tmp_path / "all.npy", array)
+    message = refusal(array_logs(tmp_path))
+    assert message.startswith("memsense all.npy recording 4, IMU 2, axis y: NaN or infinite")
+    assert "(affected recordings: 4, 6)" in message
+
+
+def test_zero_variance_is_located_in_the_file_that_has_it(tmp_path):
+    test = made(2, 3, 200)
+    test[1, 2] = 0.25
+    np.save(tmp_path / "train.npy", made(7, 6, 200))
+    np.save(tmp_path / "test.npy", test)
+    message = refusal(array_logs(tmp_path, TRAIN_TEST))
+    assert message.startswith("memsense test.npy recording 2, IMU 1, axis z: zero variance")
+
+
+def test_different_sample_counts_are_refused(tmp_path):
+    np.save(tmp_path / "train.npy", made(7, 6, 200))
+    np.save(tmp_path / "test.npy", made(2, 3, 201))
+    message = refusal(array_logs(tmp_path, TRAIN_TEST))
+    assert "train.npy of shape (7, 6, 200) and test.npy of shape (2, 3, 201)" in message
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"sensor": "memsens"}, "unknown sensor 'memsens'; conf/base/globals.yml knows memsense"),
+        ({"sensors": {"memsense": SENSORS["memsense"] | {"imus": 0}}}, "imus"),
+        ({"sensors": {"memsense": SENSORS["memsense"] | {"imu": 1}}}, "imu"),
+        ({"files": {"train": "a.npy"}}, "expected train and test, or all, got ['train']"),
+        ({"files": {"train": "a.npy", "test": "a.npy"}}, "name the same file, a.npy"),
+        ({"axes_order": ["recording", "sample"]}, "expected recording, gyroscope, sample"),
+    ],
+)
+def test_a_wrong_entry_is_refused_before_anything_is_read(tmp_path, options, said):
+    with pytest.raises(InputError) as caught:
+        array_logs(tmp_path, **options)
+    assert said in str(caught.value)
+
+
+def test_logs_are_read_only(tmp_path):
+    with pytest.raises(DatasetError, match="read only"):
+        array_logs(tmp_path).save(xr.Dataset())
+
+
+def test_the_real_memsense_file_gives_the_known_running_mean():
+    folder = os.environ.get("GYRO_PIPELINE_REAL_DATA")
+    if not folder:
+        pytest.skip("GYRO_PIPELINE_REAL_DATA does not name the folder of memsense_test_real.npy")
+    rate = array_logs(folder, {"all": "memsense_test_real.npy"}).load().angular_rate
+    assert rate.shape == (1, 11, 3, 13000)
+    samples = rate.values.astype(np.float64)
+    error = samples[..., :2500].mean(axis=-1) - samples.mean(axis=-1)
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(0.0015854, abs=5e-8)

@@ -1,0 +1,148 @@
+import os
+import pickle
+import tracemalloc
+
+import numpy as np
+import pytest
+import xarray as xr
+from kedro.io import DatasetError
+
+from gyro_pipeline.conventions import InputError
+from gyro_pipeline.datasets.atomic import replacing
+from gyro_pipeline.datasets.recordings import Recordings
+
+
+def made(samples=50, offset=0.0):
+    rate = np.arange(2 * 3 * 3 * samples, dtype=np.float32).reshape(2, 3, 3, samples) + offset
+    rate[1, 2] = np.nan
+    return xr.Dataset(
+        {
+            "angular_rate": (("imu", "recording", "axis", "sample"), rate, {"units": "deg/s"}),
+            "settles_after": ("recording", [1.5, np.nan, 3.0], {"units": "s"}),
+            "count": ("recording", [1, 2, 3]),
+        },
+        coords={
+            "imu": [1, 2],
+            "recording": [1, 2, 3],
+            "axis": ["x", "y", "z"],
+            "given_split": ("recording", ["train", "train", "test"]),
+        },
+        attrs={"sensor": "dot", "simulated": 1, "rate_hz": 108.25},
+    )
+
+
+def kept(tmp_path):
+    return Recordings(str(tmp_path / "new" / "dot.nc"))
+
+
+def test_round_trip_is_identical(tmp_path):
+    kept(tmp_path).save(made())
+    back = kept(tmp_path).load()
+    xr.testing.assert_identical(back, made())
+    for name, variable in made().variables.items():
+        assert back[name].dtype == variable.dtype
+    assert {name: type(value) for name, value in back.attrs.items()} == {
+        "sensor": str,
+        "simulated": int,
+        "rate_hz": float,
+    }
+    assert os.listdir(tmp_path / "new") == ["dot.nc"]
+
+
+def test_what_was_read_can_be_saved_to_the_same_file(tmp_path):
+    kept(tmp_path).save(made())
+    kept(tmp_path).save(kept(tmp_path).load() + 1)
+    np.testing.assert_array_equal(kept(tmp_path).load().angular_rate, made().angular_rate + 1)
+
+
+def test_what_was_read_can_be_given_other_values(tmp_path):
+    kept(tmp_path).save(made())
+    back = kept(tmp_path).load()
+    back["count"] = back["count"].copy(data=[0.5, 1.5, 2.5])  # was stored as integers
+    kept(tmp_path).save(back)
+    assert kept(tmp_path).load()["count"].values.tolist() == [0.5, 1.5, 2.5]
+
+
+def test_values_stay_in_the_file_and_pickles_refer_to_it(tmp_path):
+    kept(tmp_path).save(made(samples=100_000))  # 7 MB
+    tracemalloc.start()
+    back = kept(tmp_path).load()
+    assert tracemalloc.get_traced_memory()[1] < 2e6
+    tracemalloc.stop()
+    assert float(back.angular_rate.sum()) > 0
+    window = back.angular_rate.sel(imu=1, axis="y").isel(sample=slice(10, 12))
+    for lazy in (back, window):
+        assert len(pickle.dumps(lazy)) < 20_000
+    np.testing.assert_array_equal(
+        pickle.loads(pickle.dumps(window)), made(100_000).angular_rate[0, :, 1, 10:12]
+    )
+
+
+def test_replacing_a_file_leaves_its_open_readers_alone(tmp_path):
+    kept(tmp_path).save(made())
+    old = kept(tmp_path).load()
+    assert float(old.angular_rate[0, 0, 0, 0]) == 0
+    kept(tmp_path).save(made(offset=7))
+    assert float(old.angular_rate[0, 0, 0, 1]) == 1
+    assert float(kept(tmp_path).load().angular_rate[0, 0, 0, 1]) == 8
+
+
+@pytest.mark.parametrize("size", [0, 100, 5000])
+def test_a_damaged_file_is_named_with_the_way_out(tmp_path, size):
+    kept(tmp_path).save(made(samples=1000))
+    file = tmp_path / "new" / "dot.nc"
+    file.write_bytes(file.read_bytes()[:size])
+    with pytest.raises(DatasetError, match="delete it and run the pipeline") as caught:
+        kept(tmp_path).load()
+    assert isinstance(caught.value.__cause__, InputError)
+    assert str(caught.value.__cause__).startswith(str(file))
+
+
+def test_a_missing_file_is_not_called_damaged(tmp_path):
+    assert not kept(tmp_path).exists()
+    with pytest.raises(DatasetError) as caught:
+        kept(tmp_path).load()
+    assert isinstance(caught.value.__cause__, FileNotFoundError)
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_an_interrupted_write_leaves_the_old_file_and_no_other(tmp_path, error):
+    path = tmp_path / "table.csv"
+    path.write_text("old")
+    with pytest.raises(error), replacing(path) as temporary:
+        assert temporary.suffix == ".csv"
+        assert temporary.parent == path.parent
+        temporary.write_text("half")
+        raise error
+    assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {"table.csv": "old"}
+
+
+def test_a_folder_in_place_of_the_file_is_named(tmp_path):
+    (tmp_path / "table.csv").mkdir()
+    with (
+        pytest.raises(InputError, match="a folder has that name"),
+        replacing(tmp_path / "table.csv"),
+    ):
+        pass
+    assert os.listdir(tmp_path) == ["table.csv"]
+
+
+def test_a_file_in_place_of_a_folder_is_named(tmp_path):
+    (tmp_path / "data").write_text("")
+    with (
+        pytest.raises(InputError, match=f"{tmp_path / 'data'} is a file"),
+        replacing(tmp_path / "data" / "sub" / "table.csv"),
+    ):
+        pass
+
+
+def test_a_folder_that_cannot_be_written_to_is_named(tmp_path, monkeypatch):
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("pathlib.Path.touch", refuse)  # root may write anywhere
+    with (
+        pytest.raises(InputError, match=f"Permission denied in {tmp_path}"),
+        replacing(tmp_path / "table.csv"),
+    ):
+        pass

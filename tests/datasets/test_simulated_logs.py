@@ -1,0 +1,185 @@
+import copy
+import logging
+import os
+
+import numpy as np
+import pytest
+import xarray as xr
+from kedro.io import DatasetError
+
+from gyro_pipeline.datasets import simulated_logs
+from gyro_pipeline.datasets.recordings import Recordings
+from gyro_pipeline.datasets.simulated_logs import SimulatedLogs
+
+DATASHEET = {"rate_hz": [100, 100], "noise_density_mdps_rthz": None, "bias_stability_dph": None}
+SENSORS = {
+    "dot": {
+        "imus": 2,
+        "recordings": 40,
+        "train_recordings": 30,
+        "samples": 400,
+        "recording_s": 4,
+        "datasheet": DATASHEET,
+        "simulated": {
+            "noise_mdps_rts": [3.0, 6.0, 12.0],
+            "turn_on_spread_mdps": [0.0, 50.0, 500.0],
+            "unit_bias_dps": 3,
+        },
+    }
+}
+SENSORS["ng"] = SENSORS["dot"]
+
+
+def simulated(folder, seed=1, sensor="dot", **changes):
+    sensors = copy.deepcopy(SENSORS)
+    sensors[sensor] |= changes
+    return SimulatedLogs(sensor, sensors, "simulated", str(folder), seed)
+
+
+def stamps(folder):
+    return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in folder.iterdir()}
+
+
+def test_files_have_the_published_layout_and_give_what_was_read(tmp_path):
+    logs = simulated(tmp_path).load()
+    assert set(os.listdir(tmp_path)) == {"dot_train.npy", "dot_test.npy", "dot_truth.nc"}
+    train, test = np.load(tmp_path / "dot_train.npy"), np.load(tmp_path / "dot_test.npy")
+    assert (train.shape, test.shape) == ((30, 6, 400), (10, 6, 400))
+    assert train.dtype == test.dtype == np.float32
+    rate = logs.angular_rate
+    np.testing.assert_array_equal(rate.sel(imu=2, recording=30, axis="x"), train[29, 3])
+    np.testing.assert_array_equal(rate.sel(imu=2, recording=31, axis="z"), test[0, 5])
+    assert not np.isnan(rate).any()
+    assert logs.given_split.values.tolist() == ["train"] * 30 + ["test"] * 10
+    assert logs.simulated == 1
+    assert logs.source == "simulated"
+    assert logs.rate_hz == 100
+
+
+def test_truth_has_the_stated_model(tmp_path):
+    logs = simulated(tmp_path).load()
+    assert logs.true_bias.dims == ("imu", "recording", "axis")
+    assert logs.true_bias.dtype == np.float64
+    np.testing.assert_allclose(logs.true_noise, [3e-3, 6e-3, 12e-3], rtol=1e-12)
+    np.testing.assert_allclose(logs.true_turn_on_spread, [0, 0.05, 0.5], rtol=1e-12)
+    assert (abs(logs.true_unit_bias) <= 3).all()
+    assert len(np.unique(logs.true_unit_bias)) == 6
+    turn_on = logs.true_bias - logs.true_unit_bias
+    assert (turn_on.sel(axis="x") == 0).all()
+    # 80 draws: the standard deviation is known to about 8 %
+    np.testing.assert_allclose(turn_on.std(("imu", "recording"))[1:], [0.05, 0.5], rtol=0.3)
+
+
+def test_samples_are_the_bias_plus_noise_of_the_stated_level(tmp_path):
+    logs = simulated(tmp_path).load()
+    noise = logs.angular_rate - logs.true_bias
+    sigma = logs.true_noise * np.sqrt(logs.rate_hz)
+    # 32,000 samples an axis: 1 standard error is 0.4 %
+    np.testing.assert_allclose(noise.std(("imu", "recording", "sample")), sigma, rtol=0.02)
+    # 80 means an axis: their root mean square is N / sqrt(T) to about 8 %
+    means = np.sqrt((noise.mean("sample") ** 2).mean(("imu", "recording")))
+    np.testing.assert_allclose(means, logs.true_noise / np.sqrt(4), rtol=0.35)
+
+
+def test_colour_reaches_the_noise(tmp_path):
+    model = SENSORS["dot"]["simulated"]
+    correlated = simulated(tmp_path / "a", simulated=model | {"lag1_correlation": -0.3}).load()
+    noise = (correlated.angular_rate - correlated.true_bias).values
+    lag1 = (noise[..., 1:] * noise[..., :-1]).mean() / (noise**2).mean()
+    assert lag1 == pytest.approx(-0.3, abs=0.02)
+    flicker = simulated(tmp_path / "b", simulated=model | {"flicker_mdps": 100}).load()
+    means = (flicker.angular_rate - flicker.true_bias).mean("sample")
+    assert float(means.std()) > 0.02  # white noise alone gives 0.004
+
+
+def test_a_second_load_only_reads(tmp_path):
+    first = simulated(tmp_path).load()
+    before = stamps(tmp_path)
+    second = simulated(tmp_path).load()
+    assert stamps(tmp_path) == before
+    xr.testing.assert_identical(first, second)
+
+
+def test_the_seed_and_the_sensor_alone_decide_the_draws(tmp_path):
+    one = simulated(tmp_path / "one").load()
+    again = simulated(tmp_path / "again").load()
+    xr.testing.assert_identical(one, again)
+    for other in (simulated(tmp_path / "two", seed=2), simulated(tmp_path / "ng", sensor="ng")):
+        assert (other.load().true_unit_bias != one.true_unit_bias).all()
+
+
+@pytest.mark.parametrize("changes", [{"seed": 2}, {"train_recordings": 20}, {"recording_s": 8}])
+def test_other_settings_are_written_anew_and_said(tmp_path, caplog, changes):
+    caplog.set_level(logging.INFO, "gyro_pipeline")
+    old = simulated(tmp_path).load()
+    caplog.clear()
+    new = simulated(tmp_path, **changes).load()
+    assert new.data_hash != old.data_hash
+    assert len(caplog.records) == 1
+    assert "writing simulated dot logs anew, since their settings have changed" in caplog.text
+    xr.testing.assert_identical(new, simulated(tmp_path / "fresh", **changes).load())
+
+
+def test_a_changed_datasheet_does_not_touch_the_files(tmp_path):
+    simulated(tmp_path).load()
+    before = stamps(tmp_path)
+    simulated(tmp_path, datasheet=DATASHEET | {"bias_stability_dph": 10}).load()
+    assert stamps(tmp_path) == before
+
+
+def interrupt(*_, **__):
+    raise KeyboardInterrupt
+
+
+def test_interrupted_while_writing_samples_leaves_nothing(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(simulated_logs, "simulate_noise", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            simulated(tmp_path).load()
+    assert os.listdir(tmp_path) == []
+    assert not simulated(tmp_path).exists()
+
+
+def test_interrupted_before_the_mark_is_written_anew(tmp_path, monkeypatch):
+    expected = simulated(tmp_path).load()
+    with monkeypatch.context() as patch:
+        patch.setattr(Recordings, "save", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            simulated(tmp_path, seed=2).load()
+    # the arrays of seed 2 are there: the mark of seed 1 must not vouch for them
+    assert not simulated(tmp_path).exists()
+    xr.testing.assert_identical(simulated(tmp_path).load(), expected)
+
+
+@pytest.mark.parametrize("name", ["dot_train.npy", "dot_test.npy", "dot_truth.nc"])
+def test_a_missing_file_is_made_again(tmp_path, name):
+    expected = simulated(tmp_path).load()
+    (tmp_path / name).unlink()
+    xr.testing.assert_identical(simulated(tmp_path).load(), expected)
+
+
+def test_a_damaged_mark_is_no_mark(tmp_path):
+    expected = simulated(tmp_path).load()
+    (tmp_path / "dot_truth.nc").write_bytes(b"damaged")
+    xr.testing.assert_identical(simulated(tmp_path).load(), expected)
+
+
+def test_samples_that_are_not_those_of_the_truth_are_refused(tmp_path):
+    simulated(tmp_path).load()
+    test = np.load(tmp_path / "dot_test.npy")
+    np.save(tmp_path / "dot_test.npy", test + np.float32(0.001))
+    with pytest.raises(DatasetError, match="changed since it was written"):
+        simulated(tmp_path).load()
+
+
+def test_a_file_in_place_of_the_folder_is_named(tmp_path):
+    blocker = tmp_path / "01_raw"
+    blocker.write_text("")
+    with pytest.raises(DatasetError, match=f"{blocker} is a file where a folder is needed"):
+        simulated(blocker / "simulated").load()
+    assert os.listdir(tmp_path) == ["01_raw"]
+
+
+def test_logs_are_read_only(tmp_path):
+    with pytest.raises(DatasetError, match="read only"):
+        simulated(tmp_path).save(xr.Dataset())

@@ -1,0 +1,59 @@
+import os
+
+import numpy as np
+import pandas as pd
+import pytest
+from kedro.io import DatasetError
+
+from gyro_pipeline.datasets.tables import Table
+
+
+@pytest.fixture
+def table(tmp_path):
+    return Table(str(tmp_path / "new" / "bias.csv"))
+
+
+def test_numbers_come_back_exactly(table):
+    bits = np.random.default_rng(0).integers(0, 2**64, 20_000, dtype=np.uint64)
+    values = bits.view(np.float64)
+    values = np.append(values[~np.isnan(values)], [np.nan, 0.1, 5e-324, np.inf, -np.inf, -0.0])
+    table.save(pd.DataFrame({"bias_dps": values}))
+    back = table.load().bias_dps.to_numpy()
+    np.testing.assert_array_equal(back.view(np.uint64)[:-6], values.view(np.uint64)[:-6])
+    np.testing.assert_array_equal(back[-6:], values[-6:])
+    assert np.signbit(back[-1])
+
+
+def test_columns_keep_their_kinds_and_the_index_is_not_stored(table):
+    data = pd.DataFrame(
+        {"sensor": ["ng", "NA"], "imu": [1, 2], "real": [True, False], "bias_dps": [0.5, np.nan]},
+        index=[7, 9],
+    )
+    table.save(data)
+    pd.testing.assert_frame_equal(table.load(), data.reset_index(drop=True))
+
+
+def test_a_failed_save_keeps_the_old_table(table, tmp_path, monkeypatch):
+    table.save(pd.DataFrame({"a": [1]}))
+
+    def fail(_, path, **__):
+        path.write_text("half")
+        raise RuntimeError("disk full")
+
+    monkeypatch.setattr(pd.DataFrame, "to_csv", fail)
+    with pytest.raises(DatasetError, match="disk full"):
+        table.save(pd.DataFrame({"a": [2]}))
+    assert table.load().a.tolist() == [1]
+    assert os.listdir(tmp_path / "new") == ["bias.csv"]
+
+
+def test_preview_shows_the_first_rows(table):
+    assert not table.exists()
+    table.save(pd.DataFrame({"a": range(100), "b": 0.5}))
+    assert table.exists()
+    assert len(table.preview()["data"]) == 40
+    assert table.preview(nrows=2) == {
+        "index": [0, 1],
+        "columns": ["a", "b"],
+        "data": [[0, 0.5], [1, 0.5]],
+    }

@@ -1,0 +1,183 @@
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gyro_pipeline.conventions import MDPS, InputError
+from gyro_pipeline.physics.allan import (
+    FLICKER_FLOOR,
+    SHORTEST_FIT_SAMPLES,
+    allan_variance,
+    averaging_times_s,
+    fit_noise,
+)
+
+GOLDEN = json.loads((Path(__file__).parent / "golden" / "overlapping_allan.json").read_text())
+RATE = 100.0
+SAMPLES = 10_000
+
+
+def real_file(name):
+    folder = os.environ.get("GYRO_PIPELINE_REAL_DATA")
+    if not folder:
+        pytest.skip("GYRO_PIPELINE_REAL_DATA, the folder of the real recordings, is not set")
+    if not (Path(folder) / name).exists():
+        pytest.skip(f"{name} is not in {folder}")
+    return Path(folder) / name
+
+
+def mean_variance(recordings, rate, times):
+    return np.mean([allan_variance(samples, rate, times) for samples in recordings], axis=0)
+
+
+def fit_mean(recordings, rate):
+    length = recordings.shape[-1]
+    times = averaging_times_s(length, rate)
+    variance = mean_variance(recordings, rate, times)
+    return fit_noise(times, variance, length / rate, SHORTEST_FIT_SAMPLES / rate)
+
+
+def test_nbs14():
+    golden = GOLDEN["nbs14"]
+    frequency, factors = np.array(golden["frequency"]), np.array(golden["averaging_factors"])
+    deviation = np.sqrt(allan_variance(frequency, 1.0, factors))
+    np.testing.assert_allclose(deviation, golden["deviation"], atol=5.1e-6)
+
+
+def test_nist_sp1065_thousand_points():
+    golden = GOLDEN["thousand_points"]
+    numbers = [golden["seed"]]
+    for _ in range(999):
+        numbers.append(golden["multiplier"] * numbers[-1] % golden["modulus"])
+    samples = np.array(numbers) / golden["modulus"]
+    deviation = np.sqrt(allan_variance(samples, 1.0, np.array(golden["averaging_factors"])))
+    np.testing.assert_allclose(deviation, golden["deviation"], rtol=2e-7)
+
+
+@pytest.mark.parametrize("rate", [13000 / 87, 13000 / 120, 200.0, 250.0])
+@pytest.mark.parametrize("n_samples", [60, 130, 13_000])
+def test_averaging_times_are_whole_samples_up_to_a_fifth_and_all_usable(rate, n_samples):
+    times = averaging_times_s(n_samples, rate)
+    factors = times * rate
+    np.testing.assert_allclose(factors, np.rint(factors), rtol=1e-12)
+    assert np.all(np.diff(np.rint(factors)) >= 1)
+    assert (np.rint(factors[0]), np.rint(factors[-1])) == (1, n_samples // 5)
+    assert times.size <= 20
+    noise = np.random.default_rng(3).normal(size=n_samples)
+    assert np.all(allan_variance(noise, rate, times) > 0)
+
+
+def test_thirteen_thousand_samples_have_about_twenty_averaging_times():
+    assert averaging_times_s(13_000, RATE).size in (18, 19, 20)
+
+
+def test_variances_come_in_the_order_asked_for():
+    samples = np.random.default_rng(4).normal(size=1000)
+    one_by_one = [allan_variance(samples, RATE, np.array([t]))[0] for t in (1.0, 0.02, 0.3, 0.02)]
+    together = allan_variance(samples, RATE, np.array([1.0, 0.02, 0.3, 0.02]))
+    np.testing.assert_array_equal(together, one_by_one)
+
+
+@pytest.mark.parametrize("time", [0.0, 0.004, 0.015])
+def test_a_time_that_is_no_multiple_of_the_sample_period_is_refused(time):
+    with pytest.raises(InputError, match="multiples of the sample period"):
+        allan_variance(np.zeros(1000), RATE, np.array([0.02, time]))
+
+
+def test_a_time_too_long_for_the_recording_is_refused():
+    samples = np.random.default_rng(5).normal(size=101)
+    assert allan_variance(samples, RATE, np.array([0.5])) > 0
+    with pytest.raises(InputError, match="allows 0.5 s at most"):
+        allan_variance(samples, RATE, np.array([0.51]))
+
+
+def test_nan_is_not_cut_off():
+    samples = np.random.default_rng(6).normal(size=200)
+    samples[-1] = np.nan
+    assert np.isnan(allan_variance(samples, RATE, np.array([0.01, 0.1]))).all()
+
+
+def test_a_constant_changes_nothing_even_in_float32():
+    samples = np.random.default_rng(7).normal(0, 0.04, 5000)
+    times = averaging_times_s(5000, RATE)
+    shifted = (samples + 3.0).astype(np.float32)
+    expected = allan_variance(samples, RATE, times)
+    np.testing.assert_allclose(allan_variance(shifted, RATE, times), expected, rtol=1e-3)
+
+
+def test_white_noise_falls_with_slope_minus_one_half_and_gives_its_n():
+    sigma = 0.05
+    recordings = np.random.default_rng(8).normal(0, sigma, (40, SAMPLES))
+    times = averaging_times_s(SAMPLES, RATE)
+    deviation = np.sqrt(mean_variance(recordings, RATE, times))
+    assert np.polyfit(np.log(times), np.log(deviation), 1)[0] == pytest.approx(-0.5, abs=0.02)
+    fitted = fit_mean(recordings, RATE)
+    assert fitted.white == pytest.approx(sigma / np.sqrt(RATE), rel=0.02)
+    # what is left for B and K lies below the white noise of the longest averages
+    longest = sigma / np.sqrt(RATE * times[-1])
+    assert fitted.instability < 0.5 * longest
+    assert fitted.random_walk * np.sqrt(times[-1] / 3) < 0.5 * longest
+
+
+def test_random_walk_gives_its_k():
+    k = 2 * MDPS
+    steps = np.random.default_rng(9).normal(0, k / np.sqrt(RATE), (100, SAMPLES))
+    white = np.random.default_rng(10).normal(0, 3 * MDPS * np.sqrt(RATE), (100, SAMPLES))
+    fitted = fit_mean(np.cumsum(steps, axis=1) + white, RATE)
+    assert fitted.random_walk == pytest.approx(k, rel=0.05)
+    assert fitted.white == pytest.approx(3 * MDPS, rel=0.02)
+
+
+def test_an_exact_curve_gives_its_three_terms_back():
+    times = np.geomspace(0.1, 20, 15)
+    n, b, k = 5 * MDPS, 3 * MDPS, 1 * MDPS
+    curve = n**2 / times + FLICKER_FLOOR * b**2 + k**2 * times / 3
+    fitted = fit_noise(times, curve, 100.0, shortest_s=0.1)
+    assert (fitted.white, fitted.instability, fitted.random_walk) == pytest.approx((n, b, k))
+
+
+def test_the_flicker_floor_is_that_of_ieee_952():
+    assert np.sqrt(FLICKER_FLOOR) == pytest.approx(0.664, abs=5e-4)
+
+
+def test_times_before_the_shortest_have_no_influence():
+    times = averaging_times_s(SAMPLES, RATE)
+    curve = 1e-4 / times
+    curve[times < 0.08] *= 3
+    assert fit_noise(times, curve, 100.0, shortest_s=0.08).white == pytest.approx(0.01)
+    assert fit_noise(times, curve, 100.0, shortest_s=0.0).white > 0.011
+
+
+@pytest.mark.parametrize("variance", [0.0, np.nan])
+def test_a_fit_without_positive_variances_is_refused(variance):
+    times = np.array([1.0, 2.0, 3.0, 4.0])
+    with pytest.raises(InputError, match="positive Allan variance"):
+        fit_noise(times, np.array([1.0, 0.5, 0.3, variance]), 20.0, shortest_s=1.0)
+
+
+def test_a_fit_needs_three_times_the_shortest_included():
+    times = np.array([0.1, 0.2, 0.3, 0.4])
+    assert fit_noise(times, 1 / times, 2.0, shortest_s=0.1 + 0.1).white == pytest.approx(1)
+    with pytest.raises(InputError, match="at least 3 averaging times from 0.3 s on"):
+        fit_noise(times, 1 / times, 2.0, shortest_s=0.3)
+
+
+def test_real_memsense_white_noise():
+    recordings = np.load(real_file("memsense_test_real.npy"))  # recording, axis, sample; 250 Hz
+    white = [fit_mean(recordings[:, axis], 250.0).white for axis in range(3)]
+    np.testing.assert_allclose(white, np.array([5.3, 4.7, 6.0]) * MDPS, rtol=0.05)
+
+
+def test_real_dot_white_noise():
+    recordings = []
+    for imu in range(1, 6):
+        path = real_file(f"dot_x_stat_{imu}.csv")
+        rates = np.genfromtxt(path, delimiter=",", skip_header=2, usecols=(7, 8, 9))
+        kept = np.isfinite(rates).all(axis=1)
+        kept[:-1] &= kept[1:]  # the row before a dropout is at half scale
+        recordings.extend(rates[kept][:14_400].T)
+    fitted = fit_mean(np.array(recordings), 120.0)
+    assert fitted.white == pytest.approx(5.4 * MDPS, rel=0.05)
+    assert fitted.instability > 2 * MDPS  # coloured, unlike Memsense

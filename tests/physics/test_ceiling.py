@@ -1,0 +1,165 @@
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from gyro_pipeline.conventions import DISJOINT, MDPS, PAPER, TRUE, InputError
+from gyro_pipeline.physics.ceiling import (
+    best_gain,
+    best_saving,
+    ceiling_rmse,
+    oracle,
+    pooled,
+    running_mean_rmse,
+    turn_on_spread,
+)
+
+TRUTHS = (PAPER, DISJOINT, TRUE)
+N = 5 * MDPS
+T = 87.0
+MU = 20 * MDPS
+DRAWS = 200_000
+R_Q = [(0.05, 0.05), (10 / 87, 0.1), (10 / 87, 1.0), (0.35, 3.0), (0.5, 10.0)]
+
+
+def draw(r, q):
+    """Window means, means of the other samples and biases of many recordings."""
+    generator = np.random.default_rng([int(1000 * r), int(1000 * q)])
+    window = r * T
+    tau = np.sqrt(q * N**2 / window)
+    bias = generator.normal(MU, tau, DRAWS)
+    inside = bias + generator.normal(0, N / np.sqrt(window), DRAWS)
+    outside = bias + generator.normal(0, N / np.sqrt(T - window), DRAWS)
+    return window, tau, inside, outside, bias
+
+
+def target(truth, r, outside, inside, bias):
+    return {PAPER: r * inside + (1 - r) * outside, DISJOINT: outside, TRUE: bias}[truth]
+
+
+def rmse(error, truth, window):
+    own_noise = N**2 / (T - window) if truth == DISJOINT else 0.0
+    return np.sqrt(np.mean(error**2) - own_noise)
+
+
+@pytest.mark.parametrize("truth", TRUTHS)
+@pytest.mark.parametrize(("r", "q"), R_Q)
+def test_monte_carlo_agrees_with_the_closed_forms(r, q, truth):
+    window, tau, inside, outside, bias = draw(r, q)
+    aim = target(truth, r, outside, inside, bias)
+    best = oracle(inside, MU, tau, N, window, T, truth)
+    assert rmse(best - aim, truth, window) == pytest.approx(
+        ceiling_rmse(N, tau, window, T, truth), rel=0.01
+    )
+    assert rmse(inside - aim, truth, window) == pytest.approx(
+        running_mean_rmse(N, window, T, truth), rel=0.01
+    )
+
+
+@pytest.mark.parametrize("truth", TRUTHS)
+@pytest.mark.parametrize(("r", "q"), R_Q)
+def test_the_oracle_is_the_regression_of_the_truth_on_the_window_mean(r, q, truth):
+    window, tau, inside, outside, bias = draw(r, q)
+    slope, level = np.polyfit(inside - MU, target(truth, r, outside, inside, bias), 1)
+    at_mu, one_above = oracle(np.array([MU, MU + 1]), MU, tau, N, window, T, truth)
+    assert at_mu == pytest.approx(level, abs=5 * N / np.sqrt(window * DRAWS))
+    assert one_above - at_mu == pytest.approx(slope, abs=0.02)
+
+
+@pytest.mark.parametrize(("r", "q"), R_Q)
+def test_rho_squared_is_the_published_closed_form(r, q):
+    window = r * T
+    tau = np.sqrt(q * N**2 / window)
+    ratios = {
+        truth: ceiling_rmse(N, tau, window, T, truth) / running_mean_rmse(N, window, T, truth)
+        for truth in TRUTHS
+    }
+    assert ratios[PAPER] ** 2 == pytest.approx(r + (1 - r) * q / (1 + q))
+    assert ratios[DISJOINT] ** 2 == ratios[TRUE] ** 2 == pytest.approx(q / (1 + q))
+
+
+@pytest.mark.parametrize(("r", "q"), R_Q)
+def test_the_saving_is_where_the_running_mean_reaches_the_ceiling(r, q):
+    window = r * T
+    tau = np.sqrt(q * N**2 / window)
+    ceiling = ceiling_rmse(N, tau, window, T, PAPER)
+    reached = brentq(lambda t: N * np.sqrt(1 / t - 1 / T) - ceiling, window, T, xtol=1e-10)
+    rho = ceiling / running_mean_rmse(N, window, T, PAPER)
+    assert best_saving(rho, r) == pytest.approx(1 - window / reached, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("recording_s", "saving_pct", "gain_pct"),
+    [(87, 78, 66), (120, 84, 71), (65, 72, 61), (52, 65, 56)],
+)
+def test_known_ceilings_at_ten_seconds_without_turn_on_spread(recording_s, saving_pct, gain_pct):
+    ceiling = ceiling_rmse(N, 0.0, 10, recording_s, PAPER)
+    rho = ceiling / running_mean_rmse(N, 10, recording_s, PAPER)
+    assert round(100 * best_saving(rho, 10 / recording_s).item()) == saving_pct
+    assert round(100 * best_gain(rho).item()) == gain_pct
+
+
+def test_no_turn_on_spread_is_the_limit_that_nothing_exceeds():
+    window = np.linspace(1, 86, 30)[:, None]
+    tau = np.array([0.0, 0.01, 0.1, 1.0, 10.0, 1000.0]) * MDPS
+    r = window / T
+    rho = ceiling_rmse(N, tau, window, T, PAPER) / running_mean_rmse(N, window, T, PAPER)
+    gain, saving = best_gain(rho), best_saving(rho, r)
+    np.testing.assert_allclose(gain[:, :1], 1 - np.sqrt(r))
+    np.testing.assert_allclose(saving[:, :1], (1 - r) ** 2)
+    assert np.all(np.diff(gain, axis=1) < 0)
+    assert np.all(np.diff(saving, axis=1) < 0)
+    np.testing.assert_allclose(rho[:, -1], 1, atol=0.001)
+
+
+@pytest.mark.parametrize("truth", [DISJOINT, TRUE])
+def test_a_known_bias_needs_no_window(truth):
+    assert ceiling_rmse(N, 0.0, 10, T, truth) == 0
+    assert oracle(1.0, MU, 0.0, N, 10, T, truth) == MU
+
+
+def test_of_the_whole_recording_the_window_is_known_even_when_the_bias_is():
+    assert oracle(1.0, MU, 0.0, N, 10, T, PAPER) == pytest.approx((10 * 1.0 + 77 * MU) / T)
+
+
+def test_an_unknown_truth_is_refused():
+    with pytest.raises(InputError, match="expected 'paper', 'disjoint' or 'true', got 'mean'"):
+        running_mean_rmse(N, 10, T, "mean")
+    with pytest.raises(InputError, match="got 'mean'"):
+        ceiling_rmse(N, 0.0, 10, T, "mean")
+    with pytest.raises(InputError, match="got 'mean'"):
+        oracle(0.0, 0.0, 0.0, N, 10, T, "mean")
+
+
+def test_turn_on_spread_takes_the_averaging_noise_off():
+    noise = np.array([5.3, 4.7, 6.0]) * MDPS
+    tau = np.array([1.0, 3.0, 0.5]) * MDPS
+    generator = np.random.default_rng(1)
+    scatter = np.sqrt(tau**2 + noise**2 / 52)
+    means = np.array([1.0, -2.0, 0.1]) + generator.normal(0, scatter, (20_000, 3))
+    np.testing.assert_allclose(turn_on_spread(means, noise, 52), tau, rtol=0.03)
+
+
+def test_turn_on_spread_by_hand_counts_present_recordings_only():
+    means = np.array([[1.0, 0.0], [3.0, 0.0], [np.nan, 1.0], [5.0, 1.0]])
+    # sample variances 4 and 1/3, averaging noise 2^2 / 4
+    np.testing.assert_allclose(turn_on_spread(means, 2.0, 4.0), [np.sqrt(3.0), 0.0])
+
+
+def test_turn_on_spread_of_one_recording_is_refused():
+    with pytest.raises(InputError, match="at least 2 recordings"):
+        turn_on_spread(np.array([[1.0, 1.0], [2.0, np.nan]]), N, T)
+
+
+def test_pooling_is_over_squares_of_axes():
+    assert pooled([3.0, 4.0, 5.0]) == pytest.approx(np.sqrt(50 / 3))
+    assert pooled(np.ones((2, 3))).shape == (2,)
+    ceilings = ceiling_rmse([3 * MDPS, N, N], [0.0, MDPS, 0.0], 10, T, PAPER)
+    means = running_mean_rmse([3 * MDPS, N, N], 10, T, PAPER)
+    rho = pooled(ceilings) / pooled(means)
+    reached = brentq(
+        lambda t: pooled(running_mean_rmse([3 * MDPS, N, N], t, T, PAPER)) - pooled(ceilings),
+        10,
+        T - 1e-9,
+        xtol=1e-10,
+    )
+    assert best_saving(rho, 10 / T) == pytest.approx(1 - 10 / reached, abs=1e-9)

@@ -1,0 +1,105 @@
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from gyro_pipeline.conventions import MDPS, InputError
+from gyro_pipeline.physics.allan import FLICKER_FLOOR, allan_variance, averaging_times_s
+from gyro_pipeline.physics.noise import simulate_noise
+
+RATE = 100.0
+N = 5 * MDPS
+
+
+def lag_correlation(noise, lag):
+    return np.mean(noise[..., lag:] * noise[..., :-lag]) / np.mean(noise**2)
+
+
+@pytest.mark.parametrize("lag1", [0.0, -0.15, 0.3])
+def test_the_mean_of_t_seconds_scatters_by_n_over_root_t(lag1):
+    noise = simulate_noise(np.random.default_rng(1), (100, 20_000), RATE, N, lag1)
+    seconds = 5.0
+    means = noise.reshape(-1, int(seconds * RATE)).mean(axis=1, dtype=np.float64)
+    assert means.size == 4000
+    assert means.std() * np.sqrt(seconds) == pytest.approx(N, rel=0.04)
+    assert means.mean() == pytest.approx(0, abs=4 * N / np.sqrt(means.size * seconds))
+
+
+@pytest.mark.parametrize("lag1", [0.0, -0.15, 0.3])
+def test_samples_are_correlated_over_one_period_only(lag1):
+    noise = simulate_noise(np.random.default_rng(2), (100, 10_000), RATE, N, lag1)
+    noise = noise.astype(np.float64)
+    assert lag_correlation(noise, 1) == pytest.approx(lag1, abs=0.005)
+    assert lag_correlation(noise, 2) == pytest.approx(0, abs=0.005)
+    sigma = N * np.sqrt(RATE / (1 + 2 * lag1))
+    assert noise.std() == pytest.approx(sigma, rel=0.005)
+
+
+def test_the_first_sample_is_like_all_others():
+    noise = simulate_noise(np.random.default_rng(3), (50_000, 2), RATE, N, -0.4).astype(np.float64)
+    assert noise[:, 0].std() == pytest.approx(noise[:, 1].std(), rel=0.02)
+    assert lag_correlation(noise, 1) == pytest.approx(-0.4, abs=0.02)
+
+
+def test_every_axis_has_its_own_n():
+    per_axis = np.array([1.0, 2.0, 0.0]) * MDPS
+    noise = simulate_noise(np.random.default_rng(4), (2, 5, 3, 5000), RATE, per_axis)
+    assert noise.dtype == np.float32
+    sigma = noise.std(axis=-1, dtype=np.float64)
+    np.testing.assert_allclose(
+        sigma, np.broadcast_to(per_axis * np.sqrt(RATE), (2, 5, 3)), rtol=0.05
+    )
+
+
+@pytest.mark.parametrize("lag1", [-0.5, 0.5, 0.7])
+def test_an_impossible_lag1_correlation_is_refused(lag1):
+    with pytest.raises(InputError, match="lag1_correlation"):
+        simulate_noise(np.random.default_rng(5), (10,), RATE, N, lag1)
+
+
+@pytest.mark.parametrize("rate", [50.0, 250.0])
+def test_the_flicker_floor_is_flat_at_0664_b(rate):
+    b = 3 * MDPS
+    noise = simulate_noise(np.random.default_rng(6), (150, 6000), rate, 0.0, flicker_dps=b)
+    times = averaging_times_s(6000, rate)
+    times = times[times >= 8 / rate]
+    variance = np.mean([allan_variance(samples, rate, times) for samples in noise], axis=0)
+    floor = np.sqrt(FLICKER_FLOOR) * b
+    np.testing.assert_allclose(np.sqrt(variance), floor, rtol=0.1)
+    assert np.sqrt(variance[:6]).mean() == pytest.approx(floor, rel=0.02)
+
+
+def test_flicker_adds_to_the_white_noise():
+    b, times = 3 * MDPS, np.array([0.2, 5.0])
+    noise = simulate_noise(np.random.default_rng(7), (300, 5000), RATE, N, flicker_dps=b)
+    variance = np.mean([allan_variance(samples, RATE, times) for samples in noise], axis=0)
+    np.testing.assert_allclose(variance, N**2 / times + FLICKER_FLOOR * b**2, rtol=0.1)
+
+
+def test_a_flicker_recording_does_not_end_where_it_began():
+    noise = simulate_noise(np.random.default_rng(8), (500, 4000), RATE, 0.0, flicker_dps=1.0)
+    blocks = noise.reshape(500, 40, 100).mean(axis=-1)
+    to_last = np.std(blocks[:, -1] - blocks[:, 0])
+    to_next = np.std(blocks[:, 1] - blocks[:, 0])
+    assert to_last > 1.5 * to_next
+
+
+@pytest.mark.parametrize("flicker", [0.0, 3 * MDPS])
+def test_recordings_are_independent_and_reproducible(flicker):
+    def draw(seed):
+        generator = np.random.default_rng(seed)
+        return simulate_noise(generator, (400, 500), RATE, N, -0.15, flicker)
+
+    noise = draw(9)
+    np.testing.assert_array_equal(noise, draw(9))
+    assert not np.any(noise == draw(10))
+    means = noise.mean(axis=1)
+    assert abs(np.corrcoef(means[1:], means[:-1])[0, 1]) < 0.2
+
+
+def test_memory_is_about_that_of_the_result():
+    tracemalloc.start()
+    noise = simulate_noise(np.random.default_rng(11), (200, 5000), RATE, N, -0.15, 3 * MDPS)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1.3 * noise.nbytes
