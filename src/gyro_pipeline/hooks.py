@@ -49,7 +49,9 @@ class Preflight:
         """Check that something is left to do and that every result can be written."""
         if self._parameters is not None and not pipeline.nodes:
             only = self._parameters.only.model_dump(exclude_none=True)
-            raise InputError(f"only={only} matches nothing in this pipeline; see `studies` and `seeds`")
+            raise InputError(
+                f"only={only} matches nothing in this pipeline; see `studies` and `seeds`"
+            )
         for name in sorted(pipeline.all_outputs()):
             for path in _paths(catalog.get(name)):
                 check_writable(path)

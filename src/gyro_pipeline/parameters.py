@@ -29,7 +29,7 @@ class Datasheet(Parameter):
 
 
 class SimulatedNoise(Parameter):
-    """The stand-in for a sensor whose files are not at hand; values and sources in conf/base/globals.yml."""
+    """The stand-in for a sensor whose files are not at hand (sources: conf/base/globals.yml)."""
 
     noise_mdps_rts: PerAxis = Field(description="N per axis: the mean of t s scatters by N/sqrt(t)")
     turn_on_spread_mdps: PerAxis = Field(description="tau per axis: bias from power-on to power-on")

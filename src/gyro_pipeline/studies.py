@@ -56,7 +56,12 @@ class Cell:
 
 
 def study_cells(  # noqa: PLR0913 - what a grid is made of
-    study: Study, sensor: str, source: str, windows_s: Sequence[float], seeds: Sequence[int], only: Only
+    study: Study,
+    sensor: str,
+    source: str,
+    windows_s: Sequence[float],
+    seeds: Sequence[int],
+    only: Only,
 ) -> list[Cell]:
     """Cells of a study on a sensor on the hold-out split; the running mean of each window first.
 
@@ -70,7 +75,9 @@ def study_cells(  # noqa: PLR0913 - what a grid is made of
         )
     ]
     wanted = only.model_dump(exclude_none=True, exclude={"fold"})  # folds: known only with data
-    networks = [c for c in networks if all(getattr(c, key) == value for key, value in wanted.items())]
+    networks = [
+        c for c in networks if all(getattr(c, key) == value for key, value in wanted.items())
+    ]
     means = [
         Cell(name, 0, sensor, source, 0, 0, window_s, 0, HOLD_OUT, MEAN)
         for window_s in dict.fromkeys(cell.window_s for cell in networks)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import platform
 import sqlite3
 import tempfile
 import time
@@ -15,7 +16,6 @@ import psutil
 from kedro.io import AbstractDataset
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Param, Run, RunStatus, RunTag, ViewType
-from mlflow.exceptions import MlflowException
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.tracking import EvaluatedRun, StoredRun, TrainedRun
@@ -24,7 +24,7 @@ _TRAINED = "trained"
 """Tag, set last: the run holds all that its training made. Without it, a run is unfinished."""
 
 _OWNER = "process"
-"""Tag: the process that writes a run, as ``pid started``."""
+"""Tag: the process that writes a run, as ``host pid started``."""
 
 # One bar for each small artifact would bury everything else on a terminal.
 os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
@@ -74,16 +74,17 @@ class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
         experiments = {e.experiment_id: e.name for e in self._experiments()}
         if not experiments:
             return []
+        search = partial(self._client.search_runs, list(experiments))
+        for run in _pages(partial(search, "attributes.status = 'RUNNING'")):
+            if _TRAINED not in run.data.tags and _is_dead(run.data.tags.get(_OWNER, "")):
+                self._client.set_terminated(run.info.run_id, "KILLED")
         wanted = " and ".join(f"params.{key} = '{value}'" for key, value in self._only.items())
-        stored = []
-        for run in _pages(partial(self._client.search_runs, list(experiments), wanted)):
-            if run.info.status == RunStatus.to_string(RunStatus.RUNNING):
-                alive = _is_alive(run.data.tags.get(_OWNER, ""))
-                if _TRAINED not in run.data.tags and not alive:
-                    self._client.set_terminated(run.info.run_id, "KILLED")
-            if _TRAINED in run.data.tags:
-                stored.append(self._stored(run, experiments[run.info.experiment_id]))
-        return sorted(stored, key=lambda run: run.started_ms, reverse=True)
+        trained = [
+            self._stored(run, experiments[run.info.experiment_id])
+            for run in _pages(partial(search, wanted))
+            if _TRAINED in run.data.tags
+        ]
+        return sorted(trained, key=lambda run: run.started_ms, reverse=True)
 
     def save(self, data: TrainedRun | EvaluatedRun) -> None:
         """Add a trained run, or complete an evaluated one."""
@@ -129,7 +130,8 @@ class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
 
     def _save_trained(self, trained: TrainedRun) -> None:
         owner = psutil.Process()
-        tags = self.provenance | dict(trained.tags) | {_OWNER: f"{owner.pid} {owner.create_time()}"}
+        owned = {_OWNER: f"{platform.node()} {owner.pid} {owner.create_time()}"}
+        tags = self.provenance | dict(trained.tags) | owned
         run = self._client.create_run(
             self._experiment_id(trained.study), trained.started_ms, tags, _run_name(trained.params)
         )
@@ -209,12 +211,15 @@ def _pages(search: Callable[..., Any]) -> Iterable[Any]:
             return
 
 
-def _is_alive(owner: str) -> bool:
-    pid, _, created = owner.partition(" ")
-    try:
-        return str(psutil.Process(int(pid)).create_time()) == created
-    except (psutil.Error, ValueError):
+def _is_dead(owner: str) -> bool:
+    """Whether a run's process ran on this machine and is gone."""
+    host, pid, created = owner.split() if owner.count(" ") == 2 else ("", "", "")  # noqa: PLR2004
+    if host != platform.node():
         return False
+    try:
+        return str(psutil.Process(int(pid)).create_time()) != created
+    except psutil.NoSuchProcess:
+        return True
 
 
 def _run_name(params: Mapping[str, Any]) -> str:

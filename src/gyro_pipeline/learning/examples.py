@@ -30,14 +30,18 @@ class Device:
     def biases(self) -> np.ndarray:
         """Biases of the recordings, shape (recordings, gyroscopes), deg/s."""
         chosen = self.bias.sel(imu=list(self.imus), recording=list(self.numbers))
-        return chosen.transpose("recording", "imu", "axis").to_numpy().reshape(len(self.numbers), -1)
+        return (
+            chosen.transpose("recording", "imu", "axis").to_numpy().reshape(len(self.numbers), -1)
+        )
 
     def samples(self) -> Iterator[np.ndarray]:
         """The recordings one by one, shape (gyroscopes, samples), deg/s."""
         for number in self.numbers:
             chosen = self.recordings.sel(imu=list(self.imus), recording=number)
-            yield chosen.transpose("imu", "axis", "sample").to_numpy().reshape(
-                len(self.imus) * chosen.sizes["axis"], -1
+            yield (
+                chosen.transpose("imu", "axis", "sample")
+                .to_numpy()
+                .reshape(len(self.imus) * chosen.sizes["axis"], -1)
             )
 
 

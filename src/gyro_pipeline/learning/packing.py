@@ -20,7 +20,9 @@ def packed_shape(architecture: Architecture) -> tuple[int, int]:
     return blocks, -(-a.gyroscopes * a.stride // _ALIGNMENT) * _ALIGNMENT
 
 
-def pack(windows: np.ndarray, architecture: Architecture, out: np.ndarray | None = None) -> np.ndarray:
+def pack(
+    windows: np.ndarray, architecture: Architecture, out: np.ndarray | None = None
+) -> np.ndarray:
     """Pack windows; samples that no convolution output sees are left out.
 
     Args:

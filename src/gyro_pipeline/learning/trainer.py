@@ -77,7 +77,7 @@ def train(
             total += loss.detach() * len(batch)
         row = {
             "epoch": epoch,
-            "learning_rate": decay.get_last_lr()[0],
+            "learning_rate": float(decay.get_last_lr()[0]),
             "train_loss": float(total) / len(inputs),
         }
         decay.step()
@@ -104,7 +104,9 @@ def _loss(network: CalibrationNetwork, inputs: Tensor, targets: Tensor) -> float
 
 
 def _tensors(examples: Examples, device: torch.device) -> tuple[Tensor, Tensor]:
-    return torch.from_numpy(examples.inputs).to(device), torch.from_numpy(examples.targets).to(device)
+    return torch.from_numpy(examples.inputs).to(device), torch.from_numpy(examples.targets).to(
+        device
+    )
 
 
 def _weights(network: CalibrationNetwork) -> StateDict:

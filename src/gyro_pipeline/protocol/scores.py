@@ -133,7 +133,7 @@ def equivalent_time(times_s: np.ndarray, curves: np.ndarray, levels: np.ndarray)
         levels: RMSE to reach, shape (n,), deg/s.
 
     Returns:
-        Shape (n,), seconds; 0 where the curve starts at or below the level, inf where it never
+        Shape (n,), seconds; -inf where the curve starts at or below the level, inf where it never
         gets there (t* of the paper, section IV-C).
     """
     reached = curves <= levels[:, None]
@@ -144,7 +144,7 @@ def equivalent_time(times_s: np.ndarray, curves: np.ndarray, levels: np.ndarray)
     with np.errstate(invalid="ignore", divide="ignore"):
         fraction = np.where(high > low, (high - levels) / (high - low), 0.0)
     times = times_s[before] + fraction * (times_s[after] - times_s[before])
-    return np.where(~reached.any(axis=1), np.inf, np.where(after == 0, 0.0, times))
+    return np.where(~reached.any(axis=1), np.inf, np.where(after == 0, -np.inf, times))
 
 
 def score(
@@ -167,6 +167,8 @@ def score(
         ``test_mse_dps2`` always; ``test_rmse_dps``, ``mean_rmse_dps``, ``accuracy_gain_pct``,
         ``equivalent_time_s`` and ``time_saving_pct`` where their squares are positive. A truth
         whose own noise was taken off can leave a negative square: it is reported, not clipped.
+        Time and saving are -inf for an estimator worse than the curve's first point, and inf for
+        one that the running mean never reaches.
     """
     mse, mean_mse = errors.mean(weights), mean_errors.mean(weights)
     scores = {"test_mse_dps2": with_interval(mse)}
@@ -179,12 +181,10 @@ def score(
     scores["test_rmse_dps"] = with_interval(rmse)
     scores["mean_rmse_dps"] = with_interval(mean_rmse)
     times = equivalent_time(curve.times_s, curves, rmse)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        gains = np.where(rmse == mean_rmse, 0.0, 1 - rmse / mean_rmse)
-        savings = 1 - window_s / times
+    savings = np.where(np.isfinite(times), 1 - window_s / times, times)
     scores["equivalent_time_s"] = with_interval(times)
     scores["time_saving_pct"] = with_interval(100 * savings)
-    scores["accuracy_gain_pct"] = with_interval(100 * gains)
+    scores["accuracy_gain_pct"] = with_interval(100 * (1 - rmse / mean_rmse))
     return scores
 
 

@@ -42,7 +42,7 @@ class TestRecording:
     def window_sums(self, size: int) -> np.ndarray:
         """Sums of all non-overlapping windows, shape (windows, 3)."""
         count = self.samples.shape[-1] // size
-        return np.diff(self.running_sums[:, :: size][:, : count + 1]).T
+        return np.diff(self.running_sums[:, ::size][:, : count + 1]).T
 
     def truths(self, size: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """The truth for every window, with that truth's own averaging variance.

@@ -1,8 +1,9 @@
 """The test bench: one sensor, window and fold, on which every estimator is judged alike."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -10,6 +11,7 @@ import xarray as xr
 
 from gyro_pipeline.conventions import (
     ALL,
+    BEST,
     DISJOINT,
     FIRST,
     HOLD_OUT,
@@ -40,7 +42,12 @@ from gyro_pipeline.protocol.scores import (
     squared_errors,
     with_interval,
 )
-from gyro_pipeline.protocol.truths import TestRecording, error_table, running_mean_curve
+from gyro_pipeline.protocol.truths import (
+    CURVE_STEP_S,
+    TestRecording,
+    error_table,
+    running_mean_curve,
+)
 from gyro_pipeline.protocol.windows import cut_windows, window_size
 from gyro_pipeline.tracking import metric_name
 
@@ -189,6 +196,13 @@ class Bench:
                 tables.append(table[table.truth == truth])
         return pd.concat(tables, ignore_index=True)
 
+    @property
+    def ceiling_basis(self) -> str:
+        """In words, what the ceilings are computed from."""
+        if self.device.unit_bias is None:
+            return "estimated from recordings, white noise"
+        return "drawn values" if self.device.white else "drawn values, without the flicker noise"
+
     def ceilings(self, truth: str) -> dict[str, Estimate]:
         """What no estimator can be better than; exact, without an interval, on simulated data."""
         times = (self.window_s, self.recording_s)
@@ -239,6 +253,28 @@ class Bench:
                     )
                     metrics[metric_name("beats_oracle_p", windows, weights, truth)] = p
         return metrics
+
+
+def off_the_curve(metrics: Mapping[str, float]) -> dict[str, str]:
+    """In words, every equivalent time that is no time, by metric name.
+
+    Args:
+        metrics: From :meth:`Bench.metrics`, which holds finite values only.
+    """
+    notes = {}
+    for view in product((FIRST, ALL), (LAST, BEST), (PAPER, DISJOINT, TRUE)):
+        rmse, mean, time = (
+            metric_name(base, *view)
+            for base in ("test_rmse_dps", "mean_rmse_dps", "equivalent_time_s")
+        )
+        if rmse in metrics and time not in metrics:
+            worse = metrics[rmse] > metrics[mean]
+            notes[time] = (
+                f"worse than the running mean of {CURVE_STEP_S:g} s, where the curve starts"
+                if worse
+                else "the running mean never gets there"
+            )
+    return notes
 
 
 def test_recordings(roles: pd.DataFrame, fold: int) -> tuple[int, ...]:

@@ -19,6 +19,7 @@ from gyro_pipeline.pipelines.evaluation.bench import (
     Bench,
     describe_device,
     known_recordings,
+    off_the_curve,
     test_recordings,
 )
 from gyro_pipeline.protocol import scores, truths, windows
@@ -78,7 +79,12 @@ def evaluate(
             numbers = test_recordings(roles, cell["fold"])
             benches[key] = Bench(recordings, device, numbers, cell["window_s"], evaluation)
         yield _judge(run, benches[key], judged_with)
-    logger.info("%s: %d runs evaluated, %d skipped", recordings.attrs["sensor"], len(cells) - skipped, skipped)
+    logger.info(
+        "%s: %d runs evaluated, %d skipped",
+        recordings.attrs["sensor"],
+        len(cells) - skipped,
+        skipped,
+    )
 
 
 def _judge(run: StoredRun, bench: Bench, judged_with: str) -> EvaluatedRun:
@@ -90,18 +96,21 @@ def _judge(run: StoredRun, bench: Bench, judged_with: str) -> EvaluatedRun:
         stored = run.load(WEIGHTS)
         judged = {which: NetworkEstimator(stored, which) for which in (LAST, BEST) if stored[which]}
     side_by_side = int(run.params["real_gyros"]) // 3 if run.params["method"] == "1" else 1
-    metrics, tables = {}, []
+    metrics: dict[str, float] = {}
+    tables = []
     for which, estimator in judged.items():
         errors = bench.errors(estimator, side_by_side)
         metrics |= bench.metrics(errors, which)
         tables.append(errors.assign(weights=which))
     artifacts[ERRORS] = pd.concat(tables, ignore_index=True)
+    tags = {EVALUATED_WITH: judged_with, "ceiling": bench.ceiling_basis}
+    tags |= off_the_curve(metrics)
     logger.info(
         "%s %s: RMSE %.7f deg/s in the first window, %.6f in all (last epoch)",
         *(run.study, _title(run)),
         *(metrics[metric_name("test_rmse_dps", windows)] for windows in (FIRST, ALL)),
     )
-    return EvaluatedRun(run.run_id, metrics, {EVALUATED_WITH: judged_with}, artifacts)
+    return EvaluatedRun(run.run_id, metrics, tags, artifacts)
 
 
 def _title(run: StoredRun) -> str:

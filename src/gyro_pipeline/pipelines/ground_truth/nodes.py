@@ -88,17 +88,16 @@ def measure_noise(recordings: xr.Dataset, allan: xr.Dataset, bias: pd.DataFrame)
         ``instability_dps`` (B) and ``random_walk_dps_per_rts`` (K), by IEEE Std 952.
     """
     rate_hz = recordings.attrs["rate_hz"]
-    figures = _noise_figures(allan, recordings.sizes["sample"] / rate_hz, rate_hz)
-    figures = figures.to_dataframe(dim_order=["imu", "axis"])
+    fitted = _noise_figures(allan, recordings.sizes["sample"] / rate_hz, rate_hz)
+    names = {
+        "white": "white_dps_rts",
+        "instability": "instability_dps",
+        "random_walk": "random_walk_dps_per_rts",
+    }
+    figures = fitted.rename(names).to_dataframe(dim_order=["imu", "axis"])
     squares = bias.assign(square=bias.sample_sigma_dps**2).groupby(["imu", "axis"])["square"]
     figures.insert(0, "sample_sigma_dps", np.sqrt(squares.mean()))
-    figures = figures.rename(
-        columns={
-            "white": "white_dps_rts",
-            "instability": "instability_dps",
-            "random_walk": "random_walk_dps_per_rts",
-        }
-    ).reset_index()
+    figures = figures.reset_index()
     figures.insert(0, "sensor", recordings.attrs["sensor"])
     return figures
 

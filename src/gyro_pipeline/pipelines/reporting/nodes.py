@@ -174,12 +174,18 @@ def refuse_gaps(only: Only, *reasons: Reasons) -> None:
     commands = dict.fromkeys(command for missing in reasons for command in missing)
     if not commands:
         return
-    listed = "\n  ".join(commands)
-    message = f"{len(commands)} results of the current settings have no finished runs; run\n  {listed}"
     if only != Only():
-        logger.warning("not all tables could be made: %s", message)
+        logger.info(
+            "narrowed by only: %d results of the whole studies have no runs yet; "
+            "`kedro run --pipeline=reporting` lists them",
+            len(commands),
+        )
         return
-    raise InputError(f"{message}\n(with the --env of this report, if it has one), then this again")
+    raise InputError(
+        f"{len(commands)} results have no finished runs with the current settings; tables and "
+        "figures that need them were not made. Run (with this report's --env, if it has one)\n  "
+        + "\n  ".join(commands)
+    )
 
 
 def _published_table(
@@ -216,14 +222,16 @@ def _published_row(published: Published, row: pd.Series) -> dict[str, Any]:
 
 def _interval(row: pd.Series, base: str, windows: str) -> str:
     suffix = "" if windows == FIRST else f"_{windows}"
-    value, lo, hi = (row.get(f"{base}{suffix}{end}") for end in ("", "_lo", "_hi"))
+    value, lo, hi = (row[f"{base}{suffix}{end}"] for end in ("", "_lo", "_hi"))
     ends = "" if pd.isna(lo) else f" [{_percent(lo)}, {_percent(hi)}]"
     return f"{_percent(value)}{ends}"
 
 
 def _percent(value: float) -> str:
-    """A saving is unbounded where the network is worse than the curve's first point."""
-    return "below curve" if np.isneginf(value) else f"{value:.0f}"
+    """A saving is unbounded off the ends of the running-mean curve."""
+    if np.isinf(value):
+        return "never reached" if value > 0 else "off the curve"
+    return f"{value:.0f}"
 
 
 def _source(row: pd.Series) -> str:
@@ -243,7 +251,11 @@ def _find(results: pd.DataFrame, published: Published) -> pd.Series:
 
 
 def _augmentation_figure(
-    results: pd.DataFrame, curves: pd.DataFrame, published: list[dict[str, Any]], sensor: str, real: int
+    results: pd.DataFrame,
+    curves: pd.DataFrame,
+    published: list[dict[str, Any]],
+    sensor: str,
+    real: int,
 ) -> tuple[Figure | Missing, Reasons]:
     of_sensor = results[results.sensor == sensor]
     shown = of_sensor[of_sensor.real_gyros.isin([0, real])]  # 0: the running mean

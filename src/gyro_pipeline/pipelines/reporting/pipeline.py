@@ -1,6 +1,7 @@
 """Wiring of the reporting stage."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from kedro.pipeline import Node, Pipeline
 
@@ -16,12 +17,14 @@ from gyro_pipeline.pipelines.reporting.nodes import (
     three_gyroscopes,
 )
 
-TABLES = {"augmentation": [three_gyroscopes, multiple_gyroscopes]}
-FIGURES = {"augmentation": [sparkfun_3_real, sparkfun_12_real, dot_3_real, dot_12_real]}
+_Makers = Mapping[str, Sequence[Callable[..., Any]]]
+
+TABLES: _Makers = {"augmentation": [three_gyroscopes, multiple_gyroscopes]}
+FIGURES: _Makers = {"augmentation": [sparkfun_3_real, sparkfun_12_real, dot_3_real, dot_12_real]}
 """The paper's tables and figures that each study carries."""
 
 
-def create_pipeline(studies: dict[str, Sequence[str]]) -> Pipeline:
+def create_pipeline(studies: Mapping[str, Sequence[str]]) -> Pipeline:
     """Tables and figures of some studies.
 
     Args:
@@ -43,9 +46,13 @@ def create_pipeline(studies: dict[str, Sequence[str]]) -> Pipeline:
                 namespace="reporting",
             )
         )
-        made = [(results_table, f"{stage}.tables.results", pooled[:1])]
+        made: list[tuple[Callable[..., Any], str, list[str]]] = [
+            (results_table, f"{stage}.tables.results", pooled[:1])
+        ]
         for table in TABLES.get(study, []):
-            made.append((table, f"{stage}.tables.{table.__name__}", [pooled[0], "params:published"]))
+            made.append(
+                (table, f"{stage}.tables.{table.__name__}", [pooled[0], "params:published"])
+            )
         for figure in FIGURES.get(study, []):
             name = f"{stage}.figures.{figure.__name__}"
             made.append((figure, name, [*pooled, "params:published"]))

@@ -97,7 +97,9 @@ def network_row(
     row: dict[str, Any] = {"seeds": len(errors), "recordings": mean_errors.recording.nunique()}
     for windows in (ALL, FIRST):
 
-        def scores(table: pd.DataFrame, weights: np.ndarray, windows: str = windows) -> dict[str, Estimate]:
+        def scores(
+            table: pd.DataFrame, weights: np.ndarray, windows: str = windows
+        ) -> dict[str, Estimate]:
             return score(
                 squared_errors(table, PAPER, windows),
                 squared_errors(mean_errors, PAPER, windows),

@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import pandas as pd
@@ -73,7 +73,7 @@ def plan(
     return pd.DataFrame(rows).assign(folds=len(folds))
 
 
-def train(  # noqa: PLR0913 - a node's arguments are its datasets
+def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     cells: pd.DataFrame,
     tracked: list[StoredRun],
     recordings: xr.Dataset,
@@ -104,7 +104,10 @@ def train(  # noqa: PLR0913 - a node's arguments are its datasets
     """
     planned = {row[FINGERPRINT]: _cell(row) for row in cells.to_dict("records")}
     folds = int(cells.folds.iloc[0])
-    data = {"data_hash": recordings.attrs["data_hash"], "simulated": str(recordings.attrs["simulated"])}
+    data = {
+        "data_hash": recordings.attrs["data_hash"],
+        "simulated": str(recordings.attrs["simulated"]),
+    }
 
     def run(fp: str, started: float, tags: dict[str, str], **left: Any) -> TrainedRun:
         params = run_params(planned[fp], folds, training, splits, virtual_gyros)
@@ -119,7 +122,8 @@ def train(  # noqa: PLR0913 - a node's arguments are its datasets
     to_train = [fp for fp in missing if fp not in elsewhere and planned[fp].estimator == CNN]
     label = f"{study} {recordings.attrs['sensor']}"
     logger.info(
-        "%s: %d runs planned, %d skipped (trained before), %d shared with another study, %d to train",
+        "%s: %d runs planned, %d skipped (trained before), %d shared with another study, "
+        "%d to train",
         *(label, len(planned), len(planned) - len(missing), len(shared), len(to_train)),
     )
     for fp in missing:
@@ -201,7 +205,7 @@ def _check(cell: Cell, recordings: xr.Dataset) -> None:
         )
 
 
-def _cell(row: dict[str, Any]) -> Cell:
+def _cell(row: Mapping[Any, Any]) -> Cell:
     return Cell(**{name: row[name] for name in Cell.names()})
 
 
