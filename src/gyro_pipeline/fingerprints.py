@@ -15,7 +15,8 @@ _DIGITS = 16
 
 def data_hash(array: np.ndarray, labels: Any) -> str:
     """Hash of an array's values and labels."""
-    digest = hashlib.sha256(json.dumps([array.shape, str(array.dtype), labels]).encode())
+    described = json.dumps([array.shape, str(array.dtype), labels], sort_keys=True)
+    digest = hashlib.sha256(described.encode())
     digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()[:_DIGITS]
 

@@ -79,7 +79,7 @@ def test_labels_and_provenance(tmp_path):
     assert logs.axis.values.tolist() == ["x", "y", "z"]
     assert "given_split" not in logs.coords
     digest = logs.attrs.pop("data_hash")
-    assert len(digest) == 64
+    assert len(digest) == 16
     assert logs.attrs == {"sensor": "memsense", "source": "array", "simulated": 0, "rate_hz": 250}
 
 

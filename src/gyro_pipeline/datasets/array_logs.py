@@ -1,7 +1,5 @@
 """Logs in the array layout of the published authors' files."""
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from itertools import permutations
 from pathlib import Path
@@ -14,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from gyro_pipeline.conventions import AXES, DIMENSIONS, InputError
+from gyro_pipeline.fingerprints import data_hash
 from gyro_pipeline.parameters import Sensor
 
 LAYOUT = ("recording", "gyroscope", "sample")
@@ -198,7 +197,8 @@ class ArrayLogs(AbstractDataset[xr.Dataset, xr.Dataset]):
             "simulated": 0,
             "rate_hz": self.entry.rate_hz,
         }
-        return logs.assign_attrs(data_hash=_data_hash(logs))
+        labels = {str(name): label.values.tolist() for name, label in logs.coords.items()}
+        return logs.assign_attrs(data_hash=data_hash(rates, [labels, logs.attrs]))
 
 
 def sensor_entry(sensor: str, sensors: Mapping[str, Mapping[str, Any]]) -> Sensor:
@@ -269,18 +269,6 @@ def _merged(parts: Sequence[NDArray[Any]]) -> NDArray[np.float32]:
             rates[: part.shape[0], first : first + part.shape[1]] = part
             first += part.shape[1]
     return rates
-
-
-def _data_hash(logs: xr.Dataset) -> str:
-    """SHA-256 of the samples and of all that says what they are."""
-    labels: dict[str, Any] = {
-        str(name): label.values.tolist() for name, label in logs.coords.items()
-    }
-    labels |= {"shape": logs.angular_rate.shape, "rate_hz": logs.attrs["rate_hz"]}
-    labels |= {"sensor": logs.attrs["sensor"]}
-    digest = hashlib.sha256(json.dumps(labels, sort_keys=True).encode())
-    digest.update(np.ascontiguousarray(logs.angular_rate.values).data)
-    return digest.hexdigest()
 
 
 def _shapes(shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
