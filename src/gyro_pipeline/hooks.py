@@ -5,6 +5,7 @@ import logging
 import platform
 import subprocess
 import sys
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
@@ -21,6 +22,7 @@ from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.atomic import check_writable
 from gyro_pipeline.datasets.tracked_runs import TrackedRuns
 from gyro_pipeline.parameters import Parameters
+from gyro_pipeline.studies import used_sensors
 
 logger = logging.getLogger(__name__)
 
@@ -45,13 +47,12 @@ class Preflight:
         pipeline_registry.select(self._parameters)
 
     @hook_impl
-    def before_pipeline_run(self, pipeline: Pipeline, catalog: CatalogProtocol) -> None:
+    def before_pipeline_run(
+        self, run_params: dict[str, Any], pipeline: Pipeline, catalog: CatalogProtocol
+    ) -> None:
         """Check that something is left to do and that every result can be written."""
-        if self._parameters is not None and not pipeline.nodes:
-            only = self._parameters.only.model_dump(exclude_none=True)
-            raise InputError(
-                f"only={only} matches nothing in this pipeline; see `studies` and `seeds`"
-            )
+        if self._parameters is not None:
+            _check_matches(self._parameters, run_params["pipeline_names"] or ["__default__"])
         for name in sorted(pipeline.all_outputs()):
             for path in _paths(catalog.get(name)):
                 check_writable(path)
@@ -89,6 +90,18 @@ class Provenance:
             dataset = catalog.get(name)
             if isinstance(dataset, TrackedRuns):
                 dataset.provenance |= tags
+
+
+def _check_matches(parameters: Parameters, pipelines: Sequence[str]) -> None:
+    """Refuse an ``only`` that leaves the studies to run without a single cell."""
+    sensors = used_sensors(parameters)
+    studies = [study for study in sensors if study in pipelines or "__default__" in pipelines]
+    if studies and not any(sensors[study] for study in studies):
+        only = parameters.only.model_dump(exclude_none=True)
+        raise InputError(
+            f"only={only} matches nothing in {', '.join(studies)}; for what there is, see studies, "
+            "windows_s and seeds in conf/base/parameters/studies.yml"
+        )
 
 
 def _explain(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:

@@ -7,6 +7,7 @@ import sqlite3
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import closing
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from mlflow import MlflowClient
 from mlflow.entities import Metric, Param, Run, RunStatus, RunTag, ViewType
 
 from gyro_pipeline.conventions import InputError
+from gyro_pipeline.datasets.atomic import replacing
 from gyro_pipeline.tracking import EvaluatedRun, StoredRun, TrainedRun
 
 _TRAINED = "trained"
@@ -75,7 +77,8 @@ class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
         if not experiments:
             return []
         search = partial(self._client.search_runs, list(experiments))
-        for run in _pages(partial(search, "attributes.status = 'RUNNING'")):
+        # all pages first: what is ended is no longer on the next one
+        for run in list(_pages(partial(search, "attributes.status = 'RUNNING'"))):
             if _TRAINED not in run.data.tags and _is_dead(run.data.tags.get(_OWNER, "")):
                 self._client.set_terminated(run.info.run_id, "KILLED")
         wanted = " and ".join(f"params.{key} = '{value}'" for key, value in self._only.items())
@@ -97,6 +100,8 @@ class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
     def _client(self) -> MlflowClient:
         uri = os.environ.get("MLFLOW_TRACKING_URI")
         if not uri:
+            if not self._path.exists():
+                _make_store(self._path)
             _check_store(self._path)
             uri = f"sqlite:///{self._path}"
         try:
@@ -181,13 +186,18 @@ class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
         return {"path": str(self._path), "study": self._study, **self._only}
 
 
+def _make_store(path: Path) -> None:
+    """MLflow takes seconds for it, and cannot use one that was left half made."""
+    with replacing(path) as temporary:
+        MlflowClient(f"sqlite:///{temporary}")
+
+
 def _check_store(path: Path) -> None:
     """Refuse a file that is no MLflow store before MLflow would write into it."""
-    if not path.exists():
-        return
     advice = "move it away to start a new store"
     try:
-        with sqlite3.connect(f"file:{path}?mode=ro", uri=True) as connection:
+        # Writable, so that SQLite can roll back what a killed process left half written.
+        with closing(sqlite3.connect(f"file:{path}?mode=rw", uri=True)) as connection:
             tables = {name for (name,) in connection.execute("select name from sqlite_master")}
             sound = [row[0] for row in connection.execute("pragma quick_check(1)")]
     except sqlite3.DatabaseError as error:

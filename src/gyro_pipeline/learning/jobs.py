@@ -1,5 +1,6 @@
 """One training as a pure job: everything it needs comes in, everything it makes goes out."""
 
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -87,15 +88,17 @@ def run_training(job: TrainingJob, report: Callable[[float], None]) -> TrainedNe
         Weights at the last and the best validation epoch with all that an estimate needs.
     """
     started = time.time()
+    device = "cuda" if torch.cuda.is_available() else "cpu"
     torch.set_num_threads(1)
-    torch.use_deterministic_algorithms(True)
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # cuBLAS repeats itself with this
+    torch.use_deterministic_algorithms(True, warn_only=device == "cuda")
     architecture = job.architecture
     examples, scaling = training_examples(job.devices, architecture, job.settings.centring)
     validation = (
         None if job.validation is None else scaled_examples(job.validation, architecture, scaling)
     )
     network = initial_network(architecture, job.seed)
-    network.to("cuda" if torch.cuda.is_available() else "cpu")
+    network.to(device)
     shuffling = torch.Generator().manual_seed(job.seed)
     trained = train(
         network, examples, validation, job.settings, shuffling, lambda: report(job.epoch_work)

@@ -106,17 +106,28 @@ def command_for(cells: Sequence[Cell]) -> str:
 
 
 def results_table(results: pd.DataFrame) -> tuple[pd.DataFrame | Missing, Reasons]:
-    """All results of a study that can be made, as numbers; also printed.
+    """All results of a study that can be made, in mdps and percent; also printed.
 
     Args:
-        results: From :func:`pool_results`.
+        results: From :func:`pool_results`, which keeps every figure and its interval.
     """
     reasons = tuple(results.missing.dropna())
-    made = results[results.missing.isna()].drop(columns="missing")
+    made = results[results.missing.isna()]
     if made.empty:
         return Missing(reasons), reasons
-    logger.info("\n%s", _printed(made).to_string(index=False))
-    return made, reasons
+    table = made[
+        ["sensor", "estimator", "method", "real_gyros", "virtual_gyros", "window_s"]
+    ].copy()
+    for windows in (ALL, FIRST):
+        suffix = "" if windows == FIRST else f"_{windows}"
+        table[f"RMSE {windows} mdps"] = (made[f"test_rmse_dps{suffix}"] / MDPS).round(3)
+        for short, base in (("S", "time_saving_pct"), ("A", "accuracy_gain_pct")):
+            if base + suffix in made:
+                table[f"{short} {windows} %"] = made[base + suffix].round(0)
+    table["ceiling mdps"] = (made.ceiling_rmse_dps / MDPS).round(3)
+    logger.info("%s\n%s", _source(made.iloc[0]), table.to_string(index=False, na_rep="–"))
+    table.insert(1, "source", [_source(row) for _, row in made.iterrows()])
+    return table.assign(runs=made.run_ids.map(_short)), reasons
 
 
 def three_gyroscopes(
@@ -136,28 +147,28 @@ def multiple_gyroscopes(
 def sparkfun_3_real(
     results: pd.DataFrame, curves: pd.DataFrame, published: list[dict[str, Any]]
 ) -> tuple[Figure | Missing, Reasons]:
-    """SparkFun, 3 real and virtual gyroscopes (paper, section IV-F, first figure)."""
+    """SparkFun, 3 real and virtual gyroscopes (paper, section IV-E, first figure)."""
     return _augmentation_figure(results, curves, published, "sparkfun", 3)
 
 
 def sparkfun_12_real(
     results: pd.DataFrame, curves: pd.DataFrame, published: list[dict[str, Any]]
 ) -> tuple[Figure | Missing, Reasons]:
-    """SparkFun, 12 real and virtual gyroscopes (paper, section IV-F, second figure)."""
+    """SparkFun, 12 real and virtual gyroscopes (paper, section IV-E, second figure)."""
     return _augmentation_figure(results, curves, published, "sparkfun", 12)
 
 
 def dot_3_real(
     results: pd.DataFrame, curves: pd.DataFrame, published: list[dict[str, Any]]
 ) -> tuple[Figure | Missing, Reasons]:
-    """Movella DOT, 3 real and virtual gyroscopes (paper, section IV-G, first figure)."""
+    """Movella DOT, 3 real and virtual gyroscopes (paper, section IV-F, first figure)."""
     return _augmentation_figure(results, curves, published, "dot", 3)
 
 
 def dot_12_real(
     results: pd.DataFrame, curves: pd.DataFrame, published: list[dict[str, Any]]
 ) -> tuple[Figure | Missing, Reasons]:
-    """Movella DOT, 12 real and virtual gyroscopes (paper, section IV-G, second figure)."""
+    """Movella DOT, 12 real and virtual gyroscopes (paper, section IV-F, second figure)."""
     return _augmentation_figure(results, curves, published, "dot", 12)
 
 
@@ -216,7 +227,7 @@ def _published_row(published: Published, row: pd.Series) -> dict[str, Any]:
         "Seeds": int(row.seeds),
         "Spread of A over seeds": "–" if pd.isna(seed_sd) else f"{seed_sd:.1f}",
         "Recordings": int(row.recordings),
-        "Runs": " ".join(run_id[:8] for run_id in row.run_ids.split()),
+        "Runs": _short(row.run_ids),
     }
 
 
@@ -232,6 +243,11 @@ def _percent(value: float) -> str:
     if np.isinf(value):
         return "never reached" if value > 0 else "off the curve"
     return f"{value:.0f}"
+
+
+def _short(run_ids: str) -> str:
+    """The first digits of each run id are enough to find it."""
+    return " ".join(run_id[:8] for run_id in run_ids.split())
 
 
 def _source(row: pd.Series) -> str:
@@ -278,17 +294,3 @@ def _pooled_curve(mean: StoredRun, sensor: str) -> pd.DataFrame:
             pd.DataFrame({"windows": windows, "time_s": curve.times_s, "rmse_dps": np.sqrt(mse)})
         )
     return pd.concat(parts).assign(sensor=sensor)
-
-
-def _printed(made: pd.DataFrame) -> pd.DataFrame:
-    """The columns that fit on a terminal, in mdps and percent."""
-    shown = made[["sensor", "source", "estimator", "method", "real_gyros", "virtual_gyros"]].copy()
-    shown["window_s"] = made.window_s
-    for windows in (ALL, FIRST):
-        suffix = "" if windows == FIRST else f"_{windows}"
-        shown[f"rmse_{windows}_mdps"] = (made[f"test_rmse_dps{suffix}"] / MDPS).round(3)
-        for short, base in (("S", "time_saving_pct"), ("A", "accuracy_gain_pct")):
-            if base + suffix in made:
-                shown[f"{short}_{windows}_pct"] = made[base + suffix].round(0)
-    shown["ceiling_mdps"] = (made.ceiling_rmse_dps / MDPS).round(3)
-    return shown
