@@ -28,8 +28,7 @@ def code_hash(modules: Iterable[ModuleType]) -> str:
         tree = ast.parse(inspect.getsource(module))
         for node in ast.walk(tree):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
-                if ast.get_docstring(node, clean=False) is not None:
-                    node.body = node.body[1:]
+                node.body = [statement for statement in node.body if not _is_text(statement)]
         digest.update(ast.dump(tree).encode())
     return digest.hexdigest()[:_DIGITS]
 
@@ -37,3 +36,9 @@ def code_hash(modules: Iterable[ModuleType]) -> str:
 def fingerprint(content: Any) -> str:
     """Hash of anything that JSON can hold."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:_DIGITS]
+
+
+def _is_text(statement: ast.stmt) -> bool:
+    """Whether it is a docstring, be it of a module, a class, a function or a constant."""
+    value = statement.value if isinstance(statement, ast.Expr) else None
+    return isinstance(value, ast.Constant) and isinstance(value.value, str)

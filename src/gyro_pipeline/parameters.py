@@ -127,8 +127,8 @@ class Grid(Parameter):
     """The networks one study trains on one sensor: all combinations of the lists."""
 
     method: Literal[1, 2] = Field(description="1: input channels; 2: training data")
-    real_gyros: list[Gyroscopes]
-    virtual_gyros: list[Gyroscopes] = [0]
+    real_gyros: list[Gyroscopes] = Field(min_length=1)
+    virtual_gyros: list[Gyroscopes] = Field([0], min_length=1)
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
@@ -182,8 +182,8 @@ class Parameters(Parameter):
     training: Training
     execution: Execution
     evaluation: Evaluation
-    windows_s: list[float]
-    seeds: list[int]
+    windows_s: list[Annotated[float, Field(gt=0)]] = Field(min_length=1)
+    seeds: list[int] = Field(min_length=1)
     studies: dict[str, Study]
     only: Only
     published: list[Published]

@@ -10,19 +10,21 @@ import numpy as np
 import pandas as pd
 import torch
 
+from gyro_pipeline.learning import fused
 from gyro_pipeline.learning.examples import (
     Device,
     Scaling,
     scaled_examples,
     training_examples,
 )
+from gyro_pipeline.learning.fused import FusedEngine
 from gyro_pipeline.learning.network import Architecture, CalibrationNetwork
 from gyro_pipeline.learning.packing import pack
-from gyro_pipeline.learning.trainer import predict, train
+from gyro_pipeline.learning.trainer import TorchEngine, predict, train
 from gyro_pipeline.parameters import Training
 
-_STEP_OVERHEAD = 80_000
-"""What an optimiser step costs beside its samples, in samples; measured at batches of 64."""
+_EPOCH_OVERHEAD = 500_000
+"""What an epoch costs beside its training samples, mostly validation, in samples; measured."""
 
 
 @dataclass(frozen=True)
@@ -48,19 +50,15 @@ class TrainingJob:
     @property
     def architecture(self) -> Architecture:
         """Sizes of the network."""
-        s = self.settings
         gyroscopes = len(self.devices[0].imus) * self.devices[0].recordings.sizes["axis"]
-        return Architecture(
-            gyroscopes, self.window, s.channels, s.kernel, s.stride, s.pool, s.hidden
-        )
+        return sized(self.settings, gyroscopes, self.window)
 
     @property
     def epoch_work(self) -> float:
         """Estimated cost of an epoch, in samples of three gyroscopes."""
         per_recording = self.devices[0].recordings.sizes["sample"] // self.window
         windows = per_recording * sum(len(device.numbers) for device in self.devices)
-        steps = -(-windows // self.settings.batch_size)
-        return windows * self.window * len(self.devices[0].imus) + steps * _STEP_OVERHEAD
+        return windows * self.window * len(self.devices[0].imus) + _EPOCH_OVERHEAD
 
     @property
     def work(self) -> float:
@@ -70,11 +68,12 @@ class TrainingJob:
 
 @dataclass(frozen=True)
 class TrainedNetwork:
-    """What a training leaves: an artifact to store, the losses, and when it started (epoch, s)."""
+    """What a training leaves: an artifact to store, the losses, when it started, and on what."""
 
     artifact: Mapping[str, Any]
     history: pd.DataFrame
     started: float
+    engine: str
 
 
 def run_training(job: TrainingJob, report: Callable[[float], None]) -> TrainedNetwork:
@@ -100,8 +99,15 @@ def run_training(job: TrainingJob, report: Callable[[float], None]) -> TrainedNe
     network = initial_network(architecture, job.seed)
     network.to(device)
     shuffling = torch.Generator().manual_seed(job.seed)
+    compiled = device == "cpu" and fused.available()
     trained = train(
-        network, examples, validation, job.settings, shuffling, lambda: report(job.epoch_work)
+        network,
+        examples,
+        validation,
+        job.settings,
+        shuffling,
+        after_epoch=lambda: report(job.epoch_work),
+        engine=FusedEngine if compiled else TorchEngine,
     )
     artifact = {
         "architecture": asdict(architecture),
@@ -114,7 +120,13 @@ def run_training(job: TrainingJob, report: Callable[[float], None]) -> TrainedNe
         "best": trained.best,
         "best_epoch": trained.best_epoch,
     }
-    return TrainedNetwork(artifact, trained.history, started)
+    return TrainedNetwork(artifact, trained.history, started, "fused" if compiled else device)
+
+
+def sized(settings: Training, gyroscopes: int, window: int) -> Architecture:
+    """The network's sizes for an input of ``gyroscopes`` by ``window`` samples."""
+    sizes = (settings.channels, settings.kernel, settings.stride, settings.pool, settings.hidden)
+    return Architecture(gyroscopes, window, *sizes)
 
 
 def initial_network(architecture: Architecture, seed: int) -> CalibrationNetwork:

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from torch import Tensor, nn
 from torch.nn import functional
 
+from gyro_pipeline.conventions import InputError
+
 SLOPE = 0.1
 """Of the LeakyReLU (paper, section III-D)."""
 
@@ -20,6 +22,18 @@ class Architecture:
     stride: int
     pool: int
     hidden: int
+
+    def __post_init__(self) -> None:
+        """Refuse windows that leave nothing to pool.
+
+        Raises:
+            InputError: Naming the sizes.
+        """
+        if self.window < self.kernel or self.pooled < 1:
+            raise InputError(
+                f"a window of {self.window} samples is too short for kernel {self.kernel}, stride "
+                f"{self.stride} and pool {self.pool}; choose smaller ones under training"
+            )
 
     @property
     def convolved(self) -> int:
@@ -43,11 +57,6 @@ class CalibrationNetwork(nn.Module):
     def __init__(self, architecture: Architecture) -> None:
         super().__init__()
         a = architecture
-        if a.window < a.kernel or a.pooled < 1:
-            raise ValueError(
-                f"a window of {a.window} samples is too short for kernel {a.kernel}, "
-                f"stride {a.stride} and pool {a.pool}; choose smaller ones under training"
-            )
         self.architecture = architecture
         self.convolution = nn.Conv1d(a.gyroscopes, a.channels, a.kernel, a.stride)
         self.hidden = nn.Linear(a.pooled * a.channels, a.hidden)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import pandas as pd
@@ -36,6 +37,52 @@ class Trained:
     history: pd.DataFrame
 
 
+class Engine(Protocol):
+    """Trains one network on one set of examples, an epoch at a time."""
+
+    def epoch(self, order: np.ndarray, learning_rate: float) -> float:
+        """Train on the examples in this order, batch by batch; the mean loss on the way."""
+
+    def load_into(self, network: CalibrationNetwork) -> None:
+        """Copy the weights as they are now into a network."""
+
+
+class TorchEngine:
+    """The reference: autograd and Adam in PyTorch, on the device the network is on.
+
+    Args:
+        network: Trained in place.
+        inputs: Packed windows, shape (n, blocks, width), scaled; on the device for good.
+        targets: Shape (n, gyroscopes), scaled.
+        batch_size: Examples per step; the last one of an epoch may be smaller.
+    """
+
+    def __init__(
+        self, network: CalibrationNetwork, inputs: np.ndarray, targets: np.ndarray, batch_size: int
+    ) -> None:
+        self._network, self._batch_size = network, batch_size
+        self._inputs, self._targets = _tensors(Examples(inputs, targets), _device(network))
+        self._optimizer = torch.optim.Adam(network.parameters(), fused=True)
+
+    def epoch(self, order: np.ndarray, learning_rate: float) -> float:
+        """See :class:`Engine`."""
+        for group in self._optimizer.param_groups:
+            group["lr"] = learning_rate
+        total = torch.zeros((), device=self._inputs.device)
+        for batch in torch.from_numpy(order).to(self._inputs.device).split(self._batch_size):
+            outputs = self._network.forward_packed(self._inputs[batch])
+            loss = functional.mse_loss(outputs, self._targets[batch])
+            self._optimizer.zero_grad()
+            loss.backward()
+            self._optimizer.step()
+            total += loss.detach() * len(batch)
+        return float(total) / len(order)
+
+    def load_into(self, network: CalibrationNetwork) -> None:
+        """See :class:`Engine`."""
+        network.load_state_dict(self._network.state_dict())
+
+
 def train(
     network: CalibrationNetwork,
     training: Examples,
@@ -43,16 +90,18 @@ def train(
     schedule: Training,
     shuffling: torch.Generator,
     after_epoch: Callable[[], None],
+    engine: Callable[..., Engine] = TorchEngine,
 ) -> Trained:
-    """Train on the device the network is on; equal inputs give equal weights.
+    """Train a network; equal inputs give equal weights.
 
     Args:
         network: Initialised; it is trained in place.
-        training: Examples, kept on the device for the whole training.
+        training: Examples, kept where they are for the whole training.
         validation: Examples to watch, never to train on; may be None.
         schedule: Epochs, batch size, learning rate and its decay.
         shuffling: Draws the order of the examples; nothing else is random.
         after_epoch: Called after every epoch.
+        engine: What makes the steps.
 
     Returns:
         Weights and history.
@@ -60,33 +109,20 @@ def train(
     Raises:
         FloatingPointError: If the loss is no longer finite.
     """
-    device = next(network.parameters()).device
-    inputs, targets = _tensors(training, device)
-    watched = None if validation is None else _tensors(validation, device)
-    optimizer = torch.optim.Adam(network.parameters(), lr=schedule.learning_rate, fused=True)
-    decay = torch.optim.lr_scheduler.StepLR(optimizer, schedule.decay_every, schedule.decay)
+    steps = engine(network, training.inputs, training.targets, schedule.batch_size)
+    watched = None if validation is None else _tensors(validation, _device(network))
     rows, best, lowest = [], None, np.inf
     for epoch in range(1, schedule.epochs + 1):
-        total = torch.zeros((), device=device)
-        order = torch.randperm(len(inputs), generator=shuffling).to(device)
-        for batch in order.split(schedule.batch_size):
-            loss = functional.mse_loss(network.forward_packed(inputs[batch]), targets[batch])
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            total += loss.detach() * len(batch)
-        row = {
-            "epoch": epoch,
-            "learning_rate": float(decay.get_last_lr()[0]),
-            "train_loss": float(total) / len(inputs),
-        }
-        decay.step()
+        order = torch.randperm(len(training.inputs), generator=shuffling).numpy()
+        rate = schedule.learning_rate * schedule.decay ** ((epoch - 1) // schedule.decay_every)
+        row = {"epoch": epoch, "learning_rate": rate, "train_loss": steps.epoch(order, rate)}
+        if not np.isfinite(row["train_loss"]):
+            raise FloatingPointError(f"the loss is {row['train_loss']} in epoch {epoch}")
+        steps.load_into(network)
         if watched is not None:
             row["val_loss"] = _loss(network, *watched)
             if row["val_loss"] < lowest:
                 lowest, best = row["val_loss"], (epoch, _weights(network))
-        if not np.isfinite(row["train_loss"]):
-            raise FloatingPointError(f"the loss is {row['train_loss']} in epoch {epoch}")
         rows.append(row)
         after_epoch()
     best_epoch, best_weights = best or (None, None)
@@ -101,6 +137,10 @@ def predict(network: CalibrationNetwork, inputs: Tensor) -> Tensor:
 
 def _loss(network: CalibrationNetwork, inputs: Tensor, targets: Tensor) -> float:
     return float(functional.mse_loss(predict(network, inputs), targets))
+
+
+def _device(network: CalibrationNetwork) -> torch.device:
+    return next(network.parameters()).device
 
 
 def _tensors(examples: Examples, device: torch.device) -> tuple[Tensor, Tensor]:

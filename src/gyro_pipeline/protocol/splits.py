@@ -80,11 +80,12 @@ def _fold_roles(
 ) -> pd.DataFrame:
     rest = [r for r in recordings if r not in set(test)]
     hold_out = fold == HOLD_OUT
-    wanted = splits.validation_recordings if hold_out else splits.fold_validation_recordings
+    key = "validation_recordings" if hold_out else "fold_validation_recordings"
+    wanted = getattr(splits, key)
     if wanted >= len(rest):
         raise InputError(
             f"fold {fold}: {wanted} validation recordings asked of {len(rest)} that are not for "
-            "testing; lower splits.validation_recordings or bring more recordings"
+            f"testing; lower splits.{key} or bring more recordings"
         )
     generator = np.random.default_rng([splits.split_seed, fold - HOLD_OUT])
     validation = set(generator.choice(rest, wanted, replace=False).tolist())

@@ -34,6 +34,7 @@ from gyro_pipeline.physics.ceiling import (
     turn_on_spread,
 )
 from gyro_pipeline.protocol.scores import (
+    Curve,
     Estimate,
     beats_oracle,
     curve_errors,
@@ -182,6 +183,12 @@ class Bench:
         return pd.concat(curves, ignore_index=True)
 
     @cached_property
+    def curves(self) -> dict[tuple[str, str], Curve]:
+        """The same by truth and windows."""
+        views = product(self.curve.truth.unique(), (FIRST, ALL))
+        return {view: curve_errors(self.curve, *view) for view in views}
+
+    @cached_property
     def oracle_errors(self) -> pd.DataFrame | None:
         """Errors of the best possible estimator for each truth; None where it is not known."""
         if self.device.unit_bias is None or not self.device.white:
@@ -233,7 +240,7 @@ class Bench:
                 scores = score(
                     squared_errors(errors, truth, windows),
                     squared_errors(self.mean_errors, truth, windows),
-                    curve_errors(self.curve, truth, windows),
+                    self.curves[truth, windows],
                     self.window_s,
                     resampled,
                 )

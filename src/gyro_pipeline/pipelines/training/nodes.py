@@ -8,9 +8,9 @@ from typing import Any
 import pandas as pd
 import xarray as xr
 
-from gyro_pipeline.conventions import TEST_IMU, TRAIN, VALIDATION, InputError
+from gyro_pipeline.conventions import AXES, TEST_IMU, TRAIN, VALIDATION, InputError
 from gyro_pipeline.fingerprints import code_hash, fingerprint
-from gyro_pipeline.learning import examples, jobs, network, packing, trainer
+from gyro_pipeline.learning import examples, fused, jobs, network, packing, trainer
 from gyro_pipeline.learning.examples import Device
 from gyro_pipeline.learning.executors import run_jobs
 from gyro_pipeline.learning.jobs import TrainingJob, run_training
@@ -58,7 +58,7 @@ def plan(
     cells = study_cells(study, sensor, source, windows_s, seeds, only)
     cells = over_folds(cells, folds, only)
     for cell in cells:
-        _check(cell, recordings)
+        _check(cell, recordings, training)
     code = code_hash([examples, jobs, network, packing, trainer])
     rows = []
     for cell in cells:
@@ -135,9 +135,11 @@ def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
             yield run(fp, time.time(), {})
     devices = Devices(recordings, _labelled(bias), roles, virtual, virtual_gyros)
     todo = [devices.job(fp, planned[fp], training) for fp in to_train]
+    if todo:
+        fused.available()  # compiles it, or says why not, before the workers need it
     for job, trained in run_jobs(todo, run_training, execution, label):
         artifacts = {WEIGHTS: trained.artifact, HISTORY: trained.history}
-        ended = {"best_epoch": str(trained.artifact["best_epoch"])}
+        ended = {"best_epoch": str(trained.artifact["best_epoch"]), "engine": trained.engine}
         yield run(job.name, trained.started, ended, history=trained.history, artifacts=artifacts)
 
 
@@ -187,11 +189,13 @@ class Devices:
         )
 
 
-def _check(cell: Cell, recordings: xr.Dataset) -> None:
+def _check(cell: Cell, recordings: xr.Dataset, training: Training) -> None:
     samples, rate_hz = recordings.sizes["sample"], recordings.attrs["rate_hz"]
-    window_size(cell.window_s, rate_hz, samples, cell.sensor)
+    size = window_size(cell.window_s, rate_hz, samples, cell.sensor)
+    if cell.estimator == CNN:
+        jobs.sized(training, cell.real_gyros if cell.method == 1 else len(AXES), size)
     if cell.real_imus > recordings.sizes["imu"]:
-        available = 3 * recordings.sizes["imu"]
+        available = len(AXES) * recordings.sizes["imu"]
         raise InputError(
             f"{cell.sensor}: {cell.real_gyros} gyroscopes asked by {cell.study}, the "
             f"{cell.source} recordings hold {available}; narrow with --params=only.real_gyros=..."

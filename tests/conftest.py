@@ -1,0 +1,250 @@
+"""Fixtures: a project of one's own to run, and recordings with known values."""
+
+import contextlib
+import io
+import logging
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+import yaml
+from kedro.config import OmegaConfigLoader
+from kedro.framework.session import KedroSession
+from kedro.framework.startup import bootstrap_project
+from mlflow import MlflowClient
+from mlflow.entities import Run
+
+from gyro_pipeline.conventions import AXES, DIMENSIONS, HOLD_OUT, TEST, TRAIN, VALIDATION
+from gyro_pipeline.fingerprints import data_hash
+from gyro_pipeline.parameters import Parameters
+from gyro_pipeline.physics.noise import simulate_noise
+from gyro_pipeline.settings import CONFIG_LOADER_ARGS
+
+ROOT = Path(__file__).parents[1]
+_TIMEOUT_S = 240
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a command left on the terminal."""
+
+    code: int
+    output: str
+
+
+@dataclass(frozen=True)
+class Project:
+    """A copy of the project's configuration with data and a run store of its own."""
+
+    folder: Path
+
+    @property
+    def store(self) -> Path:
+        return self.folder / "mlflow.db"
+
+    def start(self, *arguments: str, log: Path) -> subprocess.Popen[bytes]:
+        """``kedro run`` in a process group of its own, as a shell would start it."""
+        with log.open("wb") as output:
+            return subprocess.Popen(
+                [sys.executable, "-m", "kedro", "run", *arguments],
+                cwd=self.folder,
+                env=dict(os.environ) | {"PYTHONPATH": str(ROOT / "src")},
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+
+    def kedro_run(self, *arguments: str) -> Done:
+        """``kedro run`` to its end."""
+        log = self.folder / "terminal.log"
+        process = self.start(*arguments, log=log)
+        try:
+            code = process.wait(_TIMEOUT_S)
+        finally:
+            process.kill()
+        return Done(code, log.read_text())
+
+    def run_here(self, pipeline: str, env: str, **params: Any) -> Done:
+        """The same inside this process, which saves the start-up."""
+        with _logged() as log:
+            code = 0
+            try:
+                bootstrap_project(self.folder)
+                with KedroSession.create(self.folder, env=env, runtime_params=params) as session:
+                    session.run(pipeline_names=[pipeline])
+            except Exception as error:
+                code = 1
+                with contextlib.redirect_stderr(log):  # where a traceback would go
+                    sys.excepthook(type(error), error, error.__traceback__)
+        return Done(code, log.getvalue())
+
+    def configure(self, env: str, **files: Mapping[str, Any]) -> None:
+        """Write ``conf/<env>``: ``parameters``, ``globals`` and ``catalog``."""
+        folder = self.folder / "conf" / env
+        folder.mkdir(exist_ok=True)
+        for name, content in files.items():
+            (folder / f"{name}.yml").write_text(yaml.safe_dump(dict(content)))
+
+    def runs(self, experiment: str) -> list[Run]:
+        """Runs of a study that are not deleted, in the order they were made."""
+        client = MlflowClient(f"sqlite:///{self.store}")
+        found = client.get_experiment_by_name(experiment)
+        if found is None:
+            return []
+        return list(client.search_runs([found.experiment_id], order_by=["attributes.start_time"]))
+
+    def count(self, query: str) -> int:
+        """What a counting query finds in the store; cheap enough to poll."""
+        with sqlite3.connect(f"file:{self.store}?mode=ro", uri=True, timeout=60) as connection:
+            return int(connection.execute(query).fetchone()[0])
+
+    def files(self, part: str = "data") -> dict[str, bytes]:
+        """All files below a folder, hidden ones as well, with their content."""
+        paths = sorted(path for path in (self.folder / part).rglob("*") if path.is_file())
+        return {str(path.relative_to(self.folder)): path.read_bytes() for path in paths}
+
+
+@contextlib.contextmanager
+def _logged() -> Iterator[io.StringIO]:
+    """What the project says on the terminal."""
+    log = io.StringIO()
+    handler, logger = logging.StreamHandler(log), logging.getLogger("gyro_pipeline")
+    level = logger.level
+    logger.addHandler(handler)
+    try:
+        logger.setLevel(logging.INFO)
+        yield log
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_settings_of_this_machine() -> Iterator[None]:
+    """A store, an environment or a log level set in the shell must not reach the tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("MLFLOW_TRACKING_URI", "KEDRO_ENV", "KEDRO_LOGGING_CONFIG"):
+            patch.delenv(name, raising=False)
+        yield
+
+
+@pytest.fixture(autouse=True)
+def _excepthook(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run sets it, also one inside this process."""
+    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
+
+
+@pytest.fixture(scope="session")
+def _empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """MLflow takes seconds to make one."""
+    path = tmp_path_factory.mktemp("store") / "mlflow.db"
+    MlflowClient(f"sqlite:///{path}").search_experiments()
+    return path
+
+
+@pytest.fixture(scope="session")
+def new_project(
+    tmp_path_factory: pytest.TempPathFactory, _empty_store: Path
+) -> Callable[..., Project]:
+    """Makes projects without data; ``with_store=False`` leaves the run store out as well."""
+
+    def make(with_store: bool = True) -> Project:
+        folder = tmp_path_factory.mktemp("project")
+        for name in ("pyproject.toml", "requirements.lock", ".telemetry"):
+            shutil.copy(ROOT / name, folder)
+        # settings of this machine stay out
+        shutil.copytree(ROOT / "conf", folder / "conf", ignore=shutil.ignore_patterns("local"))
+        for name in ("conf/local", "data", "src"):
+            (folder / name).mkdir()
+        if with_store:
+            shutil.copy(_empty_store, folder / "mlflow.db")
+        return Project(folder)
+
+    return make
+
+
+@dataclass(frozen=True)
+class Ran:
+    """A finished run of the smoke environment, as it was then: later ones do not change this."""
+
+    project: Project
+    done: Done
+    runs: list[Run]
+    files: dict[str, bytes]
+
+
+@pytest.fixture(scope="session")
+def smoke(new_project: Callable[..., Project]) -> Ran:
+    """``kedro run --pipeline=augmentation --env=smoke`` in a project without anything."""
+    project = new_project(with_store=False)
+    done = project.kedro_run("--pipeline=augmentation", "--env=smoke")
+    return Ran(project, done, project.runs("augmentation"), project.files())
+
+
+@pytest.fixture(scope="session")
+def parameters() -> Callable[..., Parameters]:
+    """Parameters of an environment, with some groups changed: ``parameters(splits={...})``."""
+
+    def load(env: str = "smoke", **changes: Mapping[str, Any]) -> Parameters:
+        loader = OmegaConfigLoader(
+            str(ROOT / "conf"), env=env, runtime_params=changes, **CONFIG_LOADER_ARGS
+        )
+        return Parameters(**loader["parameters"])
+
+    return load
+
+
+@pytest.fixture(scope="session")
+def make_recordings() -> Callable[..., xr.Dataset]:
+    """White noise of known N around known biases, in the layout of the conventions."""
+
+    def make(
+        bias: np.ndarray, samples: int, rate_hz: float, noise_dps_rts: float, seed: int = 0
+    ) -> xr.Dataset:
+        generator = np.random.default_rng(seed)
+        rates = simulate_noise(generator, (*bias.shape, samples), rate_hz, noise_dps_rts)
+        rates += bias[..., None].astype(np.float32)
+        return xr.Dataset(
+            {"angular_rate": (DIMENSIONS, rates)},
+            coords={
+                "imu": np.arange(1, 1 + bias.shape[0]),
+                "recording": np.arange(1, 1 + bias.shape[1]),
+                "axis": list(AXES),
+            },
+            attrs={
+                "sensor": "sparkfun",
+                "source": "test",
+                "simulated": 0,
+                "rate_hz": rate_hz,
+                "data_hash": data_hash(rates, []),
+            },
+        )
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def make_roles() -> Callable[..., pd.DataFrame]:
+    """One hold-out fold: the last recordings test, and those before them validate."""
+
+    def make(recordings: int, test: int, validation: int = 0) -> pd.DataFrame:
+        roles = [TRAIN] * (recordings - test - validation) + [VALIDATION] * validation
+        return pd.DataFrame(
+            {
+                "fold": HOLD_OUT,
+                "recording": np.arange(1, 1 + recordings),
+                "role": roles + [TEST] * test,
+            }
+        )
+
+    return make

@@ -1,0 +1,201 @@
+import tracemalloc
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyro_pipeline.learning.examples import (
+    Device,
+    device_centres,
+    scaled_examples,
+    training_examples,
+)
+from gyro_pipeline.learning.network import Architecture
+from gyro_pipeline.protocol.windows import cut_windows
+
+WINDOW, STRIDE = 20, 5
+ONE_IMU = Architecture(3, WINDOW, 2, 5, STRIDE, 2, 4)
+TWO_IMUS = Architecture(6, WINDOW, 2, 5, STRIDE, 2, 4)
+
+
+def labelled(array, dims="imu recording axis sample"):
+    """Labels as everywhere: IMUs and recordings from 1, axes by name."""
+    dims = dims.split()
+    sizes = dict(zip(dims, array.shape, strict=True))
+    coords = {
+        "imu": np.arange(1, sizes["imu"] + 1),
+        "recording": np.arange(1, sizes["recording"] + 1),
+        "axis": ["x", "y", "z"],
+    }
+    return xr.DataArray(array, dims=dims, coords=coords)
+
+
+def noise_on(bias, samples, seed=0):
+    noise = np.random.default_rng(seed).normal(scale=0.5, size=(*bias.shape, samples))
+    return (bias[..., None] + noise).astype(np.float32)
+
+
+def drawn(imus=2, recordings=6, samples=50, seed=3):
+    """Recordings whose IMUs lie far apart, and their biases."""
+    generator = np.random.default_rng(seed)
+    unit = generator.normal(scale=10, size=(imus, 1, 3))
+    bias = unit + generator.normal(scale=0.1, size=(imus, recordings, 3))
+    return noise_on(bias, samples, seed), bias
+
+
+def device(rates, bias, imus=(1,), numbers=(1, 2, 3)):
+    return Device(labelled(rates), labelled(bias, "imu recording axis"), imus, numbers)
+
+
+def unpacked(examples, gyroscopes):
+    """Windows (n, gyroscopes, samples) back from packed ones, by the layout's definition."""
+    n, blocks, _ = examples.inputs.shape
+    used = examples.inputs[:, :, : gyroscopes * STRIDE]
+    cells = used.reshape(n, blocks, gyroscopes, STRIDE).transpose(0, 2, 1, 3)
+    return cells.reshape(n, gyroscopes, blocks * STRIDE)
+
+
+def told_apart(imus, recordings):
+    """Biases that spell where they are from: 213.0 is IMU 2, recording 1, z."""
+    imu, recording, axis = np.ogrid[1 : imus + 1, 1 : recordings + 1, 1:4]
+    return (100.0 * imu + 10 * recording + axis).astype(float)
+
+
+def test_imus_side_by_side_are_in_order_of_imu_then_axis():
+    bias = told_apart(3, 4)
+    rates = np.repeat(bias[..., None], 7, axis=-1).astype(np.float32)
+    both = device(rates, bias, imus=(1, 3), numbers=(4, 2))
+    expected = [[141, 142, 143, 341, 342, 343], [121, 122, 123, 321, 322, 323]]
+    np.testing.assert_array_equal(both.biases(), expected)
+    for samples, wanted in zip(both.samples(), expected, strict=True):
+        assert samples.shape == (6, 7)
+        np.testing.assert_array_equal(samples, np.repeat(np.array(wanted)[:, None], 7, axis=1))
+
+
+def test_the_order_of_stored_dimensions_does_not_matter():
+    rates, bias = drawn()
+    usual = device(rates, bias, imus=(1, 2))
+    turned = Device(
+        usual.recordings.transpose("sample", "axis", "recording", "imu"),
+        usual.bias.transpose("axis", "recording", "imu"),
+        usual.imus,
+        usual.numbers,
+    )
+    np.testing.assert_array_equal(turned.biases(), usual.biases())
+    for one, other in zip(turned.samples(), usual.samples(), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_centring_per_device_and_with_one_mean_for_all_by_hand():
+    bias = np.array([[[1.0, 2, 3], [3, 4, 5]], [[10, 20, 30], [50, 60, 70]]])
+    rates = noise_on(bias, 40)
+    first = device(rates, bias, (1,), (1, 2))
+    second = device(rates, bias, (2,), (2,))  # one recording: it counts half as much
+    own = device_centres([first, second], "per_device")
+    np.testing.assert_array_equal(own, [[2, 3, 4], [50, 60, 70]])
+    overall = (1 + 2 + 3 + 3 + 4 + 5 + 50 + 60 + 70) / 9
+    shared = device_centres([first, second], "global")
+    np.testing.assert_allclose(shared, np.full((2, 3), overall), rtol=1e-15)
+
+
+def test_devices_side_by_side_are_centred_gyroscope_by_gyroscope():
+    bias = told_apart(2, 3)
+    together = device(noise_on(bias, 40), bias, (1, 2), (1, 3))
+    (own,) = device_centres([together], "per_device")
+    np.testing.assert_allclose(own, [121, 122, 123, 221, 222, 223])
+    (shared,) = device_centres([together], "global")
+    np.testing.assert_allclose(shared, np.full(6, 172))
+
+
+@pytest.mark.parametrize("centring", ["per_device", "global"])
+def test_examples_are_the_windows_of_each_recording_in_turn_scaled_by_hand(centring):
+    rates, bias = drawn(samples=50)
+    devices = [device(rates, bias, (1,), (1, 2, 3)), device(rates, bias, (2,), (4, 2))]
+    examples, scaling = training_examples(devices, ONE_IMU, centring)
+    assert examples.inputs.dtype == examples.targets.dtype == np.float32
+    assert len(examples.inputs) == len(examples.targets) == 2 * (3 + 2)
+    used = [(0, 0), (0, 1), (0, 2), (1, 3), (1, 1)]  # imu and recording, from 0
+    if centring == "per_device":
+        centres = [bias[0, :3].mean(axis=0)] * 3 + [bias[1, [3, 1]].mean(axis=0)] * 2
+    else:
+        centres = [np.full(3, np.mean([bias[place] for place in used]))] * 5
+    windows, targets = [], []
+    for place, centre in zip(used, centres, strict=True):
+        centred = rates[place] - centre[:, None]
+        windows += [centred[:, :20], centred[:, 20:40]]
+        targets += [bias[place] - centre] * 2
+    input_scale, target_scale = (np.sqrt(np.mean(np.square(x))) for x in (windows, targets))
+    assert scaling.input_scale == pytest.approx(input_scale, rel=1e-5)
+    assert scaling.target_scale == pytest.approx(target_scale, rel=1e-5)
+    np.testing.assert_allclose(scaling.centres[0], centres[0], rtol=1e-12)
+    got = unpacked(examples, 3) * scaling.input_scale
+    np.testing.assert_allclose(got, windows, atol=2e-6 * np.abs(rates).max())
+    np.testing.assert_allclose(examples.targets * target_scale, targets, atol=2e-6)
+
+
+def test_training_inputs_and_targets_have_a_root_mean_square_of_one():
+    rates, bias = drawn(samples=53)
+    for unseen in (Architecture(3, 23, 2, 8, 5, 1, 4), Architecture(3, 22, 2, 3, 5, 1, 4)):
+        examples, _ = training_examples([device(rates, bias)], unseen, "per_device")
+        seen = examples.inputs[examples.inputs != 0]  # padding is zero; noise never is
+        assert np.sqrt(np.mean(np.square(seen))) == pytest.approx(1, rel=1e-5)
+        assert np.sqrt(np.mean(np.square(examples.targets))) == pytest.approx(1, rel=1e-5)
+
+
+def test_side_by_side_every_recording_counts_once():
+    rates, bias = drawn(samples=70)
+    examples, scaling = training_examples([device(rates, bias, (2, 1))], TWO_IMUS, "per_device")
+    assert examples.targets.shape == (3 * 3, 6)
+    assert scaling.centres[0].shape == (6,)
+    last = unpacked(examples, 6)[-1] * scaling.input_scale + scaling.centres[0][:, None]
+    recorded = np.concatenate([rates[1, 2, :, 40:60], rates[0, 2, :, 40:60]])
+    np.testing.assert_allclose(last, recorded, atol=1e-4)
+
+
+@pytest.mark.parametrize("centring", ["per_device", "global"])
+def test_scaling_comes_from_training_recordings_of_training_devices_only(centring):
+    rates, bias = drawn(imus=3)
+    changed_rates, changed_bias = rates.copy(), bias.copy()
+    changed_rates[:, 3:] *= 1000  # recordings that validate or test
+    changed_bias[:, 3:] += 1000
+    changed_rates[2], changed_bias[2] = np.nan, np.nan  # a device that does not train
+    before, scaling = training_examples(
+        [device(rates, bias, (1,)), device(rates, bias, (2,))], ONE_IMU, centring
+    )
+    after, same = training_examples(
+        [device(changed_rates, changed_bias, (imu,)) for imu in (1, 2)], ONE_IMU, centring
+    )
+    np.testing.assert_array_equal(before.inputs, after.inputs)
+    np.testing.assert_array_equal(before.targets, after.targets)
+    np.testing.assert_array_equal(scaling.centres, same.centres)
+    assert (scaling.input_scale, scaling.target_scale) == (same.input_scale, same.target_scale)
+
+
+@pytest.mark.parametrize("centring", ["per_device", "global"])
+def test_other_recordings_are_scaled_as_the_test_device_in_training(centring):
+    rates, bias = drawn()
+    devices = [device(rates, bias, (1,)), device(rates, bias, (2,))]
+    examples, scaling = training_examples(devices, ONE_IMU, centring)
+    again = scaled_examples(devices[0], ONE_IMU, scaling)
+    np.testing.assert_array_equal(again.inputs, examples.inputs[:6])
+    np.testing.assert_array_equal(again.targets, examples.targets[:6])
+    other = scaled_examples(device(rates, bias, (1,), (5,)), ONE_IMU, scaling)
+    wanted = (rates[0, 4] - scaling.centres[0][:, None]) / scaling.input_scale
+    wanted = cut_windows(wanted, WINDOW).transpose(1, 0, 2)
+    np.testing.assert_allclose(unpacked(other, 3), wanted, atol=1e-4)
+    wanted = (bias[0, 4] - scaling.centres[0]) / scaling.target_scale
+    np.testing.assert_allclose(other.targets, [wanted] * 2, rtol=1e-5)
+
+
+def test_making_examples_changes_no_recording_and_needs_one_packed_copy_of_them():
+    rates, bias = drawn(imus=2, recordings=20, samples=13_000)
+    original = rates.copy()
+    numbers = tuple(range(1, 21))
+    devices = [device(rates, bias, (imu,), numbers) for imu in (1, 2)]
+    papers = Architecture(3, 1083, 8, 10, 10, 8, 32)
+    tracemalloc.start()
+    training_examples(devices, papers, "per_device")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert 0.9 * rates.nbytes < peak < 1.2 * rates.nbytes  # beside the recordings themselves
+    np.testing.assert_array_equal(rates, original)

@@ -1,0 +1,345 @@
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from gyro_pipeline.conventions import (
+    ALL,
+    BEST,
+    DISJOINT,
+    FIRST,
+    HOLD_OUT,
+    LAST,
+    PAPER,
+    TEST,
+    TRAIN,
+    TRUE,
+)
+from gyro_pipeline.estimators import RunningMean
+from gyro_pipeline.pipelines.evaluation import bench as bench_module
+from gyro_pipeline.pipelines.evaluation.bench import (
+    Bench,
+    describe_device,
+    known_recordings,
+    off_the_curve,
+)
+from gyro_pipeline.pipelines.evaluation.nodes import evaluate
+from gyro_pipeline.pipelines.ground_truth.nodes import measure_allan_variance, measure_bias
+from gyro_pipeline.studies import CNN, MEAN
+from gyro_pipeline.tracking import CURVE, ERRORS, EVALUATED_WITH, HISTORY, WEIGHTS
+
+WINDOW_S, SIZE, RECORDING_S = 10.0, 200, 52.0
+TESTED = (11, 12, 13, 14)
+
+
+def device_of(world, recordings=None, numbers=range(1, 11)):
+    recordings = world.recordings if recordings is None else recordings
+    return describe_device(recordings, world.bias, world.allan, tuple(numbers), seed=1)
+
+
+@pytest.fixture(scope="module")
+def bench(world):
+    return Bench(world.recordings, device_of(world), TESTED, WINDOW_S, world.evaluation)
+
+
+@pytest.fixture(scope="module")
+def simulated(world):
+    """The same recordings with drawn values, as a simulated source gives them."""
+    made = world.recordings.assign(
+        true_bias=world.recordings.angular_rate.mean("sample", dtype=np.float64) + 1e-4,
+        true_unit_bias=(("imu", "axis"), np.array([[1.0, 2, 3], [4, 5, 6]])),
+        true_turn_on_spread=("axis", np.array([1e-3, 2e-3, 3e-3])),
+        true_noise=("axis", np.array([3e-3, 4e-3, 5e-3])),
+        true_flicker=0.0,
+    )
+    return made.assign_attrs(simulated=1)
+
+
+class Off:
+    """Knows the mean of the whole recording and is off by a constant."""
+
+    def __init__(self, bench, by):
+        self._means = iter([one.samples.mean(axis=1, dtype=np.float64) for one in bench.tested])
+        self._by = by
+
+    def estimate(self, windows):
+        return np.tile(next(self._means) + self._by, (len(windows), 1))
+
+
+# errors and metrics
+
+
+def test_errors_of_the_running_mean_are_those_computed_by_hand(world, bench):
+    samples = world.recordings.angular_rate.sel(imu=1, recording=list(TESTED)).to_numpy()
+    samples = samples.astype(np.float64)  # (recording, axis, sample)
+    windows = samples[..., : 5 * SIZE].reshape(4, 3, 5, SIZE).mean(axis=-1).swapaxes(1, 2)
+    whole = samples.mean(axis=-1)[:, None]
+    errors = bench.mean_errors[bench.mean_errors.truth == PAPER]
+    assert errors.recording.tolist() == np.repeat(TESTED, 15).tolist()
+    np.testing.assert_allclose(errors.error_dps, (windows - whole).ravel(), atol=1e-12)
+    rest = (1040 * whole - SIZE * windows) / (1040 - SIZE)
+    disjoint = bench.mean_errors[bench.mean_errors.truth == DISJOINT]
+    np.testing.assert_allclose(disjoint.error_dps, (windows - rest).ravel(), atol=1e-12)
+    metrics = bench.metrics(bench.mean_errors, LAST)
+    squares = (windows - whole) ** 2
+    assert metrics["test_rmse_dps"] == pytest.approx(np.sqrt(squares[:, 0].mean()))
+    assert metrics["test_rmse_dps_all"] == pytest.approx(np.sqrt(squares.mean()))
+    noise = bench.device.noise[0] ** 2 / (RECORDING_S - WINDOW_S)
+    honest = ((windows - rest) ** 2).mean() - noise.mean()
+    assert metrics["test_mse_dps2_all_disjoint"] == pytest.approx(honest)
+
+
+def test_the_running_mean_gains_nothing_on_itself(bench):
+    metrics = bench.metrics(bench.mean_errors, LAST)
+    assert metrics["accuracy_gain_pct"] == 0
+    # The first time that the curve of four recordings, which is not monotonic, is as low.
+    curve = bench.curve.query("truth == 'paper' and windows == 'first'").groupby("time_s").sum()
+    rmse = np.sqrt(curve.sum_sq / curve["count"])
+    after = int((rmse <= rmse[WINDOW_S]).argmax())
+    time_s = metrics["equivalent_time_s"]
+    assert rmse.index[after - 1] < time_s <= rmse.index[after] <= WINDOW_S
+    assert metrics["time_saving_pct"] == pytest.approx(100 * (1 - WINDOW_S / time_s))
+
+
+def test_knowing_the_whole_recording_is_worth_the_whole_recording(bench):
+    metrics = bench.metrics(bench.errors(Off(bench, 0.0)), LAST)
+    assert metrics["test_rmse_dps"] == pytest.approx(0, abs=1e-12)
+    assert metrics["accuracy_gain_pct"] == pytest.approx(100)
+    assert metrics["equivalent_time_s"] == pytest.approx(RECORDING_S)
+    assert metrics["time_saving_pct"] == pytest.approx(100 * (1 - WINDOW_S / RECORDING_S))
+
+
+def test_an_estimate_off_the_curve_has_no_time_and_says_why(bench):
+    metrics = bench.metrics(bench.errors(Off(bench, 1.0)), LAST)
+    assert metrics["test_rmse_dps"] == pytest.approx(1)
+    assert metrics["accuracy_gain_pct"] < -1000
+    assert not any(name.startswith(("equivalent_time", "time_saving")) for name in metrics)
+    notes = off_the_curve(metrics)
+    assert "worse than the running mean of 0.25 s" in notes["equivalent_time_s"]
+    assert "equivalent_time_s_all" in notes
+    assert off_the_curve(bench.metrics(bench.mean_errors, LAST)) == {}
+
+
+def test_a_level_that_the_running_mean_never_reaches_is_said_so(bench):
+    metrics = bench.metrics(bench.mean_errors, LAST)
+    best = {name: metrics[name] for name in ("test_rmse_dps", "mean_rmse_dps")}
+    best["test_rmse_dps"] /= 100
+    assert off_the_curve(best) == {"equivalent_time_s": "the running mean never gets there"}
+
+
+def test_names_are_put_together_in_order(bench):
+    names = set(bench.metrics(bench.mean_errors, BEST))
+    assert "test_rmse_dps_all_best_lo" in names
+    assert "test_mse_dps2_all_best_disjoint_hi" in names
+    assert not any(name.startswith("ceiling") for name in names)  # it has no epoch
+    assert {"ceiling_rmse_dps", "ceiling_rmse_dps_lo", "ceiling_rmse_dps_all_disjoint"} <= set(
+        bench.metrics(bench.mean_errors, LAST)
+    )
+
+
+def test_intervals_hold_their_values(bench):
+    metrics = bench.metrics(bench.mean_errors, LAST)
+    for base in ("test_rmse_dps", "test_rmse_dps_all", "ceiling_rmse_dps"):
+        assert metrics[f"{base}_lo"] < metrics[base] < metrics[f"{base}_hi"]
+
+
+# the device and its ceiling
+
+
+def test_noise_and_turn_on_spread_are_measured(make_recordings, parameters):
+    noise, spread = 0.004, np.array([0.0, 0.002, 0.006])
+    bias = np.random.default_rng(8).normal(0, 1, (1, 120, 3)) * spread + [5, -7, 0.1]
+    recordings = make_recordings(bias, 1200, 20.0, noise, seed=9)
+    allan = measure_allan_variance(recordings)
+    table = measure_bias(recordings, allan, parameters().ground_truth)
+    device = describe_device(recordings, table, allan, tuple(range(1, 121)), seed=1)
+    assert device.noise.shape == device.spread.shape == (401, 3)
+    np.testing.assert_allclose(device.noise[0], noise, rtol=0.04)
+    np.testing.assert_allclose(device.spread[0, 1:], spread[1:], rtol=0.2)
+    assert device.spread[0, 0] < 1.5e-4  # a third of N / sqrt(T), which is all there is
+    assert device.unit_bias is None
+    assert not device.white
+    lo, hi = np.quantile(device.spread[1:, 2], [0.001, 0.999])
+    assert lo < spread[2] < hi
+
+
+def test_test_recordings_do_not_describe_the_device(world):
+    known = device_of(world)
+    wild = world.bias.copy()
+    wild.loc[wild.recording > 10, "bias_dps"] = 99
+    allan = world.allan.copy(deep=True)
+    allan.allan_variance[:, 10:] = 99
+    again = device_of(replace(world, bias=wild, allan=allan))
+    np.testing.assert_array_equal(known.noise, again.noise)
+    np.testing.assert_array_equal(known.spread, again.spread)
+
+
+def test_of_a_hold_out_the_test_recordings_are_unknown_of_a_k_fold_none(world):
+    assert known_recordings(world.roles) == tuple(range(1, 11))
+    folds = pd.concat([world.roles.assign(fold=fold) for fold in (0, 1)])
+    assert known_recordings(folds) == tuple(range(1, 15))
+    folds.loc[(folds.fold == 1) & (folds.recording == 1), "role"] = TEST
+    assert bench_module.test_recordings(folds, 0) == TESTED
+    assert bench_module.test_recordings(folds, 1) == (1, *TESTED)
+
+
+def test_a_running_mean_over_a_k_fold_is_tested_on_every_recording():
+    folds = pd.concat(
+        pd.DataFrame({"fold": f, "recording": [1, 2, 3], "role": TRAIN}) for f in range(3)
+    )
+    folds.loc[folds.fold + 1 == folds.recording, "role"] = TEST
+    assert bench_module.test_recordings(folds, HOLD_OUT) == (1, 2, 3)
+
+
+def test_ceilings_of_simulated_data_are_the_closed_form(world, simulated):
+    bench = Bench(simulated, device_of(world, simulated), TESTED, WINDOW_S, world.evaluation)
+    assert bench.ceiling_basis == "drawn values"
+    noise, spread = np.array([3e-3, 4e-3, 5e-3]), np.array([1e-3, 2e-3, 3e-3])
+    q, r = spread**2 * WINDOW_S / noise**2, WINDOW_S / RECORDING_S
+    mean = noise**2 * (1 / WINDOW_S - 1 / RECORDING_S)
+    best = mean * (r + (1 - r) * q / (1 + q))
+    rho = np.sqrt(best.mean() / mean.mean())
+    ceilings = bench.ceilings(PAPER)
+    assert ceilings["ceiling_rmse_dps"].value == pytest.approx(np.sqrt(best.mean()))
+    assert ceilings["ceiling_rmse_dps"].lo is None
+    assert ceilings["ceiling_accuracy_gain_pct"].value == pytest.approx(100 * (1 - rho))
+    saving = 100 * (1 - rho**2) * (1 - r)
+    assert ceilings["ceiling_time_saving_pct"].value == pytest.approx(saving)
+    posterior = noise**2 / WINDOW_S * q / (1 + q)
+    assert bench.ceilings(TRUE)["ceiling_rmse_dps"].value == (
+        pytest.approx(np.sqrt(posterior.mean()))
+    )
+
+
+def test_coloured_noise_has_no_oracle(world, simulated):
+    coloured = simulated.assign(true_flicker=1e-3)
+    bench = Bench(coloured, device_of(world, coloured), TESTED, WINDOW_S, world.evaluation)
+    assert bench.oracle_errors is None
+    assert bench.ceiling_basis == "drawn values, without the flicker noise"
+    assert not any("oracle" in name for name in bench.metrics(bench.mean_errors, LAST))
+
+
+def test_simulated_data_are_judged_against_the_drawn_bias_as_well(world, simulated):
+    bench = Bench(simulated, device_of(world, simulated), TESTED, WINDOW_S, world.evaluation)
+    metrics = bench.metrics(bench.errors(Off(bench, 0.0)), LAST)
+    assert metrics["test_rmse_dps_true"] == pytest.approx(1e-4)
+    assert metrics["beats_oracle_p"] < 0.05  # it looks at the whole recording
+
+
+# the node
+
+
+def evaluated(world, runs, **changes):
+    w = replace(world, **changes)
+    names = "recordings bias allan roles evaluation".split()
+    given = {name: getattr(w, name) for name in names}
+    return list(evaluate(cells=w.plan(), runs=runs, **given))
+
+
+@pytest.fixture(scope="module")
+def judged(world, stored):
+    return evaluated(world, stored)
+
+
+def test_every_run_that_waits_is_judged(world, stored, judged):
+    assert [run.run_id for run in judged] == [
+        next(one.run_id for one in stored if one.fingerprint == print_)
+        for print_ in world.plan().fingerprint
+    ]
+    by_id = {run.run_id: run for run in stored}
+    for run in judged:
+        estimator = by_id[run.run_id].params["estimator"]
+        assert set(run.artifacts) == {ERRORS} | ({CURVE} if estimator == MEAN else set())
+        weights = {MEAN: {LAST}, CNN: {LAST, BEST}}[estimator]
+        assert set(run.artifacts[ERRORS].weights) == weights
+        errors = run.artifacts[ERRORS].query("weights == 'last' and truth == 'paper'")
+        assert run.metrics["test_rmse_dps_all"] == pytest.approx(
+            np.sqrt((errors.error_dps**2).mean())
+        )
+        first = errors[errors.window == 0]
+        assert run.metrics["test_rmse_dps"] == pytest.approx(np.sqrt((first.error_dps**2).mean()))
+
+
+def test_stored_weights_give_the_stored_errors(world, stored, judged):
+    """From the state dict by plain PyTorch: convolution, LeakyReLU, max-pool, two layers."""
+    run = next(one for one in judged if one.run_id == stored[-1].run_id)
+    artifact = stored[-1].load(WEIGHTS)
+    state, scaling, t = artifact["last"], artifact["scaling"], world.training
+    layers = torch.nn.Sequential(
+        torch.nn.Conv1d(3, t.channels, t.kernel, t.stride),
+        torch.nn.LeakyReLU(0.1),
+        torch.nn.MaxPool1d(t.pool),
+    )
+    layers[0].weight.data, layers[0].bias.data = (
+        state["convolution.weight"],
+        state["convolution.bias"],
+    )
+    samples = world.recordings.angular_rate.sel(imu=1, recording=11).to_numpy()
+    centre = scaling["centre"].numpy()
+    window = (samples[:, :SIZE] - centre[:, None]) / scaling["input_scale"]
+    with torch.no_grad():
+        features = layers(torch.tensor(window, dtype=torch.float32)[None]).swapaxes(1, 2).flatten()
+        hidden = state["hidden.weight"] @ features + state["hidden.bias"]
+        output = state["output.weight"] @ torch.where(hidden > 0, hidden, 0.1 * hidden)
+        output = (output + state["output.bias"]).numpy() * scaling["target_scale"]
+    expected = centre + output - samples.mean(axis=1, dtype=np.float64)
+    errors = run.artifacts[ERRORS].query(
+        "weights == 'last' and truth == 'paper' and recording == 11 and window == 0"
+    )
+    np.testing.assert_allclose(errors.error_dps, expected, atol=1e-7)
+
+
+def test_what_was_judged_this_way_is_skipped_and_nothing_else(world, stored, judged, caplog):
+    tags = {run.run_id: run.tags for run in judged}
+    finished = [
+        replace(run, finished=True, tags={**run.tags, **tags[run.run_id]}) for run in stored
+    ]
+    caplog.set_level("INFO", logger="gyro_pipeline")
+    assert evaluated(world, finished) == []
+    assert "0 runs evaluated, 5 skipped" in caplog.text
+    waiting = [replace(finished[0], finished=False), *finished[1:]]
+    assert [run.run_id for run in evaluated(world, waiting)] == [finished[0].run_id]
+    other = world.evaluation.model_copy(update={"resamples": 101})
+    again = evaluated(world, finished, evaluation=other)
+    assert len(again) == 5
+    assert {run.tags[EVALUATED_WITH] for run in again}.isdisjoint(
+        run.tags[EVALUATED_WITH] for run in judged
+    )
+
+
+def test_only_the_test_imus_outputs_of_method_1_count(world, make_study, as_stored):
+    study = make_study("input_channels", method=1, real_gyros=[6])
+    channels = replace(world, study=study, virtual=None)
+    runs = [as_stored(run, f"id{i}") for i, run in enumerate(channels.train())]
+    run = evaluated(channels, runs)[-1]
+    errors = run.artifacts[ERRORS]
+    assert errors.groupby(["weights", "truth", "recording", "window"]).size().eq(3).all()
+    artifact = runs[-1].load(WEIGHTS)
+    # Outputs of all six are far from zero before the centres are added; IMU 1's centres come first.
+    np.testing.assert_allclose(
+        artifact["scaling"]["centre"][:3],
+        world.bias.query("imu == 1 and recording <= 8").groupby("axis").bias_dps.mean(),
+    )
+    assert run.metrics["test_rmse_dps_all"] < 0.05  # IMU 2's biases are off by more
+
+
+def test_without_validation_there_is_no_best_epoch(world, make_roles, as_stored):
+    without = replace(world, roles=make_roles(14, test=4), virtual=None)
+    cells = without.plan().query("estimator == 'cnn' and virtual_gyros == 0 and real_gyros == 3")
+    (trained,) = without.train(cells=cells)
+    assert trained.artifacts[WEIGHTS]["best"] is None
+    assert "val_loss" not in trained.artifacts[HISTORY]
+    names = "recordings bias allan roles evaluation".split()
+    given = {name: getattr(without, name) for name in names}
+    (run,) = evaluate(cells=cells, runs=[as_stored(trained, "id")], **given)
+    assert not any(BEST in name.split("_") for name in run.metrics)
+
+
+@pytest.mark.parametrize("windows", [FIRST, ALL])
+def test_the_curve_at_the_window_is_the_running_means_rmse(bench, windows):
+    curve = bench.curve.query(f"truth == 'paper' and windows == '{windows}' and time_s == 10.0")
+    rmse = np.sqrt(curve.sum_sq.sum() / curve["count"].sum())
+    name = "test_rmse_dps" + ("" if windows == FIRST else "_all")
+    assert bench.metrics(bench.errors(RunningMean()), LAST)[name] == pytest.approx(rmse)

@@ -1,0 +1,101 @@
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyro_pipeline.conventions import AXES
+from gyro_pipeline.parameters import GroundTruth
+from gyro_pipeline.physics.noise import simulate_noise
+from gyro_pipeline.pipelines.ground_truth.nodes import (
+    measure_allan_variance,
+    measure_bias,
+    measure_noise,
+)
+
+NOISE = 0.005
+RATE_HZ, SAMPLES = 20.0, 1200
+DURATION_S = SAMPLES / RATE_HZ
+TOLERANCE = GroundTruth(tolerance_mdps=2.0)
+
+
+@pytest.fixture(scope="module")
+def recordings(make_recordings):
+    # Large biases: sums in float32 would be off by more than the tolerances below.
+    bias = 300 + np.random.default_rng(1).uniform(-3, 3, (2, 12, 3))
+    made = make_recordings(bias, SAMPLES, RATE_HZ, NOISE)
+    made.angular_rate[1, 4] = np.nan
+    return made
+
+
+@pytest.fixture(scope="module")
+def allan(recordings):
+    return measure_allan_variance(recordings)
+
+
+@pytest.fixture(scope="module")
+def bias(recordings, allan):
+    return measure_bias(recordings, allan, TOLERANCE)
+
+
+def test_bias_and_sigma_are_those_of_all_samples_in_float64(recordings, bias):
+    samples = recordings.angular_rate.to_numpy().astype(np.float64)
+    for row in bias.itertuples():
+        one = samples[row.imu - 1, row.recording - 1, AXES.index(row.axis)]
+        assert row.bias_dps == pytest.approx(one.mean(), rel=1e-13)
+        assert row.sample_sigma_dps == pytest.approx(one.std(ddof=1), rel=1e-7)
+        off = np.abs(np.cumsum(one) / np.arange(1, 1 + SAMPLES) - one.mean()) > 0.002
+        assert row.settling_time_s == pytest.approx((np.flatnonzero(off)[-1] + 2) / RATE_HZ)
+
+
+def test_every_present_recording_has_a_row_and_an_absent_one_has_none(bias):
+    assert len(bias) == (2 * 12 - 1) * 3
+    assert not bias.isna().any(axis=None)
+    assert bias[(bias.imu == 2) & (bias.recording == 5)].empty
+    assert set(bias.sensor) == {"sparkfun"}
+
+
+def test_standard_error_is_n_over_the_root_of_the_duration(recordings, allan, bias):
+    noise = measure_noise(recordings, allan, bias).set_index(["imu", "axis"]).white_dps_rts
+    expected = [noise[row.imu, row.axis] / np.sqrt(DURATION_S) for row in bias.itertuples()]
+    np.testing.assert_allclose(bias.standard_error_dps, expected, rtol=1e-12)
+    np.testing.assert_allclose(bias.standard_error_dps, NOISE / np.sqrt(DURATION_S), rtol=0.1)
+
+
+def test_noise_figures_are_those_drawn(recordings, allan, bias):
+    noise = measure_noise(recordings, allan, bias)
+    assert noise[["imu", "axis"]].to_numpy().tolist() == [[i, a] for i in (1, 2) for a in AXES]
+    np.testing.assert_allclose(noise.white_dps_rts, NOISE, rtol=0.08)
+    np.testing.assert_allclose(noise.sample_sigma_dps, NOISE * np.sqrt(RATE_HZ), rtol=0.02)
+    # What is left for flicker and random walk hardly matters over a whole recording.
+    assert (noise.instability_dps < 0.2 * NOISE).all()
+
+
+def test_n_of_correlated_samples_is_not_sigma_over_the_root_of_the_rate(make_recordings):
+    recordings = make_recordings(np.zeros((1, 40, 3)), SAMPLES, RATE_HZ, NOISE)
+    recordings["angular_rate"][...] = simulate_noise(
+        np.random.default_rng(2), (1, 40, 3, SAMPLES), RATE_HZ, NOISE, lag1_correlation=-0.3
+    )
+    allan = measure_allan_variance(recordings)
+    noise = measure_noise(recordings, allan, measure_bias(recordings, allan, TOLERANCE))
+    # The long-run variance of a moving average is that of its samples times 1 + 2 rho.
+    ratio = noise.sample_sigma_dps / (NOISE * np.sqrt(RATE_HZ))
+    np.testing.assert_allclose(ratio, np.sqrt(1 / 0.4), rtol=0.02)
+    np.testing.assert_allclose(noise.white_dps_rts, NOISE, rtol=0.15)
+
+
+def test_adding_a_constant_moves_the_bias_by_it_and_nothing_else(recordings, allan, bias):
+    moved = recordings.assign(angular_rate=recordings.angular_rate - 256)  # exact in float32
+    table = measure_bias(moved, measure_allan_variance(moved), TOLERANCE)
+    np.testing.assert_allclose(table.bias_dps, bias.bias_dps - 256, atol=2e-7)
+    rest = ["standard_error_dps", "sample_sigma_dps", "settling_time_s"]
+    np.testing.assert_allclose(table[rest], bias[rest], rtol=1e-6)
+
+
+def test_allan_variance_falls_as_one_over_time_and_inputs_stay(recordings, allan):
+    before = recordings.copy(deep=True)
+    again = measure_allan_variance(recordings)
+    xr.testing.assert_identical(recordings, before)
+    xr.testing.assert_identical(again, allan)
+    assert np.isnan(allan.allan_variance.sel(imu=2, recording=5)).all()
+    mean = allan.allan_variance.mean(["imu", "recording", "axis"])
+    slope = np.polyfit(np.log(allan.time_s), np.log(mean), 1)[0]
+    assert slope == pytest.approx(-1, abs=0.05)

@@ -1,0 +1,94 @@
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyro_pipeline.conventions import InputError
+from gyro_pipeline.parameters import VirtualGyros
+from gyro_pipeline.pipelines.ground_truth.nodes import measure_allan_variance, measure_bias
+from gyro_pipeline.pipelines.virtual_gyros.nodes import synthesise
+
+RATE_HZ, SAMPLES = 10.0, 600
+SIGMA = 0.02
+SETTINGS = VirtualGyros(
+    imus=8, recordings=20, train_recordings=16, turn_on_jitter_mdps=0.0, seed=20240901
+)
+
+
+@pytest.fixture(scope="module")
+def real(make_recordings):
+    """Ten recordings that train, two that validate and four that test, these of wild gyroscopes."""
+    bias = np.random.default_rng(3).uniform(-1, 1, (2, 16, 3))
+    bias[:, 10:] *= 50
+    recordings = make_recordings(bias, SAMPLES, RATE_HZ, SIGMA / np.sqrt(RATE_HZ))
+    recordings.angular_rate[:, 10:] *= 7
+    return recordings
+
+
+@pytest.fixture(scope="module")
+def bias(real, parameters):
+    return measure_bias(real, measure_allan_variance(real), parameters().ground_truth)
+
+
+@pytest.fixture(scope="module")
+def roles(make_roles):
+    return make_roles(16, test=4, validation=2)
+
+
+@pytest.fixture(scope="module")
+def virtual(real, bias, roles):
+    return synthesise(real, bias, roles, SETTINGS)
+
+
+def test_biases_fill_the_range_of_training_recordings_and_no_more(virtual, bias):
+    training = bias[bias.recording <= 10].bias_dps
+    slack = 5 * SIGMA / np.sqrt(SAMPLES)
+    low, high = float(virtual.recording_mean.min()), float(virtual.recording_mean.max())
+    assert low > training.min() - slack
+    assert high < training.max() + slack
+    assert high - low > 0.7 * np.ptp(training)
+
+
+def test_noise_is_that_of_training_recordings(virtual, bias):
+    training = bias[bias.recording <= 10].sample_sigma_dps
+    noise = virtual.angular_rate - virtual.recording_mean
+    assert float(noise.std()) == pytest.approx(np.sqrt(np.mean(training**2)), rel=0.005)
+    successive = float((noise[..., 1:].to_numpy() * noise[..., :-1].to_numpy()).mean())
+    assert successive / float((noise**2).mean()) == pytest.approx(0, abs=0.01)
+
+
+def test_a_gyroscope_keeps_one_bias_over_its_recordings(virtual):
+    over_recordings = virtual.recording_mean.std("recording", ddof=1)
+    assert float(over_recordings.mean()) == pytest.approx(SIGMA / np.sqrt(SAMPLES), rel=0.1)
+    assert np.unique(virtual.recording_mean.mean("recording").round(2)).size > 15
+
+
+def test_jitter_moves_it_from_one_power_on_to_the_next(real, bias, roles):
+    jittery = SETTINGS.model_copy(update={"turn_on_jitter_mdps": 50.0})
+    moved = synthesise(real, bias, roles, jittery)
+    over_recordings = moved.recording_mean.std("recording", ddof=1)
+    assert float(np.sqrt((over_recordings**2).mean())) == pytest.approx(0.05, rel=0.1)
+
+
+def test_counts_layout_and_means(virtual, real):
+    assert dict(virtual.sizes) == {"imu": 8, "recording": 20, "axis": 3, "sample": SAMPLES}
+    assert virtual.angular_rate.dtype == np.float32
+    assert (virtual.rate_hz, virtual.source, virtual.simulated) == (RATE_HZ, "test", 1)
+    expected = virtual.angular_rate.to_numpy().astype(np.float64).mean(axis=-1)
+    np.testing.assert_allclose(virtual.recording_mean, expected, rtol=1e-12)
+
+
+def test_the_seed_and_the_sensor_decide(virtual, real, bias, roles):
+    again = synthesise(real, bias, roles, SETTINGS)
+    xr.testing.assert_identical(again, virtual)
+    others = [
+        synthesise(real, bias, roles, SETTINGS.model_copy(update={"seed": 1})),
+        synthesise(real.assign_attrs(sensor="dot"), bias, roles, SETTINGS),
+    ]
+    assert len({one.data_hash for one in [virtual, *others]}) == 3
+    for other in others:
+        assert not np.allclose(other.recording_mean, virtual.recording_mean, atol=0.01)
+
+
+def test_a_k_fold_is_refused(real, bias, roles):
+    with pytest.raises(InputError, match=r"sparkfun: virtual gyroscopes need a hold-out split"):
+        synthesise(real, bias, roles.assign(fold=0), SETTINGS)

@@ -1,0 +1,61 @@
+import numpy as np
+import pytest
+
+from gyro_pipeline.conventions import InputError
+from gyro_pipeline.protocol.windows import cut_windows, window_size
+
+
+@pytest.mark.parametrize(
+    ("sensor", "window_s", "size", "count"),
+    [
+        ("sparkfun", 10, 1494, 8),
+        ("sparkfun", 30, 4483, 2),
+        ("dot", 10, 1083, 12),
+        ("dot", 30, 3250, 4),
+        ("ng", 10, 2000, 6),
+        ("ng", 30, 6000, 2),
+        ("memsense", 10, 2500, 5),
+        ("memsense", 30, 7500, 1),
+    ],
+)
+def test_the_papers_windows(parameters, sensor, window_s, size, count):
+    entry = parameters("base").sensors[sensor]
+    assert window_size(window_s, entry.rate_hz, entry.samples, sensor) == size
+    assert cut_windows(np.zeros((3, entry.samples), np.float32), size).shape == (3, count, size)
+
+
+def test_windows_are_non_overlapping_slices_from_the_start():
+    samples = np.arange(2 * 3 * 23).reshape(2, 3, 23)
+    windows = cut_windows(samples, 5)
+    assert windows.shape == (2, 3, 4, 5)
+    for k in range(4):
+        np.testing.assert_array_equal(windows[:, :, k], samples[:, :, 5 * k : 5 * k + 5])
+
+
+def test_windows_are_views():
+    recordings = np.zeros((2, 4, 3, 23), np.float32)
+    one = recordings[1, 2]
+    windows = cut_windows(one, 5)
+    assert np.shares_memory(windows, recordings)
+    windows[0, 1, 2] = 7.0
+    assert recordings[1, 2, 0, 7] == 7.0
+    # Also where an axis before the samples is strided, as three IMUs' windows side by side are.
+    assert np.shares_memory(cut_windows(recordings[:, 0], 5), recordings)
+
+
+def test_a_window_may_be_the_whole_recording():
+    assert window_size(10, 10.0, 100, "dot") == 100
+    assert cut_windows(np.zeros((3, 100)), 100).shape == (3, 1, 100)
+
+
+@pytest.mark.parametrize(
+    ("window_s", "message"),
+    [
+        (52.01, r"memsense: a window of 52.01 s is 13002 samples at 250 Hz, .* 13000 \(52 s\)"),
+        (0.001, "memsense: a window of 0.001 s is 0 samples"),
+        (-1.0, "memsense: a window of -1 s"),
+    ],
+)
+def test_a_window_that_no_recording_holds_is_refused(window_s, message):
+    with pytest.raises(InputError, match=message):
+        window_size(window_s, 250.0, 13000, "memsense")

@@ -1,0 +1,205 @@
+"""Imports point one way; read from the source, so that imports inside functions count as well."""
+
+import ast
+import sys
+from pathlib import Path
+
+import pytest
+
+import gyro_pipeline
+
+PACKAGE = Path(gyro_pipeline.__file__).parent
+NAME = "gyro_pipeline"
+STAGES = [path.name for path in (PACKAGE / "pipelines").iterdir() if (path / "nodes.py").exists()]
+
+# What the modules of each part may import of this package, besides their own part.
+ALLOWED = {
+    "conventions": set(),
+    "fingerprints": set(),
+    "parameters": {"conventions"},
+    "studies": {"conventions", "parameters"},
+    "tracking": {"conventions"},
+    "physics": {"conventions"},
+    "estimators": {"conventions"},
+    "protocol": {"conventions", "parameters"},
+    "learning": {"conventions", "parameters", "protocol"},
+    "datasets": {"conventions", "parameters", "fingerprints", "tracking", "physics"},
+    **{
+        f"pipelines.{stage}": {
+            "conventions",
+            "estimators",
+            "fingerprints",
+            "learning",
+            "parameters",
+            "physics",
+            "protocol",
+            "studies",
+            "tracking",
+        }
+        for stage in STAGES
+    },
+    "pipelines": set(),
+    "pipeline_registry": {
+        "parameters",
+        "studies",
+        "pipelines",
+        *(f"pipelines.{stage}" for stage in STAGES),
+    },
+    "hooks": {"conventions", "datasets", "parameters", "pipeline_registry", "studies"},
+    "settings": {"hooks"},
+    "__init__": set(),
+    "__main__": set(),
+}
+
+
+def imported(source, package, at_import=False):
+    """Full names of all that a module of ``package`` imports, or only when it is imported."""
+    names = set()
+    nodes = [ast.parse(source)]
+    while nodes:
+        node = nodes.pop()
+        deferred = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        if at_import and deferred:
+            continue
+        nodes += ast.iter_child_nodes(node)
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            parents = package.split(".")[: len(package.split(".")) - node.level + 1]
+            base = ".".join([*(parents if node.level else []), *filter(None, [node.module])])
+            names |= {f"{base}.{alias.name}" for alias in node.names}
+    return names
+
+
+def part_of(name):
+    """The part of the package that a full name lies in; None for other packages."""
+    if name.split(".")[0] != NAME:
+        return None
+    inner = [word for word in name.split(".")[1:] if word]
+    for length in (2, 1):
+        if ".".join(inner[:length]) in ALLOWED:
+            return ".".join(inner[:length])
+    return inner[0] if inner else "__init__"
+
+
+def modules():
+    """Dotted name, enclosing package and source of every module."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = [NAME, *path.relative_to(PACKAGE).with_suffix("").parts]
+        package = ".".join(parts[:-1])
+        dotted = package if parts[-1] == "__init__" and len(parts) > 2 else ".".join(parts)
+        yield dotted, package, path.read_text()
+
+
+MODULES = {name: (package, source) for name, package, source in modules()}
+
+
+def names_of(part, at_import=False):
+    """What each module of a part imports."""
+    return {
+        name: imported(source, package, at_import)
+        for name, (package, source) in MODULES.items()
+        if part_of(name) == part or part_of(name).startswith(f"{part}.")
+    }
+
+
+def roots(names):
+    return {name.split(".")[0] for name in names}
+
+
+def violations(name, package, source):
+    """Imports that point the wrong way."""
+    own = part_of(name)
+    targets = {target: part_of(target) for target in imported(source, package)}
+    return {
+        target
+        for target, part in targets.items()
+        if part not in {None, own} | ALLOWED.get(own, set())
+    }
+
+
+def test_there_are_seven_stages():
+    assert sorted(STAGES) == sorted(
+        "raw_logs ground_truth virtual_gyros windowed_splits training evaluation reporting".split()
+    )
+
+
+def test_every_module_has_its_place():
+    assert {part_of(name) for name in MODULES} == set(ALLOWED)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_imports_point_one_way(name):
+    assert violations(name, *MODULES[name]) == set()
+
+
+@pytest.mark.parametrize(
+    ("name", "source"),
+    [
+        ("physics.bias", "from gyro_pipeline.parameters import Sensor"),
+        ("protocol.scores", "from gyro_pipeline import physics"),
+        ("learning.trainer", "from ..tracking import StoredRun"),
+        ("datasets.recordings", "def load():\n    from gyro_pipeline import learning"),
+        ("datasets.recordings", "import gyro_pipeline.pipelines.training.nodes"),
+        ("pipelines.training.nodes", "from gyro_pipeline.pipelines.evaluation import bench"),
+        ("pipelines.training.nodes", "from gyro_pipeline.pipelines import ground_truth"),
+        ("pipelines.training.nodes", "from ..raw_logs.nodes import label_recordings"),
+        ("pipelines.training.nodes", "from gyro_pipeline.datasets.tracked_runs import TrackedRuns"),
+        ("conventions", "from gyro_pipeline.parameters import Parameters"),
+    ],
+)
+def test_an_import_of_the_wrong_direction_is_seen(name, source):
+    dotted = f"{NAME}.{name}"
+    assert violations(dotted, dotted.rpartition(".")[0], source)
+
+
+def test_imports_of_the_own_part_are_not_violations():
+    source = "from gyro_pipeline.physics.allan import fit_noise\nfrom .bias import recording_mean"
+    assert not violations("gyro_pipeline.physics.ceiling", "gyro_pipeline.physics", source)
+
+
+def test_physics_is_numpy():
+    known = {NAME, "numpy", "scipy", "allantools", *sys.stdlib_module_names}
+    for name, names in names_of("physics").items():
+        assert roots(names) <= known, name
+
+
+@pytest.mark.parametrize("part", ["physics", "protocol", "estimators", "learning"])
+def test_the_science_knows_neither_kedro_nor_mlflow(part):
+    assert names_of(part)
+    for name, names in names_of(part).items():
+        assert not roots(names) & {"kedro", "kedro_datasets", "mlflow"}, name
+
+
+def test_stages_do_not_know_where_runs_are_kept():
+    for name, names in names_of("pipelines").items():
+        assert "mlflow" not in roots(names), name
+        if name.endswith(".nodes"):
+            assert "kedro" not in roots(names), name
+
+
+def test_only_datasets_know_mlflow():
+    users = {
+        name for name, (p, source) in MODULES.items() if "mlflow" in roots(imported(source, p))
+    }
+    assert users == {"gyro_pipeline.datasets.tracked_runs"}
+
+
+def test_only_learning_and_the_run_store_know_torch():
+    users = {name for name, (p, source) in MODULES.items() if "torch" in roots(imported(source, p))}
+    learning = {name for name in users if part_of(name) == "learning"}
+    assert learning
+    assert users - learning == {"gyro_pipeline.datasets.tracked_runs"}
+
+
+def test_datasets_are_imported_without_torch():
+    found = names_of("datasets", at_import=True)
+    assert "mlflow" in roots(found["gyro_pipeline.datasets.tracked_runs"])
+    for name, names in found.items():
+        assert "torch" not in roots(names), name
+
+
+def test_imports_inside_functions_are_told_from_those_at_import():
+    source = "import a\nclass C:\n    import b\n    def f(self):\n        import c\n"
+    assert imported(source, NAME, at_import=True) == {"a", "b"}
+    assert imported(source, NAME) == {"a", "b", "c"}

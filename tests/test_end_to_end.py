@@ -1,0 +1,369 @@
+"""The commands of the README, on the smoke environment and on the real Memsense file."""
+
+import os
+import re
+import shutil
+from collections import Counter
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from mlflow import MlflowClient
+
+SERIAL = {"executor": "serial"}  # where few trainings are not worth the start of processes
+REAL_FILE = "memsense_test_real.npy"
+REPORT = "data/08_reporting/simulated_smoke"
+CELL = ["sensor", "real_gyros", "virtual_gyros", "window_s"]
+PARAMS = {*CELL, "study", "method", "source", "seed", "fold", "estimator"}
+HYPER_PARAMETERS = {
+    "centring", "channels", "kernel", "stride", "pool", "hidden", "epochs", "batch_size",
+    "learning_rate", "decay", "decay_every", "validation_recordings", "split_seed",
+}  # fmt: skip
+BASES = {
+    "test_rmse_dps", "mean_rmse_dps", "equivalent_time_s", "time_saving_pct", "accuracy_gain_pct",
+    "test_mse_dps2", "ceiling_rmse_dps", "ceiling_time_saving_pct", "ceiling_accuracy_gain_pct",
+    "beats_oracle_p",
+}  # fmt: skip
+SUFFIXES = ["".join(parts) for parts in product(("", "_all"), ("", "_best"), ("", "_true"))]
+REPORTED = {
+    *(f"tables/augmentation_{name}.{kind}"
+      for name in ("results", "three_gyroscopes", "multiple_gyroscopes")
+      for kind in ("csv", "md", "tex")),
+    *(f"figures/augmentation_{sensor}_{real}_real.{kind}"
+      for sensor in ("sparkfun", "dot") for real in (3, 12) for kind in ("png", "svg")),
+}  # fmt: skip
+
+
+def by_estimator(runs, estimator):
+    return [run for run in runs if run.data.params["estimator"] == estimator]
+
+
+def identities(runs):
+    return {run.info.run_id: (run.info.start_time, run.info.end_time) for run in runs}
+
+
+def cell(run):
+    return tuple(run.data.params[name] for name in CELL)
+
+
+def artifacts(run):
+    return Path(run.info.artifact_uri.removeprefix("file://"))
+
+
+def weights(run):
+    """Bit by bit; the running mean has none."""
+    path = artifacts(run) / "weights.pt"
+    if not path.exists():
+        return None
+    stored = torch.load(path, weights_only=True)
+    return {name: value.numpy().tobytes() for name, value in stored["last"].items()}
+
+
+@dataclass(frozen=True)
+class Step:
+    """What there was after a command."""
+
+    code: int
+    output: str
+    augmentation: list
+    real2real: list
+    report: dict
+
+
+def step(project, done):
+    studies = (project.runs(study) for study in ("augmentation", "real2real"))
+    report = {path.removeprefix(f"{REPORT}/"): b for path, b in project.files(REPORT).items()}
+    return Step(done.code, done.output, *studies, report)
+
+
+# Each of these does the next thing in the same project.
+
+
+@pytest.fixture(scope="module")
+def repeated(smoke):
+    return step(smoke.project, smoke.project.run_here("augmentation", "smoke"))
+
+
+@pytest.fixture(scope="module")
+def shared(smoke, repeated):
+    done = smoke.project.run_here("real2real", "smoke", only={"sensor": "dot"}, execution=SERIAL)
+    return step(smoke.project, done)
+
+
+@pytest.fixture(scope="module")
+def incomplete(smoke, shared):
+    project = smoke.project
+    wanted = ("dot", "12", "24", "10.0")
+    (run,) = [one for one in shared.augmentation if cell(one) == wanted]
+    MlflowClient(f"sqlite:///{project.store}").delete_run(run.info.run_id)
+    for name in ("augmentation_three_gyroscopes.md", "augmentation_results.csv"):
+        (project.folder / REPORT / "tables" / name).unlink()
+    return step(project, project.kedro_run("--pipeline=reporting", "--env=smoke"))
+
+
+@pytest.fixture(scope="module")
+def repaired(smoke, incomplete):
+    (command,) = set(re.findall(r"kedro run (--pipeline=augmentation \S+)", incomplete.output))
+    return step(smoke.project, smoke.project.kedro_run(*command.split(), "--env=smoke"))
+
+
+@pytest.fixture(scope="module")
+def changed(smoke, repaired):
+    only = {"sensor": "dot", "real_gyros": 3, "virtual_gyros": 0, "window_s": 10}
+    changes = {"only": only, "training": {"hidden": 33}, "execution": SERIAL}
+    return step(smoke.project, smoke.project.run_here("augmentation", "smoke", **changes))
+
+
+# The first run
+
+
+def test_the_first_run_ends_well_and_says_where_to_look(smoke):
+    assert smoke.done.code == 0, smoke.done.output
+    last = smoke.done.output.strip().splitlines()[-3:]
+    for line, words in zip(last, (REPORT, "mlflow ui", "kedro viz"), strict=True):
+        assert words in line
+    assert "Traceback" not in smoke.done.output
+
+
+def test_there_is_one_finished_run_for_each_cell(smoke):
+    assert {run.info.status for run in smoke.runs} == {"FINISHED"}
+    networks, means = by_estimator(smoke.runs, "cnn"), by_estimator(smoke.runs, "mean")
+    assert Counter(map(cell, networks)) == Counter(
+        product(("sparkfun", "dot"), ("3", "12"), ("0", "12", "24"), ("10.0", "30.0"))
+    )
+    assert Counter(map(cell, means)) == Counter(
+        product(("sparkfun", "dot"), ("0",), ("0",), ("10.0", "30.0"))
+    )
+
+
+def test_parameters_keep_their_names(smoke):
+    for run in by_estimator(smoke.runs, "cnn"):
+        names = PARAMS | HYPER_PARAMETERS | {"folds"}
+        names |= {"turn_on_jitter_mdps"} if run.data.params["virtual_gyros"] != "0" else set()
+        assert set(run.data.params) == names
+        fixed = {"study": "augmentation", "method": "2", "seed": "0", "fold": "-1", "epochs": "6"}
+        assert {name: run.data.params[name] for name in fixed} == fixed
+        assert run.data.params["source"] == "simulated_smoke"
+        assert run.data.tags["simulated"] == "1"
+    for run in by_estimator(smoke.runs, "mean"):
+        assert set(run.data.params) == PARAMS | {"folds"}
+
+
+def test_metrics_keep_their_names(smoke):
+    name_of = re.compile(rf"({'|'.join(BASES)})(_all)?(_best)?(_disjoint|_true)?(_lo|_hi)?")
+    for run in smoke.runs:
+        metrics = run.data.metrics
+        curves = (
+            {"train_loss", "val_loss", "learning_rate"}
+            if run.data.params["estimator"] == "cnn"
+            else set()
+        )
+        assert curves <= set(metrics)
+        for name in set(metrics) - curves:
+            assert name_of.fullmatch(name), name
+        suffixes = SUFFIXES if curves else [s for s in SUFFIXES if "_best" not in s]
+        for base in ("test_rmse_dps", "mean_rmse_dps", "accuracy_gain_pct"):
+            assert {base + s + end for s in suffixes for end in ("", "_lo", "_hi")} <= set(metrics)
+        assert {"test_mse_dps2" + s.replace("_true", "_disjoint") for s in suffixes} <= set(metrics)
+        ceilings = [s for s in suffixes if "_best" not in s]
+        assert {f"ceiling_rmse_dps{s}" for s in ceilings} <= set(metrics)
+
+
+def test_an_equivalent_time_is_a_number_or_is_said_to_be_none(smoke):
+    for run in smoke.runs:
+        for name in run.data.metrics:
+            if name.startswith("test_rmse_dps") and not name.endswith(("_lo", "_hi")):
+                time = name.replace("test_rmse_dps", "equivalent_time_s")
+                assert (time in run.data.metrics) != (time in run.data.tags)
+
+
+def test_curves_are_whole_and_end_at_the_last_epoch(smoke):
+    client = MlflowClient(f"sqlite:///{smoke.project.store}")
+    run = by_estimator(smoke.runs, "cnn")[0]
+    for name in ("train_loss", "val_loss"):
+        curve = client.get_metric_history(run.info.run_id, name)
+        assert sorted(point.step for point in curve) == list(range(1, 7))
+        last = max(curve, key=lambda point: point.step)
+        assert run.data.metrics[name] == last.value
+
+
+def test_metrics_are_those_of_the_errors_kept_with_the_run(smoke):
+    for run in smoke.runs:
+        folder = artifacts(run)
+        assert folder.is_relative_to(smoke.project.folder)
+        kept = {path.name for path in folder.iterdir()}
+        network = run.data.params["estimator"] == "cnn"
+        own = {"weights.pt", "history.csv"} if network else {"running_mean_curve.parquet"}
+        assert kept == {"errors.parquet"} | own
+        errors = pd.read_parquet(folder / "errors.parquet")
+        for suffix in SUFFIXES if network else [""]:
+            chosen = errors[errors.truth == ("true" if "_true" in suffix else "paper")]
+            chosen = chosen[chosen.weights == ("best" if "_best" in suffix else "last")]
+            chosen = chosen if "_all" in suffix else chosen[chosen.window == 0]
+            rmse = np.sqrt((chosen.error_dps**2).mean())
+            assert run.data.metrics[f"test_rmse_dps{suffix}"] == pytest.approx(rmse)
+            mean = run.data.metrics[f"mean_rmse_dps{suffix}"]
+            gain = run.data.metrics[f"accuracy_gain_pct{suffix}"]
+            assert gain == pytest.approx(100 * (1 - rmse / mean))
+
+
+def test_the_report_is_written(smoke):
+    written = {path for path in smoke.files if path.startswith(REPORT)}
+    assert written == {f"{REPORT}/{name}" for name in REPORTED}
+    assert not [path for path in smoke.files if Path(path).name.startswith(".")]
+
+
+def test_tables_show_published_ours_and_the_ceiling_with_their_runs(smoke):
+    ids = {run.info.run_id[:8] for run in smoke.runs}
+    three, multiple = (
+        pd.read_csv(smoke.project.folder / REPORT / "tables" / f"augmentation_{name}.csv")
+        for name in ("three_gyroscopes", "multiple_gyroscopes")
+    )
+    assert three["Published S/A %"].tolist() == ["72/57", "84/79", "89/85"]
+    assert multiple["Published S/A %"].tolist() == ["86/88", "84/77", "88/80"]
+    for table in (three, multiple):
+        assert table["Ceiling S/A %"].str.fullmatch(r"\d+/\d+").all()
+        assert table["A %"].str.fullmatch(r"-?\d+ \[-?\d+, -?\d+\]").all()
+        assert table["Source"].eq("simulated_smoke").all()
+        assert table["Recordings"].eq(4).all()
+        assert set(table["Runs"]) <= ids
+    by_id = {run.info.run_id[:8]: run for run in smoke.runs}
+    first = by_id[three["Runs"][0]]
+    assert cell(first) == ("sparkfun", "3", "0", "10.0")
+    gain = first.data.metrics["accuracy_gain_pct_all"]
+    assert three["A %"][0].split()[0] == f"{gain:.0f}"
+
+
+def test_runs_say_what_made_them(smoke):
+    for run in smoke.runs:
+        tags = run.data.tags
+        assert tags["kedro_env"] == "smoke"
+        assert re.fullmatch(r"[0-9a-f]{16}", tags["lock_hash"])
+        assert re.fullmatch(r"[0-9a-f]{16}", tags["fingerprint"])
+        assert {"kedro_run", "git_dirty", "mlflow.source.git.commit"} <= set(tags)
+        assert {"torch", "numpy", "python", "data_hash"} <= set(tags)
+
+
+# The next ones
+
+
+def test_a_second_run_trains_nothing_and_says_so(smoke, repeated):
+    assert repeated.code == 0, repeated.output
+    skipped = "14 runs planned, 14 skipped (trained before), 0 shared with another study, 0 to"
+    for sensor in ("sparkfun", "dot"):
+        assert f"augmentation {sensor}: {skipped} train" in repeated.output
+        assert f"{sensor}: 0 runs evaluated, 14 skipped" in repeated.output
+    assert identities(repeated.augmentation) == identities(smoke.runs)
+    before = {path.removeprefix(f"{REPORT}/"): b for path, b in smoke.files.items()}
+    assert all(before[name] == content for name, content in repeated.report.items())
+
+
+def test_another_study_takes_the_cells_it_shares(smoke, shared):
+    assert shared.code == 0, shared.output
+    assert "10 runs planned, 0 skipped (trained before), 6 shared" in shared.output
+    assert identities(shared.augmentation) == identities(smoke.runs)
+    runs = shared.real2real
+    assert len(by_estimator(runs, "cnn")) == 8
+    assert len(by_estimator(runs, "mean")) == 2
+    assert {run.info.status for run in runs} == {"FINISHED"}
+    twins = {run.data.tags["fingerprint"]: run for run in smoke.runs}
+    for run in runs:
+        assert run.data.params["study"] == "real2real"
+        twin = twins.get(run.data.tags["fingerprint"])
+        shares = run.data.params["real_gyros"] in ("0", "3", "12")
+        assert (twin is not None) == shares
+        assert run.data.tags.get("trained_in") == ("augmentation" if shares else None)
+        if twin is not None:
+            assert run.data.metrics == pytest.approx(twin.data.metrics, rel=1e-6)
+            assert weights(run) == weights(twin)
+
+
+def test_reporting_makes_what_it_can_and_names_what_is_missing(repeated, incomplete):
+    assert incomplete.code != 0
+    assert "Traceback" not in incomplete.output
+    gone = {name for name in REPORTED if "multiple_gyroscopes" in name or "dot_12_real" in name}
+    kept = {name for name in incomplete.report if name.startswith(("tables/aug", "figures/aug"))}
+    assert kept == REPORTED - gone
+    three = "tables/augmentation_three_gyroscopes.md"
+    assert incomplete.report[three] == repeated.report[three]
+    results = incomplete.report["tables/augmentation_results.csv"].splitlines()
+    assert len(results) == 1 + 27
+    (command,) = set(re.findall(r"kedro run --pipeline=augmentation \S+", incomplete.output))
+    for part in ("sensor=dot", "real_gyros=12", "virtual_gyros=24", "window_s=10", "seed=0"):
+        assert f"only.{part}" in command
+    assert "--pipeline=input_channels" in incomplete.output
+    assert "tables/input_channels_results.csv" not in incomplete.report
+    assert len(incomplete.augmentation) == 27  # nothing was trained
+
+
+def test_the_command_it_names_repairs_it(incomplete, repaired):
+    assert repaired.code == 0, repaired.output
+    new = identities(repaired.augmentation).keys() - identities(incomplete.augmentation).keys()
+    assert len(new) == 1
+    assert len(repaired.augmentation) == 28
+    assert set(repaired.report) >= REPORTED
+
+
+def test_another_hyper_parameter_trains_anew_and_keeps_what_was(repaired, changed):
+    assert changed.code == 0, changed.output
+    before, after = identities(repaired.augmentation), identities(changed.augmentation)
+    assert before.items() <= after.items()
+    (new,) = [run for run in changed.augmentation if run.info.run_id not in before]
+    assert new.data.params["hidden"] == "33"
+    assert cell(new) == ("dot", "3", "0", "10.0")
+    assert "2 runs planned, 1 skipped" in changed.output
+
+
+# The real file
+
+
+@pytest.fixture(scope="module")
+def memsense(new_project):
+    folder = os.environ.get("GYRO_PIPELINE_REAL_DATA")
+    if not folder:
+        pytest.skip("GYRO_PIPELINE_REAL_DATA names no folder of real recordings")
+    file = Path(folder, REAL_FILE)
+    if not file.is_file():
+        pytest.skip(f"{REAL_FILE} is not in GYRO_PIPELINE_REAL_DATA, {folder}")
+    project = new_project()
+    raw = project.folder / "data/01_raw/published"
+    raw.mkdir(parents=True)
+    shutil.copy(file, raw)
+    done = project.kedro_run(
+        "--pipeline=real2real",
+        "--env=memsense_real",
+        "--params=training.epochs=2,execution.executor=serial",
+    )
+    return done, project.runs("real2real")
+
+
+def test_the_real_file_gives_a_run_of_each_fold(memsense):
+    done, runs = memsense
+    assert done.code == 0, done.output
+    assert {run.info.status for run in runs} == {"FINISHED"}
+    folds = Counter(
+        (run.data.params["window_s"], run.data.params["fold"]) for run in by_estimator(runs, "cnn")
+    )
+    assert folds == Counter(product(("10.0", "30.0"), map(str, range(11))))
+    means = by_estimator(runs, "mean")
+    assert sorted(run.data.params["window_s"] for run in means) == ["10.0", "30.0"]
+    for run in runs:
+        assert run.data.params["sensor"] == "memsense"
+        assert run.data.params["source"] == "published"
+        assert run.data.params["folds"] == "11"
+        assert run.data.tags["simulated"] == "0"
+        assert not any("_true" in name for name in run.data.metrics)
+
+
+def test_the_running_means_error_on_the_real_file_is_the_known_one(memsense):
+    done, runs = memsense
+    (mean,) = [r for r in by_estimator(runs, "mean") if r.data.params["window_s"] == "10.0"]
+    assert f"{mean.data.metrics['test_rmse_dps']:.7f}" == "0.0015854"
+    assert f"{mean.data.metrics['test_rmse_dps_all']:.6f}" == "0.001508"
+    (line,) = [one for one in done.output.splitlines() if "memsense mean 10 s: RMSE" in one]
+    assert "0.0015854 deg/s" in line
+    assert "0.001508 " in line

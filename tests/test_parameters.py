@@ -1,0 +1,143 @@
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from kedro.config import OmegaConfigLoader
+
+from gyro_pipeline import pipeline_registry
+from gyro_pipeline.conventions import InputError
+from gyro_pipeline.hooks import Preflight
+from gyro_pipeline.parameters import Parameters
+from gyro_pipeline.settings import CONFIG_LOADER_ARGS
+
+CONF = str(Path(__file__).parents[1] / "conf")
+
+
+@pytest.fixture
+def loaded():
+    """Parameters of the base configuration, not checked yet, with some groups changed."""
+
+    def load(**changes):
+        loader = OmegaConfigLoader(CONF, runtime_params=changes, **CONFIG_LOADER_ARGS)
+        return loader["parameters"]
+
+    return load
+
+
+@pytest.fixture
+def refusal(tmp_path, monkeypatch):
+    """What a user is told about parameters, before any pipeline is made."""
+
+    def load(parameters):
+        monkeypatch.setattr(pipeline_registry, "_selected", None)
+        context = SimpleNamespace(project_path=tmp_path, config_loader={"parameters": parameters})
+        with pytest.raises(InputError) as refused:
+            Preflight().after_context_created(context)
+        assert pipeline_registry._selected is None
+        return str(refused.value)
+
+    return load
+
+
+def test_the_configuration_of_this_project_is_accepted(loaded, monkeypatch, tmp_path):
+    monkeypatch.setattr(pipeline_registry, "_selected", None)
+    context = SimpleNamespace(project_path=tmp_path, config_loader={"parameters": loaded()})
+    Preflight().after_context_created(context)
+    assert pipeline_registry._selected == Parameters(**loaded())
+
+
+@pytest.mark.parametrize(
+    ("changes", "place", "said"),
+    [
+        ({"epoch": 5}, "epoch:", "unknown key; see conf/base"),
+        ({"training": {"epoch": 5}}, "training.epoch:", "unknown key"),
+        ({"only": {"gyros": 3}}, "only.gyros:", "unknown key"),
+        (
+            {"sensors": {"dot": {"simulated": {"colour": 1}}}},
+            "sensors.dot.simulated.colour:",
+            "unknown key",
+        ),
+        ({"training": {"epochs": 0}}, "training.epochs:", "greater than or equal to 1"),
+        ({"training": {"centring": "none"}}, "training.centring:", "'per_device' or 'global'"),
+        ({"splits": {"test_fraction": 1.0}}, "splits.test_fraction:", "less than 1"),
+        ({"source": "My Files"}, "source:", "match pattern"),
+        ({"only": {"real_gyros": 4}}, "only.real_gyros:", "multiple of 3"),
+        (
+            {"studies": {"real2real": {"sensors": {"bosch": {"method": 2, "real_gyros": [3]}}}}},
+            "studies.real2real:",
+            "unknown sensor 'bosch'; conf/base/globals.yml knows sparkfun, dot, ng, memsense",
+        ),
+        ({"only": {"sensor": "bosch"}}, "only.sensor:", "unknown sensor 'bosch'; conf/base"),
+        (
+            {"studies": {"real2real": {"sensors": {"ng": {"real_gyros": [3, 9]}}}}},
+            "studies.real2real.ng:",
+            "9 real gyroscopes asked, ng has 6",
+        ),
+        (
+            {"studies": {"augmentation": {"sensors": {"dot": {"virtual_gyros": [27]}}}}},
+            "studies.augmentation.dot:",
+            "27 virtual gyroscopes asked, virtual_gyros.imus makes 24",
+        ),
+        (
+            {"studies": {"input_channels": {"sensors": {"sparkfun": {"virtual_gyros": [12]}}}}},
+            "studies.input_channels.sensors.sparkfun:",
+            "method 1 has no virtual gyroscopes",
+        ),
+        (
+            {"studies": {"real2real": {"sensors": {"ng": {"real_gyros": [0]}}}}},
+            "studies.real2real.sensors.ng:",
+            "at least one IMU, 3 gyroscopes",
+        ),
+        (
+            {"studies": {"real2real": {"sensors": {"ng": {"real_gyros": []}}}}},
+            "studies.real2real.sensors.ng.real_gyros:",
+            "at least 1 item",
+        ),
+        (
+            {"studies": {"real2real": {"experiment": "all"}}},
+            "studies.real2real.experiment:",
+            "expected 'real2real'",
+        ),
+        (
+            {"windows_s": [10, 60]},
+            "windows_s:",
+            "a window of 60 s is longer than a recording of memsense, 52 s",
+        ),
+        ({"windows_s": []}, "windows_s:", "at least 1 item"),
+        ({"windows_s": [0]}, "windows_s.0:", "greater than 0"),
+        ({"seeds": []}, "seeds:", "at least 1 item"),
+        (
+            {"sensors": {"ng": {"train_recordings": 100}}},
+            "sensors.ng:",
+            "train_recordings must leave at least one recording for testing",
+        ),
+    ],
+)
+def test_a_bad_parameter_is_refused_by_its_place(loaded, refusal, changes, place, said):
+    message = refusal(loaded(**changes))
+    assert place in message
+    assert said in message
+
+
+def test_all_problems_are_told_at_once(loaded, refusal):
+    message = refusal(loaded(training={"epochs": 0, "stride": 0}, nonsense=1))
+    for place in ("training.epochs:", "training.stride:", "nonsense:"):
+        assert place in message
+
+
+def test_a_missing_key_is_refused(loaded, refusal):
+    parameters = loaded()
+    del parameters["splits"]["split_seed"]
+    assert "splits.split_seed: Field required" in refusal(parameters)
+
+
+def test_groups_cannot_be_changed_after_loading(parameters):
+    with pytest.raises(ValueError, match="frozen"):
+        parameters("base").training.epochs = 1
+
+
+def test_rates_are_those_that_the_counts_imply(parameters):
+    rates = {name: sensor.rate_hz for name, sensor in parameters("base").sensors.items()}
+    assert rates == pytest.approx(
+        {"sparkfun": 13000 / 87, "dot": 13000 / 120, "ng": 200, "memsense": 250}
+    )
