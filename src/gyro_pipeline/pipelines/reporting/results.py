@@ -115,8 +115,10 @@ def network_row(
             row[metric_name(base, windows, bound="lo")] = estimate.lo
             row[metric_name(base, windows, bound="hi")] = estimate.hi
             values = [one[base].value for one in single]
-            spread = float(np.std(values, ddof=1)) if len(values) > 1 else None
-            row[metric_name(base, windows) + "_seed_sd"] = spread
+            several = len(values) > 1 and np.isfinite(values).all()
+            row[metric_name(base, windows) + "_seed_sd"] = (
+                np.std(values, ddof=1) if several else None
+            )
     ceilings = mean_row(mean)
     return row | {name: value for name, value in ceilings.items() if name.startswith("ceiling")}
 
