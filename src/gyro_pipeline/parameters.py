@@ -132,6 +132,9 @@ class Grid(Parameter):
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
+        for name, counts in (("real", self.real_gyros), ("virtual", self.virtual_gyros)):
+            if len(set(counts)) < len(counts):
+                raise ValueError(f"{name}_gyros: {counts} names one of them twice")
         if min(self.real_gyros) < len(AXES):
             raise ValueError("real_gyros: at least one IMU, 3 gyroscopes, is needed")
         if self.method == 1 and any(self.virtual_gyros):
@@ -190,6 +193,9 @@ class Parameters(Parameter):
 
     @model_validator(mode="after")
     def _studies_ask_for_what_sensors_give(self) -> Self:
+        for name, values in (("seeds", self.seeds), ("windows_s", self.windows_s)):
+            if len(set(values)) < len(values):
+                raise ValueError(f"{name}: {values} names one of them twice")
         known = f"conf/base/globals.yml knows {', '.join(self.sensors)}"
         for study, asked in self.studies.items():
             if asked.experiment != study:

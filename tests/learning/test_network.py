@@ -3,6 +3,7 @@ import pytest
 import torch
 from torch import nn
 
+from gyro_pipeline.conventions import InputError
 from gyro_pipeline.learning.network import Architecture, CalibrationNetwork
 from gyro_pipeline.learning.packing import pack, packed_shape
 
@@ -91,8 +92,8 @@ def test_gradients_are_those_of_the_papers_network(sizes):
     [(9, 10, 10, 1), (5, 10, 3, 1), (49, 10, 10, 5), (20, 10, 10, 3)],
 )
 def test_a_window_too_short_for_the_network_is_refused(window, kernel, stride, pool):
-    with pytest.raises(ValueError, match=f"window of {window} samples is too short") as refused:
-        CalibrationNetwork(architecture(3, window, kernel, stride, pool))
+    with pytest.raises(InputError, match=f"window of {window} samples is too short") as refused:
+        architecture(3, window, kernel, stride, pool)
     for size in (f"kernel {kernel}", f"stride {stride}", f"pool {pool}"):
         assert size in str(refused.value)
 

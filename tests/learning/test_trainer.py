@@ -4,10 +4,12 @@ import pytest
 import torch
 from torch import nn
 
+from gyro_pipeline.learning import fused
 from gyro_pipeline.learning.examples import Examples
+from gyro_pipeline.learning.fused import FusedEngine
 from gyro_pipeline.learning.network import Architecture, CalibrationNetwork
 from gyro_pipeline.learning.packing import pack, packed_shape
-from gyro_pipeline.learning.trainer import predict, train
+from gyro_pipeline.learning.trainer import TorchEngine, predict, train
 from gyro_pipeline.parameters import Training
 
 SIZES = Architecture(3, 63, 6, 12, 5, 3, 16)
@@ -84,13 +86,22 @@ def papers_network(ours):
     return paper
 
 
-@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float32, 1e-5), (np.float64, 1e-12)])
-def test_fifty_steps_are_those_of_a_plain_pytorch_loop(dtype, tolerance):
+@pytest.mark.parametrize(
+    ("engine", "dtype", "tolerance"),
+    [
+        (TorchEngine, np.float32, 1e-5),
+        (TorchEngine, np.float64, 1e-12),
+        (FusedEngine, np.float32, 1e-5),
+    ],
+)
+def test_fifty_steps_are_those_of_a_plain_pytorch_loop(engine, dtype, tolerance):
+    if engine is FusedEngine and not fused.available():
+        pytest.skip("the C step cannot be compiled here; the log says why")
     windows, examples = drawn(155, dtype)  # ten batches; the last one is smaller
     ours = network().to(torch.float64 if dtype is np.float64 else torch.float32)
     paper = papers_network(ours)
     untrained = paper(torch.from_numpy(windows)).detach()
-    trained(examples, of=ours)
+    train(ours, examples, None, schedule(), ordered(), lambda: None, engine)
 
     inputs, targets = torch.from_numpy(windows), torch.from_numpy(examples.targets)
     generator, optimizer = ordered(), torch.optim.Adam(paper.parameters(), lr=1e-3)

@@ -31,6 +31,9 @@ _OWNER = "process"
 # One bar for each small artifact would bury everything else on a terminal.
 os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
 
+_BUSY_S = 20
+"""How long to wait for another process that writes to the store."""
+
 _CURVE_POINTS = 50
 _LOG_BATCH = 1000  # most metrics that one call takes
 
@@ -161,6 +164,12 @@ class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
 
     def _experiment_id(self, study: str) -> str:
         existing = self._client.get_experiment_by_name(study)
+        if existing is not None and existing.lifecycle_stage == "deleted":
+            raise InputError(
+                f"experiment {study} was deleted in the store; bring it back with `mlflow "
+                f"experiments restore --experiment-id {existing.experiment_id}`, or remove it for "
+                "good with `mlflow gc`"
+            )
         if existing is not None:
             return str(existing.experiment_id)
         location = None
@@ -197,7 +206,8 @@ def _check_store(path: Path) -> None:
     advice = "move it away to start a new store"
     try:
         # Writable, so that SQLite can roll back what a killed process left half written.
-        with closing(sqlite3.connect(f"file:{path}?mode=rw", uri=True)) as connection:
+        uri = f"{path.resolve().as_uri()}?mode=rw"
+        with closing(sqlite3.connect(uri, uri=True, timeout=_BUSY_S)) as connection:
             tables = {name for (name,) in connection.execute("select name from sqlite_master")}
             sound = [row[0] for row in connection.execute("pragma quick_check(1)")]
     except sqlite3.DatabaseError as error:

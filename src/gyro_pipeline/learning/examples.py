@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
+from gyro_pipeline.conventions import InputError
 from gyro_pipeline.learning.network import Architecture
 from gyro_pipeline.learning.packing import pack, packed_shape
 from gyro_pipeline.protocol.windows import cut_windows
@@ -97,6 +98,11 @@ def training_examples(
     examples = _centred(devices, centres, architecture)
     input_scale = _root_mean_square(examples.inputs, architecture)
     target_scale = float(np.sqrt(np.mean(np.square(examples.targets, dtype=np.float64))))
+    if not target_scale > 0:
+        raise InputError(
+            "training targets do not differ from their centre, so there is nothing to learn; with "
+            "centring per_device at least two training recordings are needed"
+        )
     examples.inputs[...] /= input_scale
     examples.targets[...] /= target_scale
     return examples, Scaling(centres, input_scale, target_scale)

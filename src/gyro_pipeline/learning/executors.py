@@ -54,9 +54,10 @@ def run_jobs(
     ordered = sorted(jobs, key=lambda job: job.work, reverse=True)
     if not ordered:
         return
-    workers = min(execution.workers or available_cores(), len(ordered))
+    serial = execution.executor == "serial"
+    workers = 1 if serial else min(execution.workers or available_cores(), len(ordered))
     progress = _Progress(label, len(ordered), sum(job.work for job in ordered), workers)
-    run = _run_serially if execution.executor == "serial" else _run_in_processes
+    run = _run_serially if serial else _run_in_processes
     try:
         for job, result in run(ordered, function, workers, progress):
             progress.one_finished()

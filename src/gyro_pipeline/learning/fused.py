@@ -9,12 +9,9 @@ import functools
 import hashlib
 import logging
 import os
-import shlex
 import shutil
 import subprocess
 import tempfile
-from ctypes import c_double, c_int64, c_void_p
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -27,23 +24,26 @@ from gyro_pipeline.learning.packing import packed_shape
 logger = logging.getLogger(__name__)
 
 _CACHE = "GYRO_PIPELINE_CACHE"
-# Without -ffast-math: with it gcc links code that flushes denormals to zero in the whole process,
-# and a loss that is not a number could pass for one.
+# Without -ffast-math: gcc would link code that flushes denormals to zero in the whole process, and
+# a loss that is not a number could pass for one.
 _FLAGS = "-std=gnu11 -O3 -ffp-contract=fast -fno-math-errno -fno-trapping-math -shared -fPIC"
 _NATIVE = ("-march=native", "-mcpu=native", "")
-"""What compilers call this machine's processor; the last compiles for any."""
+"""What compilers call the processor of this machine; the last compiles for any of its kind."""
+_TIMEOUT_S = 120
+
 _LINE = 16
 """Floats of a cache line."""
-_TIMEOUT_S = 120
+# Floats that fit a second cache of 1 MB beside all else; measured, and not critical.
+_WINDOW_CHUNK, _WINDOWS, _WEIGHTS = 20 << 10, 64 << 10, 128 << 10
 
 
 @functools.cache
 def available() -> bool:
-    """Whether the fused step can be used here; if not, the reason is logged once."""
+    """Whether the fused step can be used here; if not, the log says why, once."""
     try:
         _check()
     except (OSError, RuntimeError, subprocess.SubprocessError) as reason:
-        logger.info("training in PyTorch, without the several times faster C step: %s", reason)
+        logger.info("training in PyTorch, not in the several times faster C step: %s", reason)
         return False
     return True
 
@@ -58,7 +58,8 @@ class FusedEngine:
 
         Args:
             network: On the CPU.
-            inputs: Packed windows, shape (n, blocks, width), float32, scaled; used where they are.
+            inputs: Packed windows, shape (n, blocks, width), float32, scaled; used where they are,
+                a tenth faster if they start at a multiple of 64 bytes.
             targets: Shape (n, gyroscopes), float32, scaled; used where they are.
             batch_size: Examples per step.
 
@@ -70,23 +71,18 @@ class FusedEngine:
         _demand("inputs", inputs, (len(inputs), *packed_shape(a)))
         _demand("targets", targets, (len(inputs), a.gyroscopes))
         self._library, self._batch_size, self._steps = _library(), batch_size, 0
-        layout = _Layout(a)
+        layout = _Layout(a, min(batch_size, len(inputs)))
         self._index = layout.index
-        self._weights = _aligned(layout.floats)
+        self._arrays = {name: _aligned(floats) for name, floats in layout.arrays.items()}
+        self._arrays |= {"inputs": inputs, "targets": targets}
+        self._arrays["seen"][layout.kernel] = 1
+        self._weights = self._arrays["weights"]
         for name, value in network.state_dict().items():
             self._weights[self._index[name]] = value.numpy()
-        self._engine = _Engine(**layout.sizes)
-        scratch = self._library.fused_plan(self._engine, min(batch_size, len(inputs)))
-        self._arrays = {
-            "inputs": inputs,
-            "targets": targets,
-            "seen": layout.seen,
-            "weights": self._weights,
-            **{name: _aligned(layout.floats) for name in ("mean", "square", "gradient")},
-            "scratch": _aligned(scratch),
-        }
-        for name, array in self._arrays.items():
-            setattr(self._engine, name, array.ctypes.data)
+        addresses = {name: array.ctypes.data for name, array in self._arrays.items()}
+        for name, start in layout.starts.items():
+            addresses[name.replace(".", "_")] = self._weights[start:].ctypes.data
+        self._engine = _Engine(**layout.sizes, **addresses)
 
     def epoch(self, order: np.ndarray, learning_rate: float) -> float:
         """Train on examples in this order, in batches; the last one may be smaller.
@@ -101,15 +97,20 @@ class FusedEngine:
         Raises:
             IndexError: If there is no example of some index, or no index.
         """
-        order = np.ascontiguousarray(order, np.int64)
         examples, gyroscopes = self._arrays["targets"].shape
-        if not (order.size and 0 <= order.min() and order.max() < examples):
+        if not (len(order) and 0 <= order.min() and order.max() < examples):
             raise IndexError(f"order: expected indices from 0 to {examples - 1}, got {order}")
-        total: float = self._library.fused_epoch(
-            self._engine, order.ctypes.data, order.size, self._batch_size, self._steps, learning_rate
+        followed = np.append(order, order[:1]).astype(np.int64)  # the C code looks one ahead
+        squares = self._library.fused_epoch(
+            ctypes.byref(self._engine),
+            followed.ctypes.data,
+            len(order),
+            self._batch_size,
+            self._steps,
+            learning_rate,
         )
-        self._steps += -(-order.size // self._batch_size)
-        return total / (order.size * gyroscopes)
+        self._steps += -(-len(order) // self._batch_size)
+        return float(squares) / (len(order) * gyroscopes)
 
     @torch.no_grad()
     def load_into(self, network: CalibrationNetwork) -> None:
@@ -118,25 +119,56 @@ class FusedEngine:
             value.copy_(torch.from_numpy(self._weights[self._index[name]]))
 
 
+_SIZES = """gyroscopes blocks width span channels pool pooled hidden features tile chunk floats"""
+_ARRAYS = """weights mean square gradient hidden_weight hidden_bias output_weight output_bias
+    convolution_weight convolution_bias seen inputs targets pairs pair_bias active d_active
+    feature d_feature place"""
+
+
 class _Engine(ctypes.Structure):
     """``Engine`` in fused.c."""
 
     _fields_ = [
-        *((name, c_int64) for name in "gyroscopes blocks width span channels".split()),
-        *((name, c_int64) for name in "pool pooled hidden features tile chunk".split()),
-        *((name, c_void_p) for name in "inputs targets seen weights mean square".split()),
-        *((name, c_void_p) for name in "gradient scratch".split()),
+        *((name, ctypes.c_int64) for name in _SIZES.split()),
+        *((name, ctypes.c_void_p) for name in _ARRAYS.split()),
     ]
 
 
 class _Layout:
-    """Sizes as fused.c wants them, and the place of each parameter in one array of them all."""
+    """Padded sizes and arrays for fused.c, and the place of each parameter in ``weights``."""
 
-    def __init__(self, architecture: Architecture) -> None:
+    def __init__(self, architecture: Architecture, batch_size: int) -> None:
         a = architecture
         blocks, width = packed_shape(a)
-        span, channels, hidden = -(-a.kernel // a.stride) * width, _up(a.channels, 8), _up(a.hidden, 16)
-        features = _up(a.pooled * channels, 16)
+        channels, hidden = _up(a.channels, 8), _up(a.hidden, 16)
+        span, features = -(-a.kernel // a.stride) * width, _up(a.pooled * channels, 16)
+
+        unit, gyroscope, channel = (np.arange(n) for n in (a.hidden, a.gyroscopes, a.channels))
+        feature = np.add.outer(np.arange(a.pooled) * channels, channel).ravel()
+        tap, sample = np.divmod(np.arange(a.kernel), a.stride)
+        self.kernel = np.add.outer(gyroscope * a.stride, tap * width + sample)
+        within = {
+            "hidden.weight": (np.add.outer(unit * features, feature), hidden * features),
+            "hidden.bias": (unit, hidden),
+            "output.weight": (np.add.outer(gyroscope * hidden, unit), a.gyroscopes * hidden),
+            "output.bias": (gyroscope, _up(a.gyroscopes, _LINE)),
+            "convolution.weight": (np.add.outer(channel * span, self.kernel), channels * span),
+            "convolution.bias": (channel, channels),
+        }
+        self.index, self.starts, floats = {}, {}, 0
+        for name, (places, padded) in within.items():
+            self.index[name], self.starts[name] = places + floats, floats
+            floats += padded
+
+        by_window, by_weights = (
+            _WINDOW_CHUNK // (a.pool * width),
+            _WEIGHTS // (4 * hidden * channels),
+        )
+        chunk = max(2, min(by_window, by_weights, a.pooled + 1) // 2 * 2)  # even: whole vectors
+        # Windows of a tile stay in the cache until they are needed again, unless that means to go
+        # through hidden weights too large for it once more for every tile.
+        small = 4 * hidden * features <= _WEIGHTS
+        tile = _up(min(batch_size, _WINDOWS // (blocks * width) + 1) if small else batch_size, 4)
         self.sizes = {
             "gyroscopes": a.gyroscopes,
             "blocks": blocks,
@@ -147,26 +179,19 @@ class _Layout:
             "pooled": a.pooled,
             "hidden": hidden,
             "features": features,
+            "tile": tile,
+            "chunk": chunk,
+            "floats": floats,
         }
-        gyroscope, channel, unit = (np.arange(n) for n in (a.gyroscopes, a.channels, a.hidden))
-        feature = np.add.outer(np.arange(a.pooled) * channels, channel).ravel()
-        tap, sample = np.divmod(np.arange(a.kernel), a.stride)
-        kernel = np.add.outer(gyroscope * a.stride, tap * width + sample)
-        sections = {  # in the order of Parameters in fused.c, with their padded sizes
-            "hidden.weight": (np.add.outer(unit * features, feature), hidden * features),
-            "hidden.bias": (unit, hidden),
-            "output.weight": (np.add.outer(gyroscope * hidden, unit), a.gyroscopes * hidden),
-            "convolution.weight": (np.add.outer(channel * span, kernel), channels * span),
-            "convolution.bias": (channel, channels),
-            "output.bias": (gyroscope, _up(a.gyroscopes, 8)),
+        self.arrays = {
+            **dict.fromkeys(("weights", "mean", "square", "gradient"), floats),
+            **dict.fromkeys(("active", "d_active"), tile * hidden),
+            **dict.fromkeys(("feature", "place"), tile * features),
+            "d_feature": tile * (chunk * channels + 16),
+            "pairs": channels * span,
+            "pair_bias": 2 * channels,
+            "seen": span,
         }
-        self.floats = 0
-        self.index = {}
-        for name, (places, floats) in sections.items():
-            self.index[name] = self.floats + places
-            self.floats += floats
-        self.seen = _aligned(span)
-        self.seen[kernel] = 1
 
 
 def _up(size: int, multiple: int) -> int:
@@ -176,7 +201,7 @@ def _up(size: int, multiple: int) -> int:
 def _aligned(floats: int) -> np.ndarray:
     """Zeros that start with a cache line."""
     room = np.zeros(floats + _LINE, np.float32)
-    start = -room.ctypes.data // room.itemsize % _LINE
+    start = -(room.ctypes.data // room.itemsize) % _LINE
     return room[start : start + floats]
 
 
@@ -190,93 +215,92 @@ def _demand(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
 
 @functools.cache
 def _library() -> ctypes.CDLL:
-    """The compiled step, from the cache where it is there."""
-    source = resources.files(__package__).joinpath("fused.c").read_bytes()
+    """The compiled step, from the cache if it is there."""
+    source = Path(__file__).with_name("fused.c").read_bytes()
     compiler = _compiler()
     native, described = _native(compiler)
     command = [*compiler, *_FLAGS.split(), *native]
-    key = hashlib.sha256(b"\0".join([source, *map(str.encode, command), described])).hexdigest()
+    key = hashlib.sha256(b"\0".join([source, " ".join(command).encode(), described])).hexdigest()
     path = _cache() / f"fused-{key[:16]}.so"
     if not path.exists():
         _compile(command, source, path)
-    library = ctypes.CDLL(str(path))
-    library.fused_plan.argtypes = [ctypes.POINTER(_Engine), c_int64]
-    library.fused_plan.restype = c_int64
+    library = ctypes.CDLL(str(path))  # lets go of the interpreter lock while it runs
+    library.fused_epoch.restype = ctypes.c_double
     library.fused_epoch.argtypes = [
-        *(ctypes.POINTER(_Engine), c_void_p, c_int64, c_int64, c_int64, c_double),
+        *(ctypes.POINTER(_Engine), ctypes.c_void_p),
+        *(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64, ctypes.c_double),
     ]
-    library.fused_epoch.restype = c_double
     return library
 
 
 def _compiler() -> list[str]:
-    """``$CC``, which may have arguments, or the first compiler there is."""
-    asked = shlex.split(os.environ.get("CC", ""))
+    """``$CC``, which may have arguments, or the first there is."""
+    asked = os.environ.get("CC", "").split()
     for command in [asked] if asked else [["cc"], ["gcc"], ["clang"]]:
         if shutil.which(command[0]):
             return command
-    raise RuntimeError(f"no C compiler: {' '.join(asked) or 'cc, gcc, clang'} not found")
+    raise RuntimeError(f"no C compiler: {' '.join(asked) or 'cc, gcc or clang'} not found")
 
 
 def _native(compiler: list[str]) -> tuple[list[str], bytes]:
-    """Flags for this processor, and what the compiler says of it: version and instructions."""
+    """Flags for this processor, and what the compiler says of both: version and instructions.
+
+    What it says is part of the cache's key, so another processor or compiler compiles anew.
+    """
     for flag in _NATIVE:
         command = [*compiler, *flag.split(), "-dM", "-E", "-x", "c", "-"]
         done = _run(command, b"")
         if done.returncode == 0:
             return flag.split(), done.stdout
-    raise RuntimeError(f"{' '.join(command)} failed: {_last_line(done)}")
+    raise RuntimeError(_failure(command, done))
 
 
 def _compile(command: list[str], source: bytes, path: Path) -> None:
-    """Under a name of its own first: another process may do the same at the same time."""
+    """Under a name of its own first, as other processes may be doing the same."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         made = Path(folder) / path.name
-        done = _run([*command, "-x", "c", "-", "-x", "none", "-o", str(made), "-lm"], source)
+        command = [*command, "-x", "c", "-", "-lm", "-o", str(made)]
+        done = _run(command, source)
         if done.returncode != 0:
-            raise RuntimeError(f"{' '.join(command)} failed: {_last_line(done)}")
+            raise RuntimeError(_failure(command, done))
         made.replace(path)
 
 
 def _run(command: list[str], text: bytes) -> subprocess.CompletedProcess[bytes]:
-    return subprocess.run(
-        command, input=text, capture_output=True, timeout=_TIMEOUT_S, check=False
-    )
+    return subprocess.run(command, input=text, capture_output=True, timeout=_TIMEOUT_S, check=False)
 
 
-def _last_line(done: subprocess.CompletedProcess[bytes]) -> str:
-    lines = done.stderr.decode(errors="replace").strip().splitlines()
-    return lines[-1] if lines else f"exit status {done.returncode}"
+def _failure(command: list[str], done: subprocess.CompletedProcess[bytes]) -> str:
+    lines = done.stderr.decode(errors="replace").splitlines() or [f"status {done.returncode}"]
+    told = next((line for line in lines if "error" in line), lines[-1])
+    return f"{' '.join(command)}: {told.strip()}"
 
 
 def _cache() -> Path:
-    asked = os.environ.get(_CACHE)
-    if asked:
+    if asked := os.environ.get(_CACHE):
         return Path(asked)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gyro_pipeline"
 
 
 def _check() -> None:
-    """A few steps of a small network that uses every part of the code, against PyTorch."""
-    a = Architecture(3, 157, 19, 7, 3, 3, 18)
+    """Train a small network that uses every part of the code, and compare with PyTorch."""
+    a = Architecture(gyroscopes=3, window=157, channels=19, kernel=19, stride=7, pool=3, hidden=18)
     random = np.random.default_rng(0)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        network = CalibrationNetwork(a)
+        network, got = CalibrationNetwork(a), CalibrationNetwork(a)
     inputs = random.normal(size=(11, *packed_shape(a))).astype(np.float32)
-    targets = random.normal(size=(11, 3)).astype(np.float32)
+    targets = random.normal(size=(11, a.gyroscopes)).astype(np.float32)
     engine = FusedEngine(network, inputs, targets, batch_size=4)
-    got = [engine.epoch(np.arange(11), 1e-3) for _ in range(2)]
-    trained = CalibrationNetwork(a)
-    engine.load_into(trained)
+    engine.epoch(np.arange(11), learning_rate=1e-3)
+    engine.load_into(got)
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
-    examples = torch.from_numpy(inputs), torch.from_numpy(targets)
-    for expected in got:
-        total = 0.0
-        for x, y in zip(*(array.split(4) for array in examples), strict=True):
-            loss = functional.mse_loss(network.forward_packed(x), y)
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            total += float(loss) * len(x) / 11
+    for part in torch.arange(11).split(4):
+        x, y = torch.from_numpy(inputs)[part], torch.from_numpy(targets)[part]
+        optimizer.zero_grad()
+        functional.mse_loss(network.forward_packed(x), y).backward()
+        optimizer.step()
+    for name, expected in network.state_dict().items():
+        if not torch.allclose(got.state_dict()[name], expected, rtol=0, atol=1e-5):
+            raise RuntimeError(f"after compilation {name} differs from PyTorch's")

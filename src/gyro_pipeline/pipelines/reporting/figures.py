@@ -42,9 +42,9 @@ def draw_augmentation(
         figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
         first = results.iloc[0]
         real = results.real_gyros.max()
-        simulated = "simulated data" if first.simulated else "measured data"
         figure.suptitle(
-            f"{first.sensor}: {real} real gyroscopes and virtual ones ({first.source}, {simulated})"
+            f"{first.sensor}: {real} real gyroscopes and virtual ones "
+            f"({'simulated' if first.simulated else 'measured'} data, source {first.source!r})"
         )
     return figure
 
@@ -98,7 +98,11 @@ def _draw_panel(
 
 
 def _time_axis(ax: Axes, recording_s: float) -> None:
-    ax.set(xscale="log", xlabel="calibration time [s]", xlim=(1, 1.02 * recording_s))
+    ax.set(
+        xscale="log",
+        xlabel="calibration time [s], points of a window side by side",
+        xlim=(1, 1.02 * recording_s),
+    )
     ax.set_xticks([t for t in _TICKS_S if t <= recording_s], minor=False)
     ax.xaxis.set_major_formatter("{x:g}")
     ax.minorticks_off()

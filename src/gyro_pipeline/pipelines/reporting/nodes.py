@@ -124,7 +124,7 @@ def results_table(results: pd.DataFrame) -> tuple[pd.DataFrame | Missing, Reason
         table[f"RMSE {windows} mdps"] = (made[f"test_rmse_dps{suffix}"] / MDPS).round(3)
         for short, base in (("S", "time_saving_pct"), ("A", "accuracy_gain_pct")):
             if base + suffix in made:
-                table[f"{short} {windows} %"] = made[base + suffix].round(0)
+                table[f"{short} {windows} %"] = made[base + suffix].round(0) + 0.0  # no "-0"
     table["ceiling mdps"] = (made.ceiling_rmse_dps / MDPS).round(3)
     logger.info("%s\n%s", _source(made.iloc[0]), table.to_string(index=False, na_rep="–"))
     table.insert(1, "source", [_source(row) for _, row in made.iterrows()])
@@ -244,7 +244,7 @@ def _percent(value: float) -> str:
     """A saving is unbounded off the ends of the running-mean curve."""
     if np.isinf(value):
         return "never reached" if value > 0 else "off the curve"
-    return f"{value:.0f}"
+    return f"{round(value)}"
 
 
 def _short(run_ids: str) -> str:
