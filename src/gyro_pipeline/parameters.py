@@ -6,6 +6,7 @@ refused before any node runs (see :class:`gyro_pipeline.hooks.Preflight`).
 
 from typing import Annotated, Literal, Self
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from gyro_pipeline.conventions import AXES
@@ -107,6 +108,18 @@ class Training(Parameter):
     learning_rate: float = Field(gt=0)
     decay: float = Field(gt=0, le=1, description="factor on the learning rate ...")
     decay_every: int = Field(ge=1, description="... after so many epochs")
+    stop_below: float = Field(
+        0.0,
+        ge=0,
+        description="end once the learning rates still to come sum to less; 0: never early",
+    )
+
+    def learning_rates(self) -> np.ndarray:
+        """Learning rate of every epoch until the end, shape (epochs,)."""
+        steps = np.arange(self.epochs) // self.decay_every
+        rates = self.learning_rate * self.decay**steps
+        to_come = rates[::-1].cumsum()[::-1]
+        return rates[to_come >= self.stop_below]
 
 
 class Execution(Parameter):

@@ -191,3 +191,12 @@ def test_predictions_do_not_depend_on_how_many_are_made_at_once():
     with torch.no_grad():
         one_by_one = [of.forward_packed(inputs[[i]]) for i in (0, 1023, 1024, 1499)]
     torch.testing.assert_close(outputs[[0, 1023, 1024, 1499]], torch.cat(one_by_one))
+
+
+def test_a_training_ends_once_the_rates_to_come_sum_to_less_than_asked():
+    _, examples = drawn(24)
+    whole = trained(examples, epochs=6)  # rates 1e-3, 1e-3, 1e-4, 1e-4, 1e-5, 1e-5
+    early = trained(examples, epochs=6, stop_below=1.5e-4)
+    assert early.history.epoch.tolist() == [1, 2, 3]  # after it 1e-4 + 2e-5 are to come
+    pd.testing.assert_frame_equal(early.history, whole.history[:3])
+    assert trained(examples, epochs=6, stop_below=0.0).history.epoch.iloc[-1] == 6

@@ -63,7 +63,7 @@ class TrainingJob:
     @property
     def work(self) -> float:
         """Estimated cost of the training, in samples of three gyroscopes."""
-        return self.epoch_work * self.settings.epochs
+        return self.epoch_work * len(self.settings.learning_rates())
 
 
 @dataclass(frozen=True)

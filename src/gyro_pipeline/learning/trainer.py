@@ -112,9 +112,8 @@ def train(
     steps = engine(network, training.inputs, training.targets, schedule.batch_size)
     watched = None if validation is None else _tensors(validation, _device(network))
     rows, best, lowest = [], None, np.inf
-    for epoch in range(1, schedule.epochs + 1):
+    for epoch, rate in enumerate(schedule.learning_rates().tolist(), start=1):
         order = torch.randperm(len(training.inputs), generator=shuffling).numpy()
-        rate = schedule.learning_rate * schedule.decay ** ((epoch - 1) // schedule.decay_every)
         row = {"epoch": epoch, "learning_rate": rate, "train_loss": steps.epoch(order, rate)}
         if not np.isfinite(row["train_loss"]):
             raise FloatingPointError(f"the loss is {row['train_loss']} in epoch {epoch}")

@@ -139,7 +139,11 @@ def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
         fused.available()  # compiles it, or says why not, before the workers need it
     for job, trained in run_jobs(todo, run_training, execution, label):
         artifacts = {WEIGHTS: trained.artifact, HISTORY: trained.history}
-        ended = {"best_epoch": str(trained.artifact["best_epoch"]), "engine": trained.engine}
+        ended = {
+            "best_epoch": str(trained.artifact["best_epoch"]),
+            "last_epoch": str(trained.history.epoch.iloc[-1]),
+            "engine": trained.engine,
+        }
         yield run(job.name, trained.started, ended, history=trained.history, artifacts=artifacts)
 
 
