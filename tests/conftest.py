@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 import xarray as xr
 import yaml
 from kedro.config import OmegaConfigLoader
@@ -31,7 +32,7 @@ from gyro_pipeline.physics.noise import simulate_noise
 from gyro_pipeline.settings import CONFIG_LOADER_ARGS
 
 ROOT = Path(__file__).parents[1]
-_TIMEOUT_S = 240
+_TIMEOUT_S = 600
 
 
 @dataclass(frozen=True)
@@ -102,6 +103,20 @@ class Project:
         if found is None:
             return []
         return list(client.search_runs([found.experiment_id], order_by=["attributes.start_time"]))
+
+    @staticmethod
+    def artifacts(run: Run) -> Path:
+        """Where a run keeps them."""
+        return Path(run.info.artifact_uri.removeprefix("file://"))
+
+    @staticmethod
+    def weights(run: Run) -> dict[str, bytes] | None:
+        """Of the last epoch, bit by bit; the running mean has none."""
+        path = Project.artifacts(run) / "weights.pt"
+        if not path.exists():
+            return None
+        stored = torch.load(path, weights_only=True)["last"]
+        return {name: value.numpy().tobytes() for name, value in stored.items()}
 
     def count(self, query: str) -> int:
         """What a counting query finds in the store; cheap enough to poll."""

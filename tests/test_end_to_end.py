@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 from mlflow import MlflowClient
 
 SERIAL = {"executor": "serial"}  # where few trainings are not worth the start of processes
@@ -48,19 +47,6 @@ def identities(runs):
 
 def cell(run):
     return tuple(run.data.params[name] for name in CELL)
-
-
-def artifacts(run):
-    return Path(run.info.artifact_uri.removeprefix("file://"))
-
-
-def weights(run):
-    """Bit by bit; the running mean has none."""
-    path = artifacts(run) / "weights.pt"
-    if not path.exists():
-        return None
-    stored = torch.load(path, weights_only=True)
-    return {name: value.numpy().tobytes() for name, value in stored["last"].items()}
 
 
 @dataclass(frozen=True)
@@ -116,6 +102,13 @@ def changed(smoke, repaired):
     only = {"sensor": "dot", "real_gyros": 3, "virtual_gyros": 0, "window_s": 10}
     changes = {"only": only, "training": {"hidden": 33}, "execution": SERIAL}
     return step(smoke.project, smoke.project.run_here("augmentation", "smoke", **changes))
+
+
+@pytest.fixture(scope="module")
+def channels(smoke, changed):
+    only = {"window_s": 10}
+    done = smoke.project.run_here("input_channels", "smoke", only=only, execution=SERIAL)
+    return done, smoke.project.runs("input_channels")
 
 
 # The first run
@@ -193,7 +186,7 @@ def test_curves_are_whole_and_end_at_the_last_epoch(smoke):
 
 def test_metrics_are_those_of_the_errors_kept_with_the_run(smoke):
     for run in smoke.runs:
-        folder = artifacts(run)
+        folder = smoke.project.artifacts(run)
         assert folder.is_relative_to(smoke.project.folder)
         kept = {path.name for path in folder.iterdir()}
         network = run.data.params["estimator"] == "cnn"
@@ -278,8 +271,8 @@ def test_another_study_takes_the_cells_it_shares(smoke, shared):
         assert (twin is not None) == shares
         assert run.data.tags.get("trained_in") == ("augmentation" if shares else None)
         if twin is not None:
-            assert run.data.metrics == pytest.approx(twin.data.metrics, rel=1e-6)
-            assert weights(run) == weights(twin)
+            assert smoke.project.weights(run) == smoke.project.weights(twin)
+            assert run.data.metrics == pytest.approx(twin.data.metrics, rel=1e-4)
 
 
 def test_reporting_makes_what_it_can_and_names_what_is_missing(repeated, incomplete):
@@ -316,6 +309,33 @@ def test_another_hyper_parameter_trains_anew_and_keeps_what_was(repaired, change
     assert new.data.params["hidden"] == "33"
     assert cell(new) == ("dot", "3", "0", "10.0")
     assert "2 runs planned, 1 skipped" in changed.output
+
+
+def test_method_1_shares_its_cell_of_one_imu(smoke, channels):
+    done, runs = channels
+    assert done.code == 0, done.output
+    assert "5 runs planned, 0 skipped (trained before), 2 shared" in done.output
+    networks = {run.data.params["real_gyros"]: run for run in by_estimator(runs, "cnn")}
+    assert networks.keys() == {"3", "6", "9", "12"}
+    assert {run.data.params["method"] for run in networks.values()} == {"1"}
+    shared = {gyros for gyros, run in networks.items() if "trained_in" in run.data.tags}
+    assert shared == {"3"}
+    twin = next(r for r in smoke.runs if cell(r) == ("sparkfun", "3", "0", "10.0"))
+    assert smoke.project.weights(networks["3"]) == smoke.project.weights(twin)
+    for run in networks.values():
+        errors = pd.read_parquet(smoke.project.artifacts(run) / "errors.parquet")
+        assert errors.groupby(["weights", "truth", "recording", "window"]).size().eq(3).all()
+
+
+def test_ground_truth_alone(new_project):
+    project = new_project()
+    assert project.run_here("ground_truth", "smoke", only={"sensor": "ng"}).code == 0
+    folder = project.folder / "data/03_primary/simulated_smoke/ng"
+    assert len(pd.read_csv(folder / "bias.csv")) == 2 * 14 * 3
+    noise = pd.read_csv(folder / "noise.csv")
+    assert len(noise) == 2 * 3
+    assert noise.white_dps_rts.mean() == pytest.approx(0.005, rel=0.1)
+    assert project.runs("real2real") == []
 
 
 # The real file

@@ -4,13 +4,13 @@ import os
 import re
 import signal
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import psutil
 import pytest
 from mlflow import MlflowClient
 
-PATIENCE_S = 180
+PATIENCE_S = 300
 COMMAND = ("--pipeline=augmentation", "--env=smoke")
 TRAINED = "select count(*) from tags where key = 'trained'"
 FINISHED = "select count(*) from runs where status = 'FINISHED'"
@@ -26,7 +26,7 @@ class Stopped:
     survivors: list
     trained: dict
     unfinished: int
-    fake: list = field(default_factory=list)
+    fake: list
 
 
 def stop(project, how, query, at_least):
@@ -37,15 +37,20 @@ def stop(project, how, query, at_least):
         wait_until(lambda: process.poll() is not None or project.count(query) >= at_least)
         assert process.poll() is None, log.read_text()
         workers = psutil.Process(process.pid).children(recursive=True)
-        os.kill(process.pid, how)  # the parent alone, as by a shell or the kernel
+        if how == signal.SIGINT:  # Ctrl-C reaches all that the terminal runs
+            os.killpg(process.pid, how)
+        else:
+            os.kill(process.pid, how)
         code = process.wait(PATIENCE_S)
     finally:
         process.kill()
     _, survivors = psutil.wait_procs(workers, timeout=30)
+    for worker in survivors:  # to be found, not to be left behind
+        worker.kill()
     runs = project.runs("augmentation")
     trained = {run.info.run_id: run for run in runs if "trained" in run.data.tags}
     unfinished = [run for run in runs if run.info.status != "FINISHED"]
-    return Stopped(code, log.read_text(), survivors, trained, len(unfinished), suspicious(runs))
+    return Stopped(code, log.read_text(), survivors, trained, len(unfinished), suspicious(project))
 
 
 def wait_until(condition):
@@ -55,24 +60,19 @@ def wait_until(condition):
         time.sleep(0.01)
 
 
-def suspicious(runs):
-    """Runs that look finished without holding what a finished run holds."""
-    return [
-        run.info.run_id
-        for run in runs
-        if (run.info.status == "FINISHED" or "test_rmse_dps" in run.data.metrics)
-        and not {"errors.parquet"} <= artifacts(run)
-        or "trained" in run.data.tags
-        and run.data.params["estimator"] == "cnn"
-        and not {"weights.pt", "history.csv"} <= artifacts(run)
-        or run.info.status == "FINISHED"
-        and not {"test_rmse_dps", "test_rmse_dps_all"} <= set(run.data.metrics)
-    ]
-
-
-def artifacts(run):
-    folder = run.info.artifact_uri.removeprefix("file://")
-    return set(os.listdir(folder)) if os.path.isdir(folder) else set()
+def suspicious(project):
+    """Runs that look finished, or trained, without holding what such a run holds."""
+    found = []
+    for run in project.runs("augmentation"):
+        kept = {path.name for path in project.artifacts(run).glob("*")}
+        needed = set()
+        if "trained" in run.data.tags and run.data.params["estimator"] == "cnn":
+            needed |= {"weights.pt", "history.csv"}
+        if run.info.status == "FINISHED":
+            needed |= {"errors.parquet", "test_rmse_dps", "test_rmse_dps_all", "trained"}
+        if not needed <= kept | set(run.data.metrics) | set(run.data.tags):
+            found.append(run.info.run_id)
+    return found
 
 
 def numbers(words, output):
@@ -138,7 +138,7 @@ def test_nothing_looks_finished_that_is_not(stopped):
 def test_the_stops_hit_where_they_should(killed_training, interrupted, killed_evaluating):
     assert 6 <= len(killed_training.trained) < 18 <= len(interrupted.trained) < RUNS
     for early in (killed_training, interrupted):
-        assert {run.info.status for run in early.trained.values()} == {"RUNNING"}
+        assert "FINISHED" not in {run.info.status for run in early.trained.values()}
     assert len(killed_evaluating.trained) == RUNS
     statuses = [run.info.status for run in killed_evaluating.trained.values()]
     assert 3 <= statuses.count("FINISHED") < RUNS
@@ -170,9 +170,9 @@ def test_what_was_trained_is_evaluated_and_not_trained_again(
     assert judged == RUNS - statuses.count("FINISHED")
 
 
-def test_in_the_end_every_cell_is_there_once(completed, half_written):
+def test_in_the_end_every_cell_is_there_once(project, completed, half_written):
     _, runs = completed
-    assert suspicious(runs) == []
+    assert suspicious(project) == []
     by_status = {status: [] for status in ("FINISHED", "KILLED")}
     for run in runs:
         by_status[run.info.status].append(run)
@@ -187,5 +187,6 @@ def test_the_grid_is_the_one_of_an_uninterrupted_run(completed, smoke):
     assert len(smoke.runs) == RUNS
     for run in smoke.runs:
         twin = again[run.data.tags["fingerprint"]]
-        assert twin.data.metrics == pytest.approx(run.data.metrics, rel=1e-6)
         assert twin.data.params == run.data.params
+        assert smoke.project.weights(twin) == smoke.project.weights(run)
+        assert twin.data.metrics == pytest.approx(run.data.metrics, rel=1e-4)

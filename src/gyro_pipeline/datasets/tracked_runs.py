@@ -19,7 +19,7 @@ from mlflow import MlflowClient
 from mlflow.entities import Metric, Param, Run, RunStatus, RunTag, ViewType
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.datasets.atomic import replacing
+from gyro_pipeline.datasets.atomic import check_writable, replacing
 from gyro_pipeline.tracking import EvaluatedRun, StoredRun, TrainedRun
 
 _TRAINED = "trained"
@@ -106,6 +106,7 @@ class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
             if not self._path.exists():
                 _make_store(self._path)
             _check_store(self._path)
+            check_writable(self._path.parent / "mlruns" / "artifacts")
             uri = f"sqlite:///{self._path}"
         try:
             return MlflowClient(tracking_uri=uri)

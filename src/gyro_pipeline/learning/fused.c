@@ -29,11 +29,10 @@
 
 #define INLINE static inline __attribute__((always_inline))
 #if defined(__clang__)
-#define UNROLL _Pragma("unroll")
+#define EACH(i, n) _Pragma("unroll") for (int i = 0; i < (n); i++)
 #else
-#define UNROLL _Pragma("GCC unroll 16")
+#define EACH(i, n) _Pragma("GCC unroll 16") for (int i = 0; i < (n); i++)
 #endif
-#define EACH(i, n) UNROLL for (int i = 0; i < (n); i++)
 
 #define VECTOR(bytes) __attribute__((vector_size(bytes)))
 typedef float vec VECTOR(4 * LANES);
@@ -53,17 +52,17 @@ typedef uint32_t half_there VECTOR(2 * LANES) IN_MEMORY;
 typedef struct {
     /* channels, hidden and features are padded; span = taps * width */
     int64_t gyroscopes, blocks, width, span, channels, pool, pooled, hidden, features;
-    int64_t tile, chunk, floats; /* examples, pooled times worked on together; floats of the next */
-    float *weights, *mean, *square, *gradient; /* of all parameters; those by name are in weights */
-    float *hidden_weight, *hidden_bias;        /* (hidden, features), first of all; (hidden) */
-    float *output_weight, *output_bias;        /* (gyroscopes, hidden); (gyroscopes) */
+    int64_t tile, chunk, floats;        /* examples and times done together; all parameters */
+    float *weights, *mean, *square, *gradient;    /* (floats); what follows lies in weights */
+    float *hidden_weight, *hidden_bias;           /* (hidden, features), first of all; (hidden) */
+    float *output_weight, *output_bias;           /* (gyroscopes, hidden); (gyroscopes) */
     float *convolution_weight, *convolution_bias; /* (channels, span); (channels) */
-    const float *seen;                         /* (span): 1 where a kernel is, 0 elsewhere */
-    const float *inputs, *targets;             /* (n, blocks, width); (n, gyroscopes) */
-    float *pairs, *pair_bias;                  /* (span / 2, channels, 2); (channels, 2) */
-    float *active, *d_active;                  /* (tile, hidden) */
-    float *feature, *d_feature;                /* (tile, features); (tile, chunk * channels + 16) */
-    int32_t *place;                            /* (tile, features): floats from window to maximum */
+    const float *seen;                  /* (span): 1 where a kernel is, 0 elsewhere */
+    const float *inputs, *targets;      /* (n, blocks, width); (n, gyroscopes) */
+    float *pairs, *pair_bias;           /* (span / 2, channels, 2); (channels, 2) */
+    float *active, *d_active;           /* (tile, hidden) */
+    float *feature, *d_feature;         /* (tile, features); (tile, chunk * channels + 16) */
+    int32_t *place;                     /* (tile, features): offsets of maxima in the window */
 } Engine;
 
 static int64_t smaller(int64_t a, int64_t b) { return a < b ? a : b; }
@@ -104,13 +103,12 @@ static Chunk chunk_at(const Engine *e, int64_t from)
     return (Chunk){from, until, f, (until < e->pooled ? until * e->channels : e->features) - f};
 }
 
-/* So few channels do not fill vectors, so each has two lanes: one for even taps, one for odd ones.
- * A pair of taps then goes to all lanes with one 64-bit load, at the price of a single tap. */
+/* Few channels do not fill a vector, so each has two lanes: one for even taps, one for odd ones. A
+ * pair of taps then goes to all lanes with one 64-bit load, at the price of a single tap. */
 static void pair_up(const Engine *e)
 {
     for (int64_t c = 0; c < e->channels; c++) {
         e->pair_bias[2 * c] = e->convolution_bias[c];
-        e->pair_bias[2 * c + 1] = 0;
         for (int64_t k = 0; k < e->span; k++)
             e->pairs[k / 2 * 2 * e->channels + 2 * c + k % 2] =
                 e->convolution_weight[c * e->span + k];
@@ -310,8 +308,7 @@ static void convolution_gradient(const Engine *e, const float *x, const float *d
     }
 }
 
-/* PyTorch's Adam for n parameters: betas 0.9 and 0.999, eps 1e-8. `rate` is the learning rate over
- * 1 - 0.9^step, `root` 1 over the root of 1 - 0.999^step. */
+/* Adam as in PyTorch; rate and root correct for the zeros that both means started from. */
 static void adam(const Engine *e, int64_t first, int64_t n, float rate, float root)
 {
     for (int64_t i = first; i < first + n; i++) {

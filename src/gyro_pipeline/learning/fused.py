@@ -59,7 +59,7 @@ class FusedEngine:
         Args:
             network: On the CPU.
             inputs: Packed windows, shape (n, blocks, width), float32, scaled; used where they are,
-                a tenth faster if they start at a multiple of 64 bytes.
+                some percent faster if they start at a multiple of 64 bytes.
             targets: Shape (n, gyroscopes), float32, scaled; used where they are.
             batch_size: Examples per step.
 
@@ -75,7 +75,7 @@ class FusedEngine:
         self._index = layout.index
         self._arrays = {name: _aligned(floats) for name, floats in layout.arrays.items()}
         self._arrays |= {"inputs": inputs, "targets": targets}
-        self._arrays["seen"][layout.kernel] = 1
+        self._arrays["seen"][layout.seen] = 1
         self._weights = self._arrays["weights"]
         for name, value in network.state_dict().items():
             self._weights[self._index[name]] = value.numpy()
@@ -135,63 +135,87 @@ class _Engine(ctypes.Structure):
 
 
 class _Layout:
-    """Padded sizes and arrays for fused.c, and the place of each parameter in ``weights``."""
+    """Sizes and arrays as fused.c wants them, and the place of each parameter in ``weights``."""
 
     def __init__(self, architecture: Architecture, batch_size: int) -> None:
-        a = architecture
-        blocks, width = packed_shape(a)
-        channels, hidden = _up(a.channels, 8), _up(a.hidden, 16)
-        span, features = -(-a.kernel // a.stride) * width, _up(a.pooled * channels, 16)
-
-        unit, gyroscope, channel = (np.arange(n) for n in (a.hidden, a.gyroscopes, a.channels))
-        feature = np.add.outer(np.arange(a.pooled) * channels, channel).ravel()
-        tap, sample = np.divmod(np.arange(a.kernel), a.stride)
-        self.kernel = np.add.outer(gyroscope * a.stride, tap * width + sample)
-        within = {
-            "hidden.weight": (np.add.outer(unit * features, feature), hidden * features),
-            "hidden.bias": (unit, hidden),
-            "output.weight": (np.add.outer(gyroscope * hidden, unit), a.gyroscopes * hidden),
-            "output.bias": (gyroscope, _up(a.gyroscopes, _LINE)),
-            "convolution.weight": (np.add.outer(channel * span, self.kernel), channels * span),
-            "convolution.bias": (channel, channels),
-        }
-        self.index, self.starts, floats = {}, {}, 0
-        for name, (places, padded) in within.items():
+        s = _padded_sizes(architecture)
+        s |= _cache_sizes(s, batch_size)
+        self.index: dict[str, np.ndarray] = {}
+        self.starts: dict[str, int] = {}
+        floats = 0
+        for name, (places, padded) in _parameters(architecture, s).items():
             self.index[name], self.starts[name] = places + floats, floats
             floats += padded
-
-        by_window, by_weights = (
-            _WINDOW_CHUNK // (a.pool * width),
-            _WEIGHTS // (4 * hidden * channels),
-        )
-        chunk = max(2, min(by_window, by_weights, a.pooled + 1) // 2 * 2)  # even: whole vectors
-        # Windows of a tile stay in the cache until they are needed again, unless that means to go
-        # through hidden weights too large for it once more for every tile.
-        small = 4 * hidden * features <= _WEIGHTS
-        tile = _up(min(batch_size, _WINDOWS // (blocks * width) + 1) if small else batch_size, 4)
-        self.sizes = {
-            "gyroscopes": a.gyroscopes,
-            "blocks": blocks,
-            "width": width,
-            "span": span,
-            "channels": channels,
-            "pool": a.pool,
-            "pooled": a.pooled,
-            "hidden": hidden,
-            "features": features,
-            "tile": tile,
-            "chunk": chunk,
-            "floats": floats,
-        }
+        self.seen = self.index["convolution.weight"][0] - self.starts["convolution.weight"]
+        self.sizes = s | {"floats": floats}
         self.arrays = {
             **dict.fromkeys(("weights", "mean", "square", "gradient"), floats),
-            **dict.fromkeys(("active", "d_active"), tile * hidden),
-            **dict.fromkeys(("feature", "place"), tile * features),
-            "d_feature": tile * (chunk * channels + 16),
-            "pairs": channels * span,
-            "pair_bias": 2 * channels,
-            "seen": span,
+            **dict.fromkeys(("active", "d_active"), s["tile"] * s["hidden"]),
+            **dict.fromkeys(("feature", "place"), s["tile"] * s["features"]),
+            "d_feature": s["tile"] * (s["chunk"] * s["channels"] + 16),
+            "pairs": s["channels"] * s["span"],
+            "pair_bias": 2 * s["channels"],
+            "seen": s["span"],
         }
+
+
+def _padded_sizes(architecture: Architecture) -> dict[str, int]:
+    a = architecture
+    blocks, width = packed_shape(a)
+    channels = _up(a.channels, 8)
+    return {
+        "gyroscopes": a.gyroscopes,
+        "blocks": blocks,
+        "width": width,
+        "span": -(-a.kernel // a.stride) * width,
+        "channels": channels,
+        "pool": a.pool,
+        "pooled": a.pooled,
+        "hidden": _up(a.hidden, 16),
+        "features": _up(a.pooled * channels, 16),
+    }
+
+
+def _cache_sizes(sizes: dict[str, int], batch_size: int) -> dict[str, int]:
+    """Examples and pooled times that are worked on together, so that they stay in the cache."""
+    s = sizes
+    by_window = _WINDOW_CHUNK // (s["pool"] * s["width"])
+    by_weights = _WEIGHTS // (4 * s["hidden"] * s["channels"])  # they, gradient and two means
+    chunk = min(by_window, by_weights, s["pooled"] + 1)
+    # Windows of a tile are still there when they are needed again. Where the hidden weights are too
+    # many for the cache, to go through them once more for every tile would cost more than it saves.
+    few_weights = 4 * s["hidden"] * s["features"] <= _WEIGHTS
+    by_tile = _WINDOWS // (s["blocks"] * s["width"]) + 1
+    tile = min(batch_size, by_tile) if few_weights else batch_size
+    return {"tile": _up(tile, 4), "chunk": max(2, chunk // 2 * 2)}  # so that they fill vectors
+
+
+def _parameters(
+    architecture: Architecture, sizes: dict[str, int]
+) -> dict[str, tuple[np.ndarray, int]]:
+    """Places of each parameter's values in its padded array, and the size of that array."""
+    a, s = architecture, sizes
+    unit, gyroscope, channel = (np.arange(n) for n in (a.hidden, a.gyroscopes, a.channels))
+    feature = np.add.outer(np.arange(a.pooled) * s["channels"], channel).ravel()
+    tap, sample = np.divmod(np.arange(a.kernel), a.stride)
+    kernel = np.add.outer(gyroscope * a.stride, tap * s["width"] + sample)
+    return {
+        "hidden.weight": (
+            np.add.outer(unit * s["features"], feature),
+            s["hidden"] * s["features"],
+        ),
+        "hidden.bias": (unit, s["hidden"]),
+        "output.weight": (
+            np.add.outer(gyroscope * s["hidden"], unit),
+            a.gyroscopes * s["hidden"],
+        ),
+        "output.bias": (gyroscope, _up(a.gyroscopes, _LINE)),
+        "convolution.weight": (
+            np.add.outer(channel * s["span"], kernel),
+            s["channels"] * s["span"],
+        ),
+        "convolution.bias": (channel, s["channels"]),
+    }
 
 
 def _up(size: int, multiple: int) -> int:

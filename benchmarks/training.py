@@ -1,0 +1,708 @@
+"""How fast the network trains: our paths, PyTorch Lightning, skorch and plain loops on one core.
+
+    pip install -e .[bench]                   # the peers; without them they are left out
+    python benchmarks/training.py             # one core: ratios to Lightning, fraction of peak
+    python benchmarks/training.py --scaling   # two processes against one
+    python benchmarks/training.py --study     # the whole study, extrapolated from every cell
+    python benchmarks/training.py --memory    # peak memory and time against N and S
+
+All data are random and of the right shape; nothing is read and nothing is kept. What each part
+measures, and its last results: benchmarks/README.md.
+"""
+
+import argparse
+import contextlib
+import copy
+import ctypes
+import importlib
+import importlib.metadata
+import importlib.util
+import logging
+import multiprocessing
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+import xarray as xr
+from kedro.config import OmegaConfigLoader
+from torch import Tensor
+from torch.nn import functional
+from torch.utils.data import DataLoader, Sampler, TensorDataset
+
+from gyro_pipeline.conventions import AXES, DIMENSIONS, TEST, TRAIN
+from gyro_pipeline.datasets.recordings import Recordings
+from gyro_pipeline.learning import fused
+from gyro_pipeline.learning.examples import Device
+from gyro_pipeline.learning.executors import available_cores, run_jobs
+from gyro_pipeline.learning.fused import FusedEngine
+from gyro_pipeline.learning.jobs import TrainingJob, initial_network, run_training, sized
+from gyro_pipeline.learning.network import Architecture, CalibrationNetwork
+from gyro_pipeline.learning.packing import pack
+from gyro_pipeline.learning.trainer import Engine, TorchEngine
+from gyro_pipeline.parameters import Execution, Parameters
+from gyro_pipeline.pipelines.training.nodes import Devices
+from gyro_pipeline.protocol.splits import assign_roles
+from gyro_pipeline.settings import CONFIG_LOADER_ARGS
+from gyro_pipeline.studies import CNN, Cell, study_cells
+
+BATCH, RATE = 64, 1e-4
+STEPS_PER_EPOCH = 10
+PEERS = ("lightning", "skorch")
+LARGE = {"channels": 16, "kernel": 25, "stride": 5, "pool": 4, "hidden": 64}
+SIZES = {  # name: (network, gyroscopes, samples of a window)
+    "large-3x1500": (LARGE, 3, 1500),
+    "large-12x1500": (LARGE, 12, 1500),
+    "large-3x7500": (LARGE, 3, 7500),
+    "large-12x7500": (LARGE, 12, 7500),
+    "default-3x1494": ({}, 3, 1494),
+    "default-12x1494": ({}, 12, 1494),
+    "default-3x4483": ({}, 3, 4483),
+    "default-12x4483": ({}, 12, 4483),
+}
+STUDY_SEEDS = 5
+MEASURE_S = 0.5
+"""A training is measured for so long, and for at least three epochs after the first."""
+SCALING_LEAD_S, SCALING_S = 20, 5
+"""Until all processes are training for sure; how long they are then watched."""
+MEMORY_IMUS, MEMORY_SAMPLES = (1, 4, 12), (1500, 4500)
+MEMORY_RECORDINGS, MEMORY_WINDOWS = 80, 4
+MEASURED = ["peak_MB", "preparation_s", "epoch_s"]
+STUDY = "study"
+
+
+def main() -> None:
+    """Run the part that is asked for."""
+    arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parts = arguments.add_mutually_exclusive_group()
+    for part, meaning in (
+        ("scaling", "two processes against one"),
+        ("study", "time of the whole study"),
+        ("memory", "peak memory against N and S"),
+    ):
+        parts.add_argument(f"--{part}", action="store_true", help=meaning)
+    arguments.add_argument("--sizes", nargs="+", choices=SIZES, default=list(SIZES))
+    arguments.add_argument("--repetitions", type=int, default=5)
+    arguments.add_argument("--steps", type=int, default=40, help="per repetition, on one core")
+    options = arguments.parse_args()
+    loader = OmegaConfigLoader(str(Path(__file__).parents[1] / "conf"), **CONFIG_LOADER_ARGS)
+    parameters = Parameters(**loader["parameters"])
+    torch.set_num_threads(1)
+    print(machine())
+    fused.available()  # compiled now, not while the clock runs
+    with tempfile.TemporaryDirectory() as folder:
+        if options.scaling:
+            scaling(parameters, Path(folder), options.repetitions)
+        elif options.study:
+            study(parameters, Path(folder))
+        elif options.memory:
+            memory(parameters, Path(folder))
+        else:
+            one_core(parameters, options.sizes, options.repetitions, options.steps)
+
+
+# ------------------------------------------------------------------ the machine and its peaks
+
+
+def machine() -> str:
+    """What the results depend on."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    about = dict(line.split("\t: ", 1) for line in lines if "\t: " in line)
+    about = {key.strip(): value for key, value in about.items()}
+    model = f"{about.get('model name', platform.processor())}, family {about.get('cpu family')}"
+    widest = [f for f in ("avx512f", "avx2", "avx") if f in about.get("flags", "").split()][:1]
+    compiler = shutil.which(os.environ.get("CC", "cc").split()[0])
+    told = [compiler, "--version"] if compiler else ["echo", "no C compiler"]
+    first = subprocess.run(told, capture_output=True, text=True, check=False).stdout.split("\n")[0]
+    versions = [f"{name} {_version(name)}" for name in ("torch", "numpy", *PEERS)]
+    return "\n".join(
+        [
+            f"processor: {model}, {' '.join(widest)}, {available_cores()} cores",
+            f"compiler:  {first}",
+            f"versions:  Python {platform.python_version()}, {', '.join(versions)}",
+            f"load:      {os.getloadavg()[0]:.1f} processes before the start",
+        ]
+    )
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed (left out)"
+
+
+FMA_SOURCE = """
+#if defined(__AVX512F__)
+#define BYTES 64
+#elif defined(__AVX__)
+#define BYTES 32
+#else
+#define BYTES 16
+#endif
+typedef float vec __attribute__((vector_size(BYTES)));
+double fma_loop(long n)
+{
+    vec sums[12] = {0}, factor = {0}, term = {0};
+    factor += 0.5f, term += (float)n;
+    for (int j = 0; j < 12; j++) sums[j] += (float)(n + j); /* else they are one and the same */
+    for (long i = 0; i < n; i++)
+        _Pragma("GCC unroll 16") for (int j = 0; j < 12; j++) sums[j] = sums[j] * factor + term;
+    for (int j = 1; j < 12; j++) sums[0] += sums[j];
+    return sums[0][0] > 0 ? 12.0 * 2 * (BYTES / 4) * n : 0; /* operations */
+}
+"""
+
+
+def fma_peak() -> float | None:
+    """Multiply-adds in registers, GFLOP/s of one core; None without a compiler."""
+    compiler = os.environ.get("CC", "cc").split()
+    flags = ["-O3", "-ffp-contract=fast", "-shared", "-fPIC", "-x", "c", "-"]
+    if not shutil.which(compiler[0]):
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "fma.so"
+        for native in ("-march=native", "-mcpu=native"):
+            command = [*compiler, native, *flags, "-o", str(path)]
+            done = subprocess.run(
+                command, input=FMA_SOURCE, text=True, capture_output=True, check=False
+            )
+            if done.returncode == 0:
+                break
+        else:
+            return None
+        loop = ctypes.CDLL(str(path)).fma_loop
+    loop.restype, loop.argtypes = ctypes.c_double, [ctypes.c_long]
+    best = 0.0
+    for _ in range(50):
+        started = time.process_time()
+        best = max(best, loop(10_000_000) / (time.process_time() - started))
+    return best / 1e9
+
+
+GEMM_PROGRAM = """
+import time
+import numpy, torch
+torch.set_num_threads(1)
+a = numpy.random.default_rng(0).random((2048, 2048), numpy.float32)
+best = 0
+for b in [a, torch.from_numpy(a)] * 10:
+    started = time.process_time()
+    b @ b
+    best = max(best, 2 * 2048**3 / (time.process_time() - started))
+print(best)
+"""
+
+
+def gemm_peak() -> float:
+    """A product of two float32 matrices, by the faster of NumPy and PyTorch, GFLOP/s of one core.
+
+    In a process of its own, as NumPy's threads are counted when it is imported.
+    """
+    names = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
+    alone = os.environ | dict.fromkeys(names, "1")
+    command = [sys.executable, "-c", GEMM_PROGRAM]
+    done = subprocess.run(command, env=alone, capture_output=True, text=True, check=True)
+    return float(done.stdout) / 1e9
+
+
+def peaks() -> dict[str, float]:
+    """Best of many, GFLOP/s of one core."""
+    measured = {"GEMM": gemm_peak()}
+    multiply_add = fma_peak()
+    if multiply_add is None:
+        print("no C compiler: the multiply-add peak is not measured")
+    else:
+        measured["FMA"] = multiply_add
+    print("peaks:     " + ", ".join(f"{k} {v:.0f} GFLOP/s" for k, v in measured.items()))
+    return measured
+
+
+def step_operations(a: Architecture, batch: int = BATCH) -> float:
+    """Operations of one step, counted from the sizes as if nothing could be skipped.
+
+    The convolution has a forward product and one for its weights' gradient, dense over all its
+    outputs; a linear layer has these and one for its input's gradient.
+    """
+    convolution = a.convolved * a.channels * a.gyroscopes * a.kernel
+    linear = a.pooled * a.channels * a.hidden + a.hidden * a.gyroscopes
+    return 2.0 * batch * (2 * convolution + 3 * linear)
+
+
+# --------------------------------------------------------------------- one core: ours and peers
+
+
+Run = Callable[[int], float]
+"""Train so many epochs and return the seconds; starting and ending a framework is not timed.
+
+Seconds on the processor: of one process with one thread they are the clock's on an idle machine,
+and on a shared one they leave out what others used.
+"""
+
+
+def one_core(parameters: Parameters, sizes: list[str], repetitions: int, steps: int) -> None:
+    """All ways on the same work, in turns, so that all see the same disturbances."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    top = peaks()
+    for name in sizes:
+        changes, gyroscopes, window = SIZES[name]
+        training = parameters.training.model_copy(update=changes)
+        architecture = sized(training, gyroscopes, window)
+        ways, networks = prepared(architecture)
+        for run in ways.values():
+            run(1)
+        epochs = -(-steps // STEPS_PER_EPOCH)
+        seconds = pd.DataFrame(
+            [{way: run(epochs) for way, run in ways.items()} for _ in range(repetitions)]
+        )
+        table = compared(seconds / (epochs * STEPS_PER_EPOCH), architecture, top)
+        table["loss"] = [f"{networks[way]():.4f}" for way in ways]
+        print(f"\n{name}, batch {BATCH}, {repetitions} x {epochs * STEPS_PER_EPOCH} steps")
+        print(table.to_string(), flush=True)
+
+
+def compared(seconds: pd.DataFrame, architecture: Architecture, top: dict[str, float]):
+    """A row per way, from the seconds of a step in each repetition."""
+    first = seconds.columns[0]
+    ratios = seconds.rdiv(seconds[first], axis=0)
+    rates = step_operations(architecture) / seconds.median() / 1e9
+    table = pd.DataFrame(
+        {
+            "ms": (1e3 * seconds.median()).map("{:.2f}".format),
+            f"x {first}": ratios.median().map("{:.2f}".format),
+            "min to max": [f"{r.min():.2f} to {r.max():.2f}" for _, r in ratios.items()],
+            "GFLOP/s": rates.map("{:.1f}".format),
+        }
+    )
+    for name, peak in top.items():
+        table[f"% of {name}"] = (100 * rates / peak).map("{:.0f}".format)
+    return table
+
+
+def prepared(a: Architecture) -> tuple[dict[str, Run], dict[str, Callable[[], float]]]:
+    """All ways there are here, and the loss each has reached, to see that they do the same."""
+    random = np.random.default_rng(0)
+    n = BATCH * STEPS_PER_EPOCH
+    windows = random.standard_normal((n, a.gyroscopes, a.window), np.float32)
+    targets = random.standard_normal((n, a.gyroscopes), np.float32)
+    x, y = torch.from_numpy(windows), torch.from_numpy(targets)
+    packed = pack(windows.transpose(1, 0, 2), a)
+    start = initial_network(a, seed=0)
+    ways: dict[str, Run] = {}
+    losses: dict[str, Callable[[], float]] = {}
+
+    def add(way: str, make: Callable[[CalibrationNetwork], Run]) -> None:
+        network = copy.deepcopy(start)
+        ways[way] = make(network)
+        losses[way] = lambda: loss(network, x, y)
+
+    for peer, make in zip(PEERS, (lightning_way, skorch_way), strict=True):
+        if importlib.util.find_spec(peer):
+            add(peer, lambda network, make=make: make(network, x, y))
+    add("DataLoader", lambda network: loop_way(network, batches(x, y)))
+    add("tensors", lambda network: loop_way(network, TensorBatches(x, y)))
+    add("packed", lambda network: engine_way(network, TorchEngine, packed, targets))
+    if fused.available():
+        add("fused", lambda network: engine_way(network, FusedEngine, packed, targets))
+    else:
+        print("no C compiler: the fused path is left out")
+    return ways, losses
+
+
+@torch.no_grad()
+def loss(network: CalibrationNetwork, x: Tensor, y: Tensor) -> float:
+    return float(functional.mse_loss(network(x), y))
+
+
+class Order(Sampler[int]):
+    """Another order of n examples every epoch, the same ones for every way."""
+
+    def __init__(self, n: int) -> None:
+        self._n, self._shuffling = n, torch.Generator().manual_seed(0)
+
+    def drawn(self) -> Tensor:
+        return torch.randperm(self._n, generator=self._shuffling)
+
+    def __iter__(self) -> Iterator[int]:
+        yield from self.drawn().tolist()
+
+    def __len__(self) -> int:
+        return self._n
+
+
+def batches(x: Tensor, y: Tensor) -> DataLoader:
+    """Loaded in this process; others would need cores of their own."""
+    return DataLoader(TensorDataset(x, y), BATCH, sampler=Order(len(x)))
+
+
+class TensorBatches:
+    """Batches of tensors in memory."""
+
+    def __init__(self, x: Tensor, y: Tensor) -> None:
+        self._x, self._y, self._order = x, y, Order(len(x))
+
+    def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
+        for batch in self._order.drawn().split(BATCH):
+            yield self._x[batch], self._y[batch]
+
+
+def loop_way(network: CalibrationNetwork, epoch: DataLoader | TensorBatches) -> Run:
+    optimizer = torch.optim.Adam(network.parameters(), lr=RATE)
+
+    def run(epochs: int) -> float:
+        started = time.process_time()
+        for _ in range(epochs):
+            for x, y in epoch:
+                optimizer.zero_grad()
+                functional.mse_loss(network(x), y).backward()
+                optimizer.step()
+        return time.process_time() - started
+
+    return run
+
+
+def engine_way(
+    network: CalibrationNetwork, engine: type[Engine], packed: np.ndarray, targets: np.ndarray
+) -> Run:
+    steps = engine(network, packed, targets, BATCH)  # type: ignore[call-arg]
+    order = Order(len(packed))
+
+    def run(epochs: int) -> float:
+        started = time.process_time()
+        for _ in range(epochs):
+            steps.epoch(order.drawn().numpy(), RATE)
+            steps.load_into(network)
+        return time.process_time() - started
+
+    return run
+
+
+def skorch_way(network: CalibrationNetwork, x: Tensor, y: Tensor) -> Run:
+    skorch = importlib.import_module("skorch")
+    regressor = skorch.NeuralNetRegressor(
+        network,
+        optimizer=torch.optim.Adam,
+        lr=RATE,
+        batch_size=BATCH,
+        train_split=None,
+        iterator_train__sampler=Order(len(x)),
+        verbose=0,
+    ).initialize()
+
+    def run(epochs: int) -> float:
+        started = time.process_time()
+        regressor.partial_fit(x, y, epochs=epochs)
+        return time.process_time() - started
+
+    return run
+
+
+def lightning_way(network: CalibrationNetwork, x: Tensor, y: Tensor) -> Run:
+    lightning = importlib.import_module("lightning")
+    logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
+    warnings.filterwarnings("ignore", module="lightning")
+    loader, optimizer = batches(x, y), torch.optim.Adam(network.parameters(), lr=RATE)
+
+    class Module(lightning.LightningModule):
+        def __init__(self) -> None:
+            super().__init__()
+            self.network = network
+
+        def training_step(self, batch: tuple[Tensor, Tensor], _: int) -> Tensor:
+            return functional.mse_loss(self.network(batch[0]), batch[1])
+
+        def configure_optimizers(self) -> torch.optim.Optimizer:
+            return optimizer  # with its state from the repetitions before
+
+    class Clock(lightning.Callback):
+        def on_train_epoch_start(self, trainer, _) -> None:
+            if trainer.current_epoch == 0:
+                self.started = time.process_time()
+
+        def on_train_epoch_end(self, *_) -> None:
+            self.seconds = time.process_time() - self.started
+
+    module = Module()
+
+    def run(epochs: int) -> float:
+        clock = Clock()
+        trainer = lightning.Trainer(
+            max_epochs=epochs,
+            accelerator="cpu",
+            devices=1,
+            callbacks=[clock],
+            logger=False,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+        )
+        trainer.fit(module, loader)
+        return clock.seconds
+
+    return run
+
+
+# ----------------------------------------------------------------- trainings of the whole study
+
+
+class Enough(Exception):  # noqa: N818 - not an error: a training was measured for long enough
+    """Ends a training from within its report of an epoch."""
+
+
+def timed_training(job: TrainingJob, report: Callable[[float], None]) -> tuple[float, float, float]:
+    """Seconds before the first epoch, of an epoch with its validation; share on the processor."""
+    started, busy, ends = time.perf_counter(), -time.process_time(), []
+
+    def after_epoch(work: float) -> None:
+        ends.append(time.perf_counter())
+        if len(ends) > 3 and ends[-1] - ends[0] > MEASURE_S:  # noqa: PLR2004 - see MEASURE_S
+            raise Enough
+
+    with contextlib.suppress(Enough):
+        run_training(job, after_epoch)
+    report(job.work)
+    share = (busy + time.process_time()) / (time.perf_counter() - started)
+    epoch_s = (ends[-1] - ends[0]) / (len(ends) - 1)
+    return ends[0] - started - epoch_s, epoch_s, share
+
+
+def recorded(path: Path, imus: int, recordings: int, samples: int) -> xr.Dataset:
+    """White noise around random biases, in a file."""
+    random = np.random.default_rng(0)
+    coordinates = {
+        "imu": np.arange(1, imus + 1),
+        "recording": np.arange(1, recordings + 1),
+        "axis": list(AXES),
+    }
+    shape = (imus, recordings, len(AXES))
+    rates = random.standard_normal((*shape, samples), np.float32)
+    bias = random.normal(size=shape)
+    data = {"angular_rate": (DIMENSIONS, rates), "recording_mean": (DIMENSIONS[:-1], bias)}
+    Recordings(str(path)).save(xr.Dataset(data, coordinates))
+    return Recordings(str(path)).load()
+
+
+def study_jobs(parameters: Parameters, folder: Path) -> dict[Cell, TrainingJob]:
+    """Every distinct training of the three studies, one seed each, longest first."""
+    p, jobs, seen = parameters, {}, []
+    virtual = recorded(
+        folder / "virtual.nc", p.virtual_gyros.imus, p.virtual_gyros.train_recordings, 13000
+    )
+    for name, sensor in p.sensors.items():
+        real = recorded(folder / f"{name}.nc", sensor.imus, sensor.recordings, sensor.samples)
+        real = real.assign_attrs(sensor=name, rate_hz=sensor.rate_hz)
+        numbers = range(1, sensor.recordings + 1)
+        given = {n: TRAIN if n <= sensor.train_recordings else TEST for n in numbers}
+        roles = assign_roles(numbers, p.splits, given)
+        devices = Devices(real, real.recording_mean.load(), roles, virtual, p.virtual_gyros)
+        for asked in p.studies.values():
+            if name not in asked.sensors:
+                continue
+            for cell in study_cells(asked, name, p.source, p.windows_s, [0], p.only):
+                if cell.estimator == CNN and cell.content not in seen:
+                    seen.append(cell.content)
+                    jobs[cell] = devices.job(str(len(seen)), cell, p.training)
+    return dict(sorted(jobs.items(), key=lambda item: item[1].work, reverse=True))
+
+
+def study(parameters: Parameters, folder: Path) -> None:
+    """Measure a few epochs of every cell with all cores busy; extrapolate to all epochs, seeds."""
+    top, jobs = peaks(), study_jobs(parameters, folder)
+    cells = {job.name: cell for cell, job in jobs.items()}
+    execution = Execution(executor="processes", workers=None)
+    rows = []
+    for job, (preparation_s, epoch_s, share) in run_jobs(
+        list(jobs.values()), timed_training, execution, "cells"
+    ):
+        n, steps = _training_windows(job), -(-_training_windows(job) // BATCH)
+        minutes = (preparation_s + job.settings.epochs * epoch_s) / 60
+        rows.append(
+            {
+                "study": cells[job.name].study,
+                "sensor": cells[job.name].sensor,
+                "gyros": f"{cells[job.name].real_gyros}+{cells[job.name].virtual_gyros}",
+                "S": job.window,
+                "windows": n,
+                "preparation_s": preparation_s,
+                "epoch_ms": 1e3 * epoch_s,
+                "minutes": minutes,
+                "busy": minutes * share,
+                "steps": steps * job.settings.epochs,
+                "GFLOP": job.settings.epochs * step_operations(job.architecture, n) / 1e9,
+            }
+        )
+    table = pd.DataFrame(rows).sort_values("minutes", ascending=False)
+    print(table.drop(columns=["busy", "steps", "GFLOP"]).round(2).to_string(index=False))
+    augmentation = table[table.study == "augmentation"]
+    _total(f"augmentation, {len(augmentation)} cells, 1 seed (make run)", augmentation, 1, top)
+    _total(f"all studies, {len(table)} cells, {STUDY_SEEDS} seeds", table, STUDY_SEEDS, top)
+
+
+def _training_windows(job: TrainingJob) -> int:
+    per_recording = job.devices[0].recordings.sizes["sample"] // job.window
+    return per_recording * sum(len(device.numbers) for device in job.devices)
+
+
+def _total(what: str, table: pd.DataFrame, seeds: int, top: dict[str, float]) -> None:
+    cores, sums = available_cores(), seeds * table.sum(numeric_only=True)
+    minutes = sums.minutes / cores
+    rate = sums.GFLOP / (60 * cores * minutes)
+    parts = ", ".join(f"{100 * rate / peak:.0f} % of {name}" for name, peak in top.items())
+    print(
+        f"{what}: {minutes:.1f} minutes on {cores} cores, "
+        f"{sums.steps:.2e} steps, {1e9 * sums.GFLOP:.2e} operations, "
+        f"{rate:.1f} GFLOP/s per core ({parts}); "
+        f"preparation is {100 * sums.preparation_s / (60 * sums.minutes):.1f} %; "
+        f"on the processor for {sums.busy / cores:.1f} minutes of it, others had the rest"
+    )
+
+
+# --------------------------------------------------------------- two processes against one
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A training watched from ``start`` on, in seconds since the epoch of the clock."""
+
+    training: TrainingJob
+    start: float
+    work: float = 1.0
+
+
+def epochs_per_second(job: Watched, report: Callable[[float], None]) -> float:
+    """Epochs per second on the processor while all processes are at work."""
+    ends, busy = [], []
+
+    def after_epoch(work: float) -> None:
+        ends.append(time.time())
+        busy.append(time.process_time())
+        if ends[-1] > job.start + SCALING_S:
+            raise Enough
+
+    with contextlib.suppress(Enough):
+        run_training(job.training, after_epoch)
+    if ends[0] > job.start or ends[-1] < job.start + SCALING_S:
+        raise RuntimeError("a training did not last over the time watched; change SCALING_LEAD_S")
+    watched = [spent for end, spent in zip(ends, busy, strict=True) if end >= job.start]
+    return (len(watched) - 1) / (watched[-1] - watched[0])
+
+
+def scaling(parameters: Parameters, folder: Path, repetitions: int) -> None:
+    """Trainings side by side, each on a thread of its own, against one alone."""
+    if available_cores() < 2:  # noqa: PLR2004
+        print("one core only: scaling is not measured")
+        return
+    jobs = study_jobs(parameters, folder)
+    cell = next(c for c in jobs if (c.sensor, c.real_gyros, c.virtual_gyros) == ("sparkfun", 12, 0))
+    endless = jobs[cell].settings.model_copy(update={"epochs": 10**6, "decay_every": 10**6})
+    job = replace(jobs[cell], settings=endless)
+    print(f"epochs per second of {_training_windows(job)} windows of {job.window} samples")
+    ratios = []
+    for _ in range(repetitions):
+        rates = {}
+        for workers in (1, 2):
+            execution = Execution(executor="processes", workers=workers)
+            watched = [Watched(job, time.time() + SCALING_LEAD_S)] * workers
+            done = run_jobs(watched, epochs_per_second, execution, f"{workers} at once")
+            rates[workers] = sum(rate for _, rate in done)
+        ratios.append(rates[2] / rates[1])
+        print(f"one {rates[1]:.1f}, two {rates[2]:.1f}: {ratios[-1]:.2f}", flush=True)
+    print(f"median ratio {np.median(ratios):.2f}, {min(ratios):.2f} to {max(ratios):.2f}")
+
+
+# ------------------------------------------------------------------- memory and time against N, S
+
+
+def memory(parameters: Parameters, folder: Path) -> None:
+    """Every training in a process of its own; recordings grow with S, their windows do not."""
+    if not Path("/proc/self/status").exists():
+        print("peak memory is read from /proc, which only Linux has")
+        return
+    jobs, rows = [], []
+    for samples in MEMORY_SAMPLES:
+        imus = max(MEMORY_IMUS)
+        shape = (imus, MEMORY_RECORDINGS, MEMORY_WINDOWS * samples)
+        data = recorded(folder / f"{samples}.nc", *shape)
+        jobs += [
+            _memory_job(parameters, data, method, imus, samples)
+            for method in (1, 2)
+            for imus in MEMORY_IMUS
+        ]
+    largest = max(study_jobs(parameters, folder).values(), key=_megabytes)
+    jobs.append(replace(largest, name=f"{STUDY} {len(largest.devices)}"))
+    spawn = multiprocessing.get_context("spawn")
+    with spawn.Pool(1, maxtasksperchild=1) as fresh:
+        for job, (megabytes, preparation_s, epoch_s) in zip(
+            jobs, fresh.imap(peak_memory, jobs, chunksize=1), strict=True
+        ):
+            given = (*job.name.split(), job.window, _megabytes(job))
+            rows.append((*given, megabytes, preparation_s, epoch_s))
+    columns = ["method", "N", "S", "recordings_MB", *MEASURED]
+    table = pd.DataFrame(rows, columns=columns).astype({"N": int})
+    table["peak / recordings"] = table.peak_MB / table.recordings_MB
+    print(table.round(3).to_string(index=False))
+    table = table[table.method != STUDY]
+    for method, group in table.groupby("method"):
+        for column in MEASURED:
+            _fit(f"method {method}, {column}", group.N * group.S, group[column])
+    _fit("all, peak_MB against recordings_MB", table.recordings_MB, table.peak_MB)
+
+
+def _memory_job(
+    parameters: Parameters, data: xr.Dataset, method: int, imus: int, samples: int
+) -> TrainingJob:
+    """N IMUs side by side (method 1) or one after the other (method 2)."""
+    numbers = tuple(range(1, MEMORY_RECORDINGS + 1))
+    all_imus = tuple(range(1, imus + 1))
+    inputs = [all_imus] if method == 1 else [(imu,) for imu in all_imus]
+    bias = data.recording_mean.load()
+    devices = [Device(data.angular_rate, bias, some, numbers) for some in inputs]
+    return TrainingJob(f"{method} {imus}", devices, None, samples, parameters.training, seed=0)
+
+
+def _megabytes(job: TrainingJob) -> float:
+    """All recordings of a training, in float32."""
+    used = [*job.devices, *([job.validation] if job.validation else [])]
+    rates = job.devices[0].recordings
+    per_imu = rates.sizes["axis"] * rates.sizes["sample"]
+    return 4e-6 * per_imu * sum(len(d.imus) * len(d.numbers) for d in used)
+
+
+def peak_memory(job: TrainingJob) -> tuple[float, float, float]:
+    """Peak memory above that after imports, MB; seconds before the first epoch and of an epoch.
+
+    getrusage would do, but what it reports starts with the peak of the process that spawned.
+    """
+    before = _status("VmRSS")
+    preparation_s, epoch_s, _ = timed_training(job, lambda work: None)
+    return _status("VmHWM") - before, preparation_s, epoch_s
+
+
+def _status(key: str) -> float:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(f"{key}:")) * 1024 / 1e6
+
+
+def _fit(what: str, x: pd.Series, y: pd.Series) -> None:
+    slope, start = np.polyfit(x, y, 1)
+    off = np.abs(y - start - slope * x).max()
+    print(
+        f"{what}: {start:.3g} + {slope:.3g} x, largest deviation {off:.2g} "
+        f"({100 * off / y.max():.0f} % of the largest)"
+    )
+
+
+if __name__ == "__main__":
+    main()

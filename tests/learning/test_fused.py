@@ -1,0 +1,340 @@
+"""The C step against PyTorch, and what happens where it cannot be had."""
+
+import os
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional
+
+from gyro_pipeline.learning import fused
+from gyro_pipeline.learning.fused import FusedEngine
+from gyro_pipeline.learning.network import Architecture, CalibrationNetwork
+from gyro_pipeline.learning.packing import pack
+
+
+def _missing() -> str:
+    try:
+        fused._compiler()
+    except RuntimeError as reason:
+        return str(reason)
+    return ""
+
+
+# Where there is a compiler the step must compile: a mistake in fused.c fails, it does not skip.
+needs_compiler = pytest.mark.skipif(bool(_missing()), reason=_missing())
+
+TINY = Architecture(3, 101, 5, 7, 3, 3, 17)
+# gyroscopes, window, channels, kernel, stride, pool, hidden; batch size
+TRAININGS = {
+    "default": (Architecture(3, 1494, 8, 10, 10, 8, 32), 64),
+    "6 gyroscopes": (Architecture(6, 1494, 8, 10, 10, 8, 32), 16),
+    "12 gyroscopes, several tiles": (Architecture(12, 1494, 8, 10, 10, 8, 32), 16),
+    "12 gyroscopes, several tiles and chunks": (Architecture(12, 4483, 8, 10, 10, 8, 32), 16),
+    "large hidden layer, several chunks": (Architecture(3, 1500, 16, 25, 5, 4, 64), 16),
+    "no size a round one": (TINY, 64),
+    "kernel shorter than stride": (Architecture(6, 200, 5, 3, 7, 2, 7), 16),
+    "many channels, stride one": (Architecture(12, 60, 20, 7, 1, 5, 33), 16),
+    "kernel is the window": (Architecture(3, 25, 25, 25, 4, 1, 9), 16),
+    "last block cut short": (Architecture(3, 43, 3, 4, 10, 1, 7), 16),
+    "wide kernel": (Architecture(24, 300, 40, 29, 10, 3, 64), 64),
+}
+
+
+@pytest.fixture(scope="module")
+def _cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(autouse=True)
+def _as_if_new(monkeypatch, _cache):
+    """A cache of these tests alone, nothing remembered before or after, and one thread."""
+    monkeypatch.setenv("GYRO_PIPELINE_CACHE", str(_cache))
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    forget()
+    yield
+    forget()
+    torch.set_num_threads(threads)
+
+
+def forget():
+    fused.available.cache_clear()
+    fused._library.cache_clear()
+
+
+def network(a, seed=0):
+    torch.manual_seed(seed)
+    return CalibrationNetwork(a)
+
+
+def examples(a, n=150, seed=1):
+    """Noise around a bias that the targets hold."""
+    generator = np.random.default_rng(seed)
+    bias = generator.normal(size=(a.gyroscopes, n, 1))
+    windows = bias + generator.normal(scale=2, size=(a.gyroscopes, n, a.window))
+    targets = np.ascontiguousarray(bias[..., 0].T, np.float32)
+    return pack(windows.astype(np.float32), a), targets
+
+
+def orders(n, epochs):
+    generator = np.random.default_rng(2)
+    return [generator.permutation(n) for _ in range(epochs)]
+
+
+def plain_loop(of, inputs, targets, batch_size, epochs, rate):
+    """PyTorch's steps on the network itself; the mean loss of each epoch."""
+    x, y = torch.from_numpy(inputs), torch.from_numpy(targets)
+    optimizer = torch.optim.Adam(of.parameters(), lr=rate)
+    losses = []
+    for order in epochs:
+        total = 0.0
+        for batch in torch.from_numpy(order).split(batch_size):
+            loss = functional.mse_loss(of.forward_packed(x[batch]), y[batch])
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            total += loss.item() * len(batch)
+        losses.append(total / len(order))
+    return losses
+
+
+@needs_compiler
+@pytest.mark.parametrize("training", TRAININGS)
+def test_fifty_steps_are_those_of_pytorch(training):
+    a, batch_size = TRAININGS[training]
+    inputs, targets = examples(a)
+    epochs = orders(150, 17 if batch_size == 64 else 5)  # 51 or 50 steps, the last ones smaller
+    ours, theirs = network(a), network(a)
+    engine = FusedEngine(ours, inputs, targets, batch_size)
+    losses = [engine.epoch(order, 1e-4) for order in epochs]
+    assert losses == pytest.approx(plain_loop(theirs, inputs, targets, batch_size, epochs, 1e-4))
+
+    with torch.no_grad():
+        x = torch.from_numpy(inputs)
+        untrained = ours.forward_packed(x)
+        engine.load_into(ours)
+        got, expected = ours.forward_packed(x), theirs.forward_packed(x)
+    spread = float(targets.std())
+    assert float((expected - untrained).std()) > 0.005 * spread  # the steps went somewhere
+    torch.testing.assert_close(got, expected, rtol=0, atol=1e-5 * spread)
+    for name, value in theirs.state_dict().items():
+        torch.testing.assert_close(ours.state_dict()[name], value, rtol=0, atol=1e-5, msg=name)
+
+
+@needs_compiler
+def test_equal_inputs_give_equal_weights_to_the_last_bit():
+    inputs, targets = examples(TINY)
+    stored = []
+    for _ in range(2):
+        engine = FusedEngine(network(TINY), inputs, targets, 64)
+        losses = [engine.epoch(order, 1e-3) for order in orders(150, 3)]
+        trained = network(TINY, seed=9)
+        engine.load_into(trained)
+        stored.append((losses, trained.state_dict()))
+    assert stored[0][0] == stored[1][0]
+    for name, value in stored[0][1].items():
+        assert torch.equal(value, stored[1][1][name]), name
+
+
+@needs_compiler
+def test_examples_are_used_where_they_are_and_left_as_they_are():
+    inputs, targets = examples(TINY)
+    for array in (inputs, targets):
+        array.flags.writeable = False
+    initial = network(TINY)
+    engine = FusedEngine(initial, inputs, targets, 64)
+    before = engine.epoch(np.arange(150), 1e-9)
+    for name, value in network(TINY).state_dict().items():
+        assert torch.equal(value, initial.state_dict()[name]), name
+    targets.flags.writeable = True
+    targets += 10
+    assert engine.epoch(np.arange(150), 1e-9) > before + 50
+
+
+@needs_compiler
+def test_of_equal_outputs_the_first_is_the_maximum_as_in_pytorch():
+    """Kernels of zeros make all outputs equal; only the first of each pool sees other zeros."""
+    a = Architecture(3, 120, 8, 10, 10, 4, 16)
+    inputs, targets = examples(a, 8)
+    inputs.reshape(8, 3, 4, -1)[:, :, 0] = 0
+    for following, moved in ((0, False), (1, True)):
+        ours, theirs = network(a), network(a)
+        with torch.no_grad():
+            for each in (ours, theirs):
+                each.convolution.weight.zero_()
+        inputs.reshape(8, 3, 4, -1)[:, :, 0] = following  # where it is not zero, it is learnt from
+        engine = FusedEngine(ours, inputs, targets, 8)
+        engine.epoch(np.arange(8), 1e-3)
+        engine.load_into(ours)
+        plain_loop(theirs, inputs, targets, 8, [np.arange(8)], 1e-3)
+        assert bool(theirs.convolution.weight.any()) == moved
+        torch.testing.assert_close(ours.convolution.weight, theirs.convolution.weight)
+        assert ours.convolution.bias.ne(network(a).convolution.bias).all()
+
+
+@needs_compiler
+@pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan])
+@pytest.mark.parametrize("block", [0, 1, 7, 31])
+def test_what_is_not_finite_ends_in_the_loss(value, block):
+    inputs, targets = examples(TINY)
+    inputs[7, block, 0] = value
+    assert not np.isfinite(FusedEngine(network(TINY), inputs, targets, 64).epoch(np.arange(150), 0))
+
+
+@needs_compiler
+def test_numbers_too_small_to_be_normal_are_kept_in_the_process():
+    assert fused.available()
+    assert np.float32(1e-30) * np.full(16, 1e-10, np.float32).max() > 0
+
+
+@needs_compiler
+def test_other_threads_run_meanwhile():
+    a, _ = TRAININGS["large hidden layer, several chunks"]
+    inputs, targets = examples(a)
+    engine = FusedEngine(network(a), inputs, targets, 64)
+    order = np.tile(np.arange(150), 200)
+    with ThreadPoolExecutor(1) as pool:
+        running, longest, last = pool.submit(engine.epoch, order, 0.0), 0.0, time.monotonic()
+        start = last
+        while not running.done():
+            time.sleep(0.001)
+            now = time.monotonic()
+            longest, last = max(longest, now - last), now
+    assert longest < 0.5 * (last - start)
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (lambda x, y: (x.astype(np.float64), y), "inputs: .* float64 of shape"),
+        (lambda x, y: (x[:, :-1], y), r"inputs: expected .* \(150, 34, 16\), .* \(150, 33, 16\)"),
+        (lambda x, y: (x[::2], y[::2]), "inputs: expected contiguous"),
+        (lambda x, y: (x, y[1:]), r"targets: expected .* \(150, 3\), .* \(149, 3\)"),
+    ],
+)
+def test_examples_that_do_not_fit_are_refused(spoil, told):
+    with pytest.raises(ValueError, match=told):
+        FusedEngine(network(TINY), *spoil(*examples(TINY)), 64)
+
+
+@needs_compiler
+@pytest.mark.parametrize("order", [[], [0, 150], [-1, 3]])
+def test_an_order_of_examples_that_are_not_there_is_refused(order):
+    engine = FusedEngine(network(TINY), *examples(TINY), 64)
+    with pytest.raises(IndexError, match="indices from 0 to 149"):
+        engine.epoch(np.array(order, np.int64), 1e-3)
+
+
+def refusal(caplog):
+    """The one line that says why there is no C step."""
+    caplog.clear()
+    caplog.set_level("INFO", logger="gyro_pipeline")
+    assert not fused.available()
+    assert not fused.available()
+    (record,) = [r for r in caplog.records if r.name == fused.__name__]
+    assert record.levelname == "INFO"
+    assert "\n" not in record.getMessage()
+    return record.getMessage()
+
+
+def program(path, *lines):
+    path.write_text("\n".join(["#!/bin/sh", *lines]))
+    path.chmod(0o755)
+    return str(path)
+
+
+def test_without_a_compiler_it_is_said_once_and_training_goes_on(monkeypatch, caplog, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CC", raising=False)
+    assert "no C compiler: cc, gcc or clang not found" in refusal(caplog)
+    with pytest.raises(RuntimeError, match="no C compiler"):
+        FusedEngine(network(TINY), *examples(TINY), 64)
+
+
+def test_a_compiler_that_was_asked_for_is_not_replaced(monkeypatch, caplog):
+    monkeypatch.setenv("CC", "no-such-compiler -O1")
+    assert "no C compiler: no-such-compiler -O1 not found" in refusal(caplog)
+
+
+def test_a_broken_compiler_is_no_error(monkeypatch, caplog, tmp_path):
+    monkeypatch.setenv("CC", program(tmp_path / "cc", "echo 'fatal error: no licence' >&2; exit 1"))
+    assert "fatal error: no licence" in refusal(caplog)
+
+
+def test_a_source_that_does_not_compile_is_no_error(monkeypatch, caplog, tmp_path):
+    broken = 'case "$*" in *-dM*) exit 0;; esac; echo "error: what is a vector" >&2; exit 1'
+    monkeypatch.setenv("CC", program(tmp_path / "cc", broken))
+    monkeypatch.setenv("GYRO_PIPELINE_CACHE", str(tmp_path / "cache"))
+    assert "error: what is a vector" in refusal(caplog)
+    assert list((tmp_path / "cache").iterdir()) == []
+
+
+@needs_compiler
+def test_a_step_that_computes_something_else_is_not_used(monkeypatch, caplog):
+    monkeypatch.setenv("CC", " ".join([*fused._compiler(), "-Dsqrtf=fabsf"]))
+    assert "differs from PyTorch's" in refusal(caplog)
+
+
+@needs_compiler
+def test_what_cannot_be_loaded_is_no_error(monkeypatch, caplog, tmp_path):
+    monkeypatch.setenv("GYRO_PIPELINE_CACHE", str(tmp_path))
+    monkeypatch.setattr(fused, "_compile", lambda *to: to[-1].write_bytes(b"cut short"))
+    told = refusal(caplog)
+    (library,) = tmp_path.iterdir()
+    assert str(library) in told
+
+
+@needs_compiler
+def test_a_cache_that_cannot_be_written_is_no_error(monkeypatch, caplog, tmp_path):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("GYRO_PIPELINE_CACHE", str(tmp_path / "file" / "folder"))
+    assert "Not a directory" in refusal(caplog)
+
+
+@needs_compiler
+def test_what_is_compiled_is_kept_for_the_next_process(monkeypatch, tmp_path):
+    monkeypatch.delenv("GYRO_PIPELINE_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert fused.available()
+    (library,) = (tmp_path / "gyro_pipeline").iterdir()
+    made = library.stat().st_mtime_ns
+    forget()
+    with monkeypatch.context() as patch:
+        patch.setattr(fused, "_compile", lambda *_: pytest.fail("compiled again"))
+        assert fused.available()
+    assert library.stat().st_mtime_ns == made
+
+    monkeypatch.setenv("CC", " ".join([*fused._compiler(), "-DOTHER"]))
+    forget()
+    assert fused.available()
+    assert len(list((tmp_path / "gyro_pipeline").iterdir())) == 2
+
+
+@needs_compiler
+def test_another_processor_or_compiler_has_a_file_of_its_own(monkeypatch, tmp_path):
+    monkeypatch.setenv("GYRO_PIPELINE_CACHE", str(tmp_path))
+    assert fused.available()
+    flags, described = fused._native(fused._compiler())
+    assert b"__VERSION__" in described
+    assert b"__x86_64__" in described or b"__aarch64__" in described
+    monkeypatch.setattr(fused, "_native", lambda _: (flags, described + b"#define __NEWER__ 1\n"))
+    forget()
+    assert fused.available()
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+@needs_compiler
+def test_processes_may_compile_at_the_same_time(monkeypatch, tmp_path):
+    command = [sys.executable, "-c", "from gyro_pipeline.learning import fused as f; f._library()"]
+    here = {"GYRO_PIPELINE_CACHE": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)}
+    running = [subprocess.Popen(command, env=os.environ | here) for _ in range(2)]
+    assert [process.wait(120) for process in running] == [0, 0]
+    assert len(list(tmp_path.iterdir())) == 1
+    monkeypatch.setenv("GYRO_PIPELINE_CACHE", str(tmp_path))
+    assert fused.available()

@@ -1,0 +1,275 @@
+"""Input that cannot be used is refused before any training, and leaves nothing half written."""
+
+import sqlite3
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+SAMPLES, RECORDINGS = 1300, 7
+
+
+def good():
+    """Recordings of one IMU."""
+    shape = (RECORDINGS, 3, SAMPLES)
+    return np.random.default_rng(0).normal(0, 0.05, shape).astype(np.float32)
+
+
+def with_one(where, value):
+    array = good()
+    array[where] = value
+    return array
+
+
+@pytest.fixture(scope="module")
+def mine(new_project):
+    """A project whose Memsense logs are an array file."""
+
+    def make(array, name="mine.npy", **only):
+        project = new_project()
+        folder = project.folder / "data/01_raw/mine"
+        folder.mkdir(parents=True)
+        np.save(folder / "mine.npy", array, allow_pickle=True)
+        entry = {
+            "type": "gyro_pipeline.datasets.array_logs.ArrayLogs",
+            "sensor": "memsense",
+            "sensors": "${globals:sensors}",
+            "source": "${globals:source}",
+            "path": "data/01_raw/mine",
+            "files": {"all": name},
+        }
+        project.configure(
+            "mine",
+            globals={"source": "mine", "sensors": {"memsense": {"samples": SAMPLES}}},
+            parameters={"only": {"sensor": "memsense", "real_gyros": 3} | only},
+            catalog={"memsense.raw_logs.files": entry},
+        )
+        return project
+
+    return make
+
+
+def refused(project, pipeline="real2real", env="mine", **params):
+    """Run a project that must fail, and give what it then says."""
+    before = project.files(".")
+    done = project.run_here(pipeline, env, **params)
+    check_refusal(project, done, before)
+    return done.output
+
+
+def check_refusal(project, done, before):
+    assert done.code != 0
+    assert "error: " in done.output
+    assert "Traceback" not in done.output
+    assert " to train" not in done.output
+    after = project.files(".")
+    assert {name: after.get(name) for name in before if name != "terminal.log"} == {
+        name: content for name, content in before.items() if name != "terminal.log"
+    }
+    new = [Path(name) for name in after if name not in before]
+    assert not [path for path in new if path.name.startswith(".") and ".viz" not in path.parts]
+    assert not [path for path in new if "mlruns" in path.parts]
+
+
+# parameters
+
+
+@pytest.mark.parametrize(
+    ("params", "words"),
+    [
+        ({"trainin": {"epochs": 3}}, ["trainin: unknown key", "conf/base"]),
+        ({"training": {"epoch": 3}}, ["training.epoch: unknown key", "conf/base"]),
+        ({"training": {"epochs": 0}}, ["training.epochs", "greater than or equal to 1"]),
+        ({"training": {"centring": "none"}}, ["training.centring", "'per_device' or 'global'"]),
+        ({"only": {"sensor": "foo"}}, ["only.sensor", "'foo'", "sparkfun, dot, ng, memsense"]),
+        ({"windows_s": [10, 60]}, ["windows_s", "60 s", "longer", "memsense, 52 s"]),
+        (
+            {"studies": {"real2real": {"sensors": {"dot": {"real_gyros": [3, 15]}}}}},
+            ["studies.real2real.dot", "15 real gyroscopes", "dot has 12"],
+        ),
+        (
+            {"studies": {"augmentation": {"sensors": {"dot": {"virtual_gyros": [27]}}}}},
+            ["studies.augmentation.dot", "27 virtual gyroscopes", "makes 24"],
+        ),
+        (
+            {"studies": {"real2real": {"sensors": {"foo": {"method": 2, "real_gyros": [3]}}}}},
+            ["studies.real2real", "unknown sensor 'foo'", "conf/base/globals.yml"],
+        ),
+        ({"source": "../elsewhere"}, ["source", "pattern"]),
+    ],
+)
+def test_parameters(new_project, params, words):
+    output = refused(new_project(), env="smoke", **params)
+    for word in words:
+        assert word in output
+
+
+@pytest.mark.parametrize(
+    ("pipeline", "only"),
+    [
+        ("augmentation", {"real_gyros": 6}),
+        ("augmentation", {"sensor": "memsense"}),
+        ("real2real", {"window_s": 11}),
+        ("input_channels", {"seed": 1}),
+        ("__default__", {"real_gyros": 15}),
+    ],
+)
+def test_an_only_that_matches_nothing(new_project, pipeline, only):
+    output = refused(new_project(), pipeline, env="smoke", only=only)
+    assert "matches nothing" in output
+    assert all(name in output for name in only)
+
+
+# files of recordings
+
+
+@pytest.mark.parametrize(
+    ("array", "words"),
+    [
+        (good()[0], ["expected 3 axes", "got shape (3, 1300)"]),
+        (with_one((2, 1, 5), np.nan), ["recording 3, IMU 1, axis y", "NaN", "remove"]),
+        (with_one((4, 0, 0), np.inf), ["recording 5, IMU 1, axis x", "infinite", "remove"]),
+        (with_one((6, 2), 0.25), ["recording 7, IMU 1, axis z", "zero variance", "remove"]),
+        (np.array([{"a": 1}]), ["pickled objects", "never loaded", "delete"]),
+        (good()[:, :2], ["(7, 2, 1300)", "divisible by 3"]),
+        (good()[..., :200], ["window of 10 s is 250 samples", "has 200", "windows_s"]),
+    ],
+    ids=["rank", "nan", "infinite", "constant", "pickled", "gyroscopes", "short"],
+)
+def test_files(mine, array, words):
+    output = refused(mine(array))
+    assert "memsense" in output
+    for word in words:
+        assert word in output
+
+
+def test_a_pickle_is_not_even_opened(mine, tmp_path):
+    witness = tmp_path / "executed"
+
+    class Trap:
+        def __reduce__(self):
+            return Path.touch, (witness,)
+
+    assert "pickled objects" in refused(mine(np.array([Trap()])))
+    assert not witness.exists()
+
+
+def test_a_file_that_is_not_there(mine):
+    assert "memsense other.npy: no such file" in refused(mine(good(), name="other.npy"))
+
+
+def test_more_gyroscopes_than_a_file_holds(mine):
+    output = refused(mine(good(), real_gyros=6))
+    assert "6 gyroscopes asked by real2real, the mine recordings hold 3" in output
+
+
+def test_a_fold_that_there_is_not(mine):
+    assert "only.fold=7: memsense has folds 0 to 6" in refused(mine(good(), fold=7))
+
+
+# places
+
+
+@pytest.mark.parametrize("layer", ["02_intermediate", "05_model_input", "08_reporting"])
+def test_a_file_in_place_of_a_data_folder(new_project, layer):
+    project = new_project()
+    (project.folder / "data" / layer).write_text("in the way")
+    output = refused(project, env="smoke", only={"sensor": "ng"})
+    assert f"data/{layer} is a file where a folder is needed; move it away" in output
+    assert set(project.files()) == {f"data/{layer}"}  # it was found before anything was written
+
+
+def test_a_file_in_place_of_the_simulated_logs(new_project):
+    project = new_project()
+    (project.folder / "data/01_raw").write_text("in the way")
+    output = refused(project, env="smoke", only={"sensor": "ng"})
+    assert "data/01_raw is a file where a folder is needed; move it away" in output
+
+
+def test_a_file_in_place_of_the_artifacts(mine):
+    project = mine(good())
+    (project.folder / "mlruns").write_text("in the way")
+    assert "mlruns is a file where a folder is needed; move it away" in refused(project)
+
+
+def damage(store):
+    content = bytearray(store.read_bytes())
+    content[12288:163840] = bytes(151552)
+    store.write_bytes(content)
+
+
+def foreign(store):
+    store.unlink()
+    with sqlite3.connect(store) as connection:
+        connection.execute("create table books (title text)")
+    connection.close()
+
+
+def of_another_version(store):
+    with sqlite3.connect(store) as connection:
+        connection.execute("update alembic_version set version_num = 'not yet known'")
+    connection.close()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (damage, ["malformed", "move it away"]),
+        (lambda store: store.write_text("not a database" * 99), ["not a database", "move it away"]),
+        (foreign, ["expected an MLflow store", "tables books", "move it away"]),
+        (of_another_version, ["mlflow db upgrade"]),
+    ],
+    ids=["damaged", "text", "foreign", "version"],
+)
+def test_run_stores(mine, spoil, words):
+    project = mine(good())
+    spoil(project.store)
+    output = refused(project)
+    assert "mlflow.db" in output
+    for word in words:
+        assert word in output
+
+
+# The same through the command line, where nothing stands between an error and the terminal.
+
+
+@dataclass(frozen=True)
+class Case:
+    arguments: tuple
+    words: tuple
+    array: object = None
+    spoil: object = None
+
+
+CASES = {
+    "key": Case(("--env=mine", "--params=trainin.epochs=3"), ("trainin: unknown key",)),
+    "constant": Case(("--env=mine",), ("recording 7, IMU 1, axis z",), with_one((6, 2), 0.25)),
+    "pickled": Case(("--env=mine",), ("never loaded",), np.array([{"a": 1}])),
+    "foreign": Case(("--env=mine",), ("expected an MLflow store",), spoil=foreign),
+}
+
+
+@pytest.fixture(scope="module")
+def commands(mine):
+    """All cases, two at a time: most of what they do is to start."""
+
+    def run(case):
+        project = mine(good() if case.array is None else case.array)
+        if case.spoil:
+            case.spoil(project.store)
+        before = project.files(".")
+        return project, project.kedro_run("--pipeline=real2real", *case.arguments), before
+
+    with ThreadPoolExecutor(2) as pool:
+        return dict(zip(CASES, pool.map(run, CASES.values()), strict=True))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_commands(commands, name):
+    project, done, before = commands[name]
+    check_refusal(project, done, before)
+    assert done.code == 1
+    for word in CASES[name].words:
+        assert word in done.output
