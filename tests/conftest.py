@@ -35,6 +35,12 @@ ROOT = Path(__file__).parents[1]
 _TIMEOUT_S = 600
 
 
+@pytest.fixture(scope="session", autouse=True)
+def compiled_elsewhere(tmp_path_factory):
+    """What tests compile does not end up in the cache of who runs them."""
+    os.environ["GYRO_PIPELINE_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+
+
 @dataclass(frozen=True)
 class Done:
     """What a command left on the terminal."""

@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Iterator, Mapping
+from importlib import resources
 from typing import Any
 
 import pandas as pd
@@ -59,7 +60,8 @@ def plan(
     cells = over_folds(cells, folds, only)
     for cell in cells:
         _check(cell, recordings, training)
-    code = code_hash([examples, jobs, network, packing, trainer])
+    compiled = resources.files(fused.__package__).joinpath("fused.c").read_text()
+    code = [code_hash([examples, fused, jobs, network, packing, trainer]), compiled]
     rows = []
     for cell in cells:
         content = cell.content | {"recordings": recordings.attrs["data_hash"]}
