@@ -77,7 +77,7 @@ SCALING_LEAD_S, SCALING_S = 20, 5
 """Until all processes are training for sure; how long they are then watched."""
 MEMORY_IMUS, MEMORY_SAMPLES = (1, 4, 12), (1500, 4500)
 MEMORY_RECORDINGS, MEMORY_WINDOWS = 80, 4
-MEASURED = ["peak_MB", "preparation_s", "epoch_s"]
+MEASURED = ["peak_MB", "preparation_s", "epoch_ms"]
 STUDY = "study"
 
 
@@ -273,7 +273,9 @@ def one_core(parameters: Parameters, sizes: list[str], repetitions: int, steps: 
         print(table.to_string(), flush=True)
 
 
-def compared(seconds: pd.DataFrame, architecture: Architecture, top: dict[str, float]):
+def compared(
+    seconds: pd.DataFrame, architecture: Architecture, top: dict[str, float]
+) -> pd.DataFrame:
     """A row per way, from the seconds of a step in each repetition."""
     first = seconds.columns[0]
     ratios = seconds.rdiv(seconds[first], axis=0)
@@ -648,7 +650,7 @@ def memory(parameters: Parameters, folder: Path) -> None:
             jobs, fresh.imap(peak_memory, jobs, chunksize=1), strict=True
         ):
             given = (*job.name.split(), job.window, _megabytes(job))
-            rows.append((*given, megabytes, preparation_s, epoch_s))
+            rows.append((*given, megabytes, preparation_s, 1e3 * epoch_s))
     columns = ["method", "N", "S", "recordings_MB", *MEASURED]
     table = pd.DataFrame(rows, columns=columns).astype({"N": int})
     table["peak / recordings"] = table.peak_MB / table.recordings_MB

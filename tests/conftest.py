@@ -5,6 +5,7 @@ import io
 import logging
 import os
 import shutil
+import signal
 import sqlite3
 import subprocess
 import sys
@@ -41,6 +42,11 @@ def compiled_elsewhere(tmp_path_factory):
     os.environ["GYRO_PIPELINE_CACHE"] = str(tmp_path_factory.mktemp("cache"))
 
 
+def listen_to_interrupts() -> None:
+    """A shell lets what it runs in the background ignore Ctrl-C, and children inherit that."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @dataclass(frozen=True)
 class Done:
     """What a command left on the terminal."""
@@ -69,6 +75,7 @@ class Project:
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
+                preexec_fn=listen_to_interrupts,
             )
 
     def kedro_run(self, *arguments: str) -> Done:
@@ -217,9 +224,8 @@ def parameters() -> Callable[..., Parameters]:
     """Parameters of an environment, with some groups changed: ``parameters(splits={...})``."""
 
     def load(env: str = "smoke", **changes: Mapping[str, Any]) -> Parameters:
-        loader = OmegaConfigLoader(
-            str(ROOT / "conf"), env=env, runtime_params=changes, **CONFIG_LOADER_ARGS
-        )
+        settings: dict[str, Any] = dict(CONFIG_LOADER_ARGS)
+        loader = OmegaConfigLoader(str(ROOT / "conf"), env, changes, **settings)
         return Parameters(**loader["parameters"])
 
     return load

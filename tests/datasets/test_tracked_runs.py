@@ -300,7 +300,7 @@ def test_of_a_killed_process_trained_runs_wait_and_half_written_ones_end(store):
     (run,) = tracked(store).load()
     assert run.params["seed"] == "0"
     assert not run.finished
-    assert statuses(store) == {waiting: "RUNNING", half_written: "KILLED"}
+    assert statuses(store) == {waiting: "KILLED", half_written: "KILLED"}
     tracked(store).save(EvaluatedRun(run.run_id, {"test_rmse_dps": 1e-3}, {}, {}))
     assert statuses(store) == {waiting: "FINISHED", half_written: "KILLED"}
 

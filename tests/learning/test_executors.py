@@ -249,6 +249,8 @@ def program(tmp_path):
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         start_new_session=True,
+        # A shell lets what it runs in the background ignore Ctrl-C, and children inherit that.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     try:
         soon(lambda: len(list(tmp_path.glob("*.pid"))) == 2, "its workers have not started")

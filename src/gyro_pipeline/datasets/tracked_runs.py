@@ -41,8 +41,8 @@ _LOG_BATCH = 1000  # most metrics that one call takes
 class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
     """Trained runs of one study, or of all, narrowed to a sensor and a source.
 
-    Loading returns the trained runs, newest first, and ends what dead processes left half
-    written as KILLED. Saving takes one run at a time: a :class:`TrainedRun` becomes a run that
+    Loading returns the trained runs, newest first, and ends what dead processes left unfinished
+    as KILLED; of these, a trained run can still be evaluated. Saving takes one run at a time: a :class:`TrainedRun` becomes a run that
     waits for its evaluation, an :class:`EvaluatedRun` completes it and sets it FINISHED.
     """
 
@@ -82,7 +82,7 @@ class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
         search = partial(self._client.search_runs, list(experiments))
         # all pages first: what is ended is no longer on the next one
         for run in list(_pages(partial(search, "attributes.status = 'RUNNING'"))):
-            if _TRAINED not in run.data.tags and _is_dead(run.data.tags.get(_OWNER, "")):
+            if _is_dead(run.data.tags.get(_OWNER, "")):
                 self._client.set_terminated(run.info.run_id, "KILLED")
         wanted = " and ".join(f"params.{key} = '{value}'" for key, value in self._only.items())
         trained = [
