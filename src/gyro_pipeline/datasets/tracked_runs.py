@@ -41,9 +41,10 @@ _LOG_BATCH = 1000  # most metrics that one call takes
 class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
     """Trained runs of one study, or of all, narrowed to a sensor and a source.
 
-    Loading returns the trained runs, newest first, and ends what dead processes left unfinished
-    as KILLED; of these, a trained run can still be evaluated. Saving takes one run at a time: a :class:`TrainedRun` becomes a run that
-    waits for its evaluation, an :class:`EvaluatedRun` completes it and sets it FINISHED.
+    Loading returns the trained runs, newest first, and ends what dead processes left unfinished as
+    KILLED; of these, a trained run can still be evaluated. Saving takes one run at a time: a
+    :class:`TrainedRun` becomes a run that waits for its evaluation, an :class:`EvaluatedRun`
+    completes it and sets it FINISHED.
     """
 
     def __init__(
