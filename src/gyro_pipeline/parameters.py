@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from gyro_pipeline.conventions import AXES
 
 PerAxis = tuple[float, float, float]
+Precision = Literal["float32", "bfloat16"]
 Gyroscopes = Annotated[int, Field(ge=0, multiple_of=len(AXES), description="a count of axes")]
 
 
@@ -112,6 +113,10 @@ class Training(Parameter):
         0.0,
         ge=0,
         description="end once the learning rates still to come sum to less; 0: never early",
+    )
+
+    precision: Precision = Field(
+        "float32", description="of samples, and of the kernels as they meet them, in training"
     )
 
     def learning_rates(self) -> np.ndarray:

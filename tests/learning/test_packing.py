@@ -3,7 +3,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gyro_pipeline.learning.network import Architecture
-from gyro_pipeline.learning.packing import pack, packed_shape
+from gyro_pipeline.learning.packing import pack, packed_shape, to_bfloat16
 
 
 @st.composite
@@ -42,8 +42,8 @@ def test_nothing_the_network_sees_is_left_out_and_no_block_is_to_spare(a):
     blocks, width = packed_shape(a)
     last_seen = (a.convolved - 1) * a.stride + a.kernel
     assert (blocks - 1) * a.stride < last_seen <= blocks * a.stride
-    assert a.gyroscopes * a.stride <= width < a.gyroscopes * a.stride + 8
-    assert width % 8 == 0
+    assert a.gyroscopes * a.stride <= width < a.gyroscopes * a.stride + 16
+    assert width % 16 == 0
 
 
 def test_packing_writes_into_a_part_of_a_larger_array_and_nowhere_else():
@@ -62,3 +62,15 @@ def test_windows_may_be_views_of_any_layout():
     as_the_estimator_has_them = np.ascontiguousarray(windows.transpose(1, 0, 2)).transpose(1, 0, 2)
     np.testing.assert_array_equal(pack(as_the_estimator_has_them, a), pack(windows, a))
     np.testing.assert_array_equal(pack(windows[:, ::2], a), pack(windows, a)[::2])
+
+
+def test_rows_start_with_a_cache_line():
+    a = Architecture(3, 23, 4, 8, 5, 1, 8)
+    assert all(pack(numbered(a, n), a).ctypes.data % 64 == 0 for n in (1, 4, 300))
+
+
+def test_bfloat16_keeps_the_upper_half_of_the_nearest_number():
+    exact, between = np.float32(1.5), np.float32(1 + 2**-8)  # ... of two as near the even one
+    assert to_bfloat16(np.array([[exact, -exact], [between, 0]])).tolist() == [
+        *([0x3FC0, 0xBFC0], [0x3F80, 0])
+    ]

@@ -8,7 +8,7 @@ import xarray as xr
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.learning.network import Architecture
-from gyro_pipeline.learning.packing import pack, packed_shape
+from gyro_pipeline.learning.packing import aligned_zeros, pack, packed_shape
 from gyro_pipeline.protocol.windows import cut_windows
 
 
@@ -66,7 +66,10 @@ class Scaling:
 
 @dataclass(frozen=True)
 class Examples:
-    """Scaled examples: inputs (n, blocks, width) and targets (n, gyroscopes), float32."""
+    """Scaled examples: inputs (n, blocks, width) and targets (n, gyroscopes), float32.
+
+    Inputs to train on may be bfloat16 (:func:`~gyro_pipeline.learning.packing.to_bfloat16`).
+    """
 
     inputs: np.ndarray
     targets: np.ndarray
@@ -97,6 +100,8 @@ def training_examples(
     centres = device_centres(devices, centring)
     examples = _centred(devices, centres, architecture)
     input_scale = _root_mean_square(examples.inputs, architecture)
+    if not np.isfinite(input_scale):
+        raise InputError("training samples are not all finite; repair or leave out a recording")
     target_scale = float(np.sqrt(np.mean(np.square(examples.targets, dtype=np.float64))))
     if not target_scale > 0:
         raise InputError(
@@ -121,7 +126,7 @@ def _centred(
 ) -> Examples:
     per_recording = devices[0].recordings.sizes["sample"] // architecture.window
     n = per_recording * sum(len(device.numbers) for device in devices)
-    inputs = np.zeros((n, *packed_shape(architecture)), np.float32)
+    inputs = aligned_zeros((n, *packed_shape(architecture)))
     targets = np.empty((n, architecture.gyroscopes), np.float32)
     start = 0
     for device, centre in zip(devices, centres, strict=True):

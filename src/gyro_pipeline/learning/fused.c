@@ -4,6 +4,7 @@
  *   gradient is then summed at those places alone.
  * - Examples go forward and backward in tiles, and time in chunks, that stay in the second cache.
  * - Hidden weights are updated as soon as their gradient is complete.
+ * With BF16 the inputs, and the kernels as they meet them, are bfloat16; all else stays float32.
  *
  * fused.py owns all memory and pads sizes so that loops over vectors have no rest. Padding has zero
  * weights, hence zero outputs and gradients, and Adam leaves it so.
@@ -24,7 +25,6 @@
 #endif
 #define WIDE (LANES == 16 ? 4 : 2)
 #define ROWS 4
-#define POSITIONS (2 * WIDE)
 #define MOST 6
 
 #define INLINE static inline __attribute__((always_inline))
@@ -39,27 +39,35 @@ typedef float vec VECTOR(4 * LANES);
 typedef int32_t ints VECTOR(4 * LANES);
 typedef uint64_t longs VECTOR(4 * LANES);
 typedef float quad VECTOR(16);
-typedef float eight VECTOR(32);
 /* In memory they start anywhere a float may. */
 #define IN_MEMORY __attribute__((aligned(4), may_alias))
 typedef vec vec_there IN_MEMORY;
-typedef eight eight_there IN_MEMORY;
-typedef uint64_t pair_there IN_MEMORY;
+typedef ints ints_there IN_MEMORY;
 typedef uint32_t half_there VECTOR(2 * LANES) IN_MEMORY;
+
+#ifdef BF16
+typedef uint16_t sample;
+#else
+typedef float sample;
+#endif
 
 #define SLOPE 0.1f /* network.SLOPE */
 
 typedef struct {
     /* channels, hidden and features are padded; span = taps * width */
     int64_t gyroscopes, blocks, width, span, channels, pool, pooled, hidden, features;
-    int64_t tile, chunk, floats;        /* examples and times done together; all parameters */
+    int64_t tile, chunk;                /* examples and times done together */
+    int64_t refetch;                    /* whether a tile's windows leave the cache meanwhile */
+    int64_t kernel_row, floats;         /* of kernels; of all parameters */
     float *weights, *mean, *square, *gradient;    /* (floats); what follows lies in weights */
     float *hidden_weight, *hidden_bias;           /* (hidden, features), first of all; (hidden) */
     float *output_weight, *output_bias;           /* (gyroscopes, hidden); (gyroscopes) */
     float *convolution_weight, *convolution_bias; /* (channels, span); (channels) */
     const float *seen;                  /* (span): 1 where a kernel is, 0 elsewhere */
-    const float *inputs, *targets;      /* (n, blocks, width); (n, gyroscopes) */
-    float *pairs, *pair_bias;           /* (span / 2, channels, 2); (channels, 2) */
+    const sample *inputs;               /* (n, blocks, width) */
+    const float *targets;               /* (n, gyroscopes) */
+    sample *kernels;                    /* (span / 2, kernel_row): see arrange */
+    float *biases;                      /* (kernel_row) */
     float *active, *d_active;           /* (tile, hidden) */
     float *feature, *d_feature;         /* (tile, features); (tile, chunk * channels + 16) */
     int32_t *place;                     /* (tile, features): offsets of maxima in the window */
@@ -73,6 +81,18 @@ INLINE void store(float *to, vec value) { *(vec_there *)to = value; }
 /* Into a register: gcc otherwise loads again for every use, and loads are what limits. */
 INLINE vec load_once(const float *from) { return *(const volatile vec_there *)from; }
 
+/* Where a > b (never if one is not a number) x, elsewhere y. */
+INLINE ints greater(vec a, vec b, ints x, ints y)
+{
+#if defined(__AVX512F__)
+    const __mmask16 first = _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GT_OQ);
+    return (ints)_mm512_mask_mov_epi32((__m512i)y, first, (__m512i)x);
+#else
+    const ints first = a > b;
+    return (first & x) | (~first & y);
+#endif
+}
+
 /* b if either is not a number. */
 INLINE vec maximum(vec a, vec b)
 {
@@ -81,8 +101,7 @@ INLINE vec maximum(vec a, vec b)
 #elif defined(__AVX__)
     return (vec)_mm256_max_ps((__m256)a, (__m256)b);
 #else
-    const ints first = a > b;
-    return (vec)((first & (ints)a) | (~first & (ints)b));
+    return (vec)greater(a, b, (ints)a, (ints)b);
 #endif
 }
 
@@ -94,6 +113,16 @@ INLINE float total(vec value)
     return (sum[0] + sum[2]) + (sum[1] + sum[3]);
 }
 
+/* What depends on the type of a sample: begin() and end() a use of it (begin() is 0 where the system
+ * has it not), arrange() the kernels for a step, convolve() them with some
+ * positions, convolve_block() with POSITIONS, take half() of what they give where the channels fill
+ * no more, and load samples() as floats. */
+#ifdef BF16
+#include "fused_bfloat16.h"
+#else
+#include "fused_float32.h"
+#endif
+
 /* Pooled times from..until and their features f..f+columns, with any padding. */
 typedef struct { int64_t from, until, f, columns; } Chunk;
 
@@ -103,83 +132,39 @@ static Chunk chunk_at(const Engine *e, int64_t from)
     return (Chunk){from, until, f, (until < e->pooled ? until * e->channels : e->features) - f};
 }
 
-/* Few channels do not fill a vector, so each has two lanes: one for even taps, one for odd ones. A
- * pair of taps then goes to all lanes with one 64-bit load, at the price of a single tap. */
-static void pair_up(const Engine *e)
+/* Into the cache. */
+INLINE void fetch(const void *from, int64_t bytes)
 {
-    for (int64_t c = 0; c < e->channels; c++) {
-        e->pair_bias[2 * c] = e->convolution_bias[c];
-        for (int64_t k = 0; k < e->span; k++)
-            e->pairs[k / 2 * 2 * e->channels + 2 * c + k % 2] =
-                e->convolution_weight[c * e->span + k];
-    }
+    for (int64_t i = 0; i < bytes; i += 64) __builtin_prefetch((const char *)from + i);
 }
 
-/* Outputs of `count` successive positions for `wide` vectors of channels; both are constants. */
-INLINE void convolve(const Engine *e, const float *x, int64_t channel, vec (*out)[2], int count,
-                     int wide)
-{
-    const int64_t width = e->width, step = 2 * e->channels;
-    const float *pairs = e->pairs + 2 * channel, *bias = e->pair_bias + 2 * channel;
-    vec sums[POSITIONS][2];
-    EACH(p, count) EACH(v, wide) sums[p][v] = load(bias + v * LANES);
-    for (int64_t k = 0; k < e->span; k += 2, pairs += step) {
-        vec weights[2];
-        EACH(v, wide) weights[v] = load(pairs + v * LANES);
-        EACH(p, count) {
-            const vec taps = (vec)(*(const pair_there *)(x + p * width + k) + (longs){0});
-            EACH(v, wide) sums[p][v] += weights[v] * taps;
-        }
-    }
-    EACH(p, count) EACH(v, wide) out[p][v] = sums[p][v];
-}
-
-/* Not inlined, so that all registers are its own. */
-__attribute__((noinline)) static void convolve_block(const Engine *e, const float *x,
-                                                     int64_t channel, vec (*out)[2], int wide)
-{
-    if (wide == 1) convolve(e, x, channel, out, POSITIONS, 1);
-    else convolve(e, x, channel, out, POSITIONS, 2);
-}
-
-/* Convolve, pool and activate a chunk of one window for `wide` vectors of channels; meanwhile
- * fetch `next` into the cache. */
-INLINE void pool(const Engine *e, const float *x, const float *next, Chunk now, int64_t channel,
-                 float *feature, int32_t *place, int wide)
+/* Convolve, pool and activate a chunk of one window, for a vector of channels or half of one;
+ * meanwhile fetch `next` into the cache. */
+INLINE void pool(const Engine *e, const sample *x, const sample *next, Chunk now, int64_t channel,
+                 float *feature, int32_t *place, int full)
 {
     const int64_t width = e->width, first = now.from * e->pool, last = now.until * e->pool;
     const int many = last >= POSITIONS;
     const vec lowest = (vec){0} - INFINITY;
-    vec out[POSITIONS][2], best[2] = {lowest, lowest}, broken[2] = {{0}};
-    ints at[2] = {{0}}, here = (ints){0} + (int32_t)(first * width);
+    vec out[POSITIONS], best = lowest;
+    ints at = {0}, here = (ints){0} + (int32_t)(first * width);
     int64_t position = first, left = e->pool;
     while (position < last) {
         /* The last block overlaps the one before it, so as not to leave the window. */
         const int64_t start = many ? smaller(position, last - POSITIONS) : position;
         const int64_t stop = start + (many ? POSITIONS : 1);
-        for (int64_t i = (position - first) * width; i < (stop - first) * width; i += 16)
-            __builtin_prefetch(next + i);
-        if (many) convolve_block(e, x + start * width, channel, out, wide);
-        else convolve(e, x + start * width, channel, out, 1, wide);
+        fetch(next + (position - first) * width, (stop - position) * width * (int64_t)sizeof *x);
+        if (many) convolve_block(e, x + start * width, channel, out, full);
+        else convolve(e, x + start * width, channel, out, 1, full);
         for (; position < stop; position++, here += (int32_t)width) {
-            EACH(v, wide) {
-                const longs both = (longs)out[position - start][v];
-                const vec value = (vec)both + (vec)(both << 32 | both >> 32);
-                const ints better = value > best[v]; /* the first of equals, as in PyTorch */
-                at[v] = (better & here) | (~better & at[v]);
-                best[v] = maximum(value, best[v]);
-                broken[v] += 0 * value; /* not a number if any value is not finite */
-            }
+            const vec value = out[position - start];
+            at = greater(value, best, here, at); /* the first of equals, as in PyTorch */
+            best = maximum(value, best);
             if (--left) continue;
-            left = e->pool;
-            EACH(v, wide) {
-                const vec value = best[v] + broken[v], active = maximum(value, SLOPE * value);
-                *(half_there *)(feature + v * (LANES / 2)) =
-                    __builtin_convertvector((longs)active, half_there);
-                *(half_there *)(place + v * (LANES / 2)) =
-                    __builtin_convertvector((longs)at[v], half_there);
-                best[v] = lowest;
-            }
+            const vec active = maximum(best, SLOPE * best);
+            if (full) *(vec_there *)feature = active, *(ints_there *)place = at;
+            else *(half_there *)feature = half(active), *(half_there *)place = half((vec)at);
+            best = lowest, left = e->pool;
             feature += e->channels, place += e->channels;
         }
     }
@@ -266,45 +251,38 @@ static double head(const Engine *e, const float *target, float scale, float *act
     return loss;
 }
 
-/* to (wide vectors and a rest of eight) += sum over n times of d times the window at the maximum;
- * returns the sum of d. Odd and even times have sums of their own, to wait less for the last. */
-INLINE float weigh(const Engine *e, const float *x, const float *d, const int32_t *place, int64_t n,
-                   float *to, int wide, int rest)
+/* to (2 channels of wide vectors) += d times the window at the maximum, over n times. Two channels at
+ * once wait less for their last sums. */
+INLINE void weigh(const Engine *e, const sample *x, const float *d, const int32_t *place, int64_t n,
+                  float *to, int wide)
 {
-    vec sums[2][MOST] = {0};
-    eight last[2] = {0};
-    float bias[2] = {0};
-    for (int64_t t = 0; t < n; t += 2)
-        EACH(i, 2) {
-            if (i && t + 1 == n) break;
-            const float scale = d[(t + i) * e->channels], *at = x + place[(t + i) * e->channels];
-            EACH(v, wide) sums[i][v] += scale * load(at + v * LANES);
-            if (rest) last[i] += scale * *(const eight_there *)(at + wide * LANES);
-            bias[i] += scale;
-        }
-    EACH(v, wide) store(to + v * LANES, load(to + v * LANES) + (sums[0][v] + sums[1][v]));
-    if (rest) *(eight_there *)(to + wide * LANES) += last[0] + last[1];
-    return bias[0] + bias[1];
+    vec sums[2][MOST];
+    EACH(i, 2) EACH(v, wide) sums[i][v] = load(to + i * e->span + v * LANES);
+    for (int64_t t = 0; t < n; t++, d += e->channels, place += e->channels)
+        EACH(i, 2) EACH(v, wide) sums[i][v] += d[i] * samples(x + place[i] + v * LANES);
+    EACH(i, 2) EACH(v, wide) store(to + i * e->span + v * LANES, sums[i][v]);
 }
 
-/* The convolution's gradient from n pooled times of one window. */
-static void convolution_gradient(const Engine *e, const float *x, const float *d,
-                                 const int32_t *place, int64_t n)
+/* The convolution's gradient from n pooled times of one window; meanwhile fetch `next`. */
+static void convolution_gradient(const Engine *e, const sample *x, const sample *next,
+                                 const float *d, const int32_t *place, int64_t n)
 {
-    for (int64_t c = 0; c < e->channels; c++, d++, place++) {
-        float *to = gradient(e, e->convolution_weight + c * e->span), bias = 0;
-        for (int64_t k = 0, wide, rest; k < e->span; k += wide * LANES + rest * 8) {
-            const int64_t vectors = (e->span - k) / LANES, passes = (vectors + MOST - 1) / MOST;
-            wide = passes > 1 ? (vectors + passes - 1) / passes : vectors;
-            rest = passes < 2 && (e->span - k) % LANES;
-            switch (2 * wide + rest) {
+    const int64_t part = e->refetch * n * e->pool * e->width / e->channels;
+    const int64_t vectors = e->span / LANES, passes = (vectors + MOST - 1) / MOST;
+    float *bias = gradient(e, e->convolution_bias);
+    for (int64_t t = 0; t < n; t++)
+        for (int64_t c = 0; c < e->channels; c++) bias[c] += d[t * e->channels + c];
+    for (int64_t c = 0; c < e->channels; c += 2, d += 2, place += 2) {
+        float *to = gradient(e, e->convolution_weight + c * e->span);
+        fetch(next + c * part, 2 * part * (int64_t)sizeof *x);
+        for (int64_t pass = 0, v = 0, until; pass < passes; pass++, v = until) {
+            until = (pass + 1) * vectors / passes;
+            switch (until - v) {
 #define WEIGH(wide) \
-    case 2 * wide: bias = weigh(e, x + k, d, place, n, to + k, wide, 0); break; \
-    case 2 * wide + 1: bias = weigh(e, x + k, d, place, n, to + k, wide, 1); break;
-                WEIGH(0) WEIGH(1) WEIGH(2) WEIGH(3) WEIGH(4) WEIGH(5) WEIGH(6)
+    case wide: weigh(e, x + v * LANES, d, place, n, to + v * LANES, wide); break;
+                WEIGH(1) WEIGH(2) WEIGH(3) WEIGH(4) WEIGH(5) WEIGH(6)
             }
         }
-        gradient(e, e->convolution_bias)[c] += bias;
     }
 }
 
@@ -330,9 +308,9 @@ static void forward(const Engine *e, const int64_t *order, int64_t n, Chunk now)
         for (int64_t c = 0; c < e->channels; c += LANES) {
             float *feature = e->feature + b * e->features + now.f + c;
             int32_t *place = e->place + b * e->features + now.f + c;
-            const float *x = e->inputs + order[b] * window, *then = e->inputs + next;
-            if (e->channels - c < LANES) pool(e, x, then, now, c, feature, place, 1);
-            else pool(e, x, then, now, c, feature, place, 2);
+            const sample *x = e->inputs + order[b] * window, *then = e->inputs + next;
+            if (e->channels - c < LANES) pool(e, x, then, now, c, feature, place, 0);
+            else pool(e, x, then, now, c, feature, place, 1);
         }
     }
     hidden_sums(e, n, now);
@@ -342,6 +320,7 @@ static void forward(const Engine *e, const int64_t *order, int64_t n, Chunk now)
 static void backward(const Engine *e, const int64_t *order, int64_t n, Chunk now, int is_first)
 {
     const int64_t d_row = e->chunk * e->channels + 16;
+    const int64_t window = e->blocks * e->width, time = e->pool * e->width;
     const float *weight = e->hidden_weight + now.f, *feature = e->feature + now.f;
     product(e->d_active, e->hidden, 1, weight, e->features, e->hidden, e->d_feature, d_row, n,
             now.columns, 1);
@@ -350,7 +329,9 @@ static void backward(const Engine *e, const int64_t *order, int64_t n, Chunk now
     for (int64_t b = 0; b < n; b++, feature += e->features) {
         float *d = e->d_feature + b * d_row;
         for (int64_t i = 0; i < now.columns; i++) d[i] *= feature[i] > 0 ? 1 : SLOPE;
-        convolution_gradient(e, e->inputs + order[b] * e->blocks * e->width, d,
+        int64_t next = order[b + 1 < n ? b + 1 : 0] * window + now.from * time;
+        if (b + 1 == n) next -= now.from ? e->chunk * time : 0;
+        convolution_gradient(e, e->inputs + order[b] * window, e->inputs + next, d,
                              e->place + b * e->features + now.f, now.until - now.from);
     }
 }
@@ -361,7 +342,7 @@ static double step(const Engine *e, const int64_t *order, int64_t n, float rate,
     const int64_t others = e->hidden * e->features; /* where all but the hidden weights start */
     const float scale = 2.0f / (float)(n * e->gyroscopes);
     double loss = 0;
-    pair_up(e);
+    arrange(e);
     for (int64_t i = others; i < e->floats; i++) e->gradient[i] = 0;
     for (int64_t done = 0; done < n; done += e->tile, order += e->tile) {
         const int64_t size = smaller(e->tile, n - done);
@@ -385,16 +366,26 @@ static double step(const Engine *e, const int64_t *order, int64_t n, float rate,
     return loss;
 }
 
+/* Whether it can be used on this system. */
+int fused_usable(void)
+{
+    const int usable = begin();
+    if (usable) end();
+    return usable;
+}
+
 /* Train on the n examples in this order (and read one index more), in batches; `steps` were made
  * before. Returns the sum of squared errors, each as it was before its batch's step. */
 double fused_epoch(const Engine *e, const int64_t *order, int64_t n, int64_t batch, int64_t steps,
                    double learning_rate)
 {
     double loss = 0;
+    begin();
     for (int64_t done = 0; done < n; done += batch) {
         const double first = 1 - pow(0.9, (double)++steps), second = 1 - pow(0.999, (double)steps);
         loss += step(e, order + done, smaller(batch, n - done), (float)(learning_rate / first),
                      (float)(1 / sqrt(second)));
     }
+    end();
     return loss;
 }

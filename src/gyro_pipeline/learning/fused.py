@@ -1,7 +1,8 @@
 """The training step in C, for one thread of a CPU: the packed path's results, several times faster.
 
-The source, ``fused.c``, is compiled at first use by the system's C compiler into the user's cache.
-Without a compiler nothing is lost but time: :func:`available` says no and training runs in PyTorch.
+The source, ``fused.c``, is compiled at first use by the system's C compiler into the user's cache,
+for samples in float32 or in bfloat16. Without a compiler, or without a processor that multiplies
+bfloat16, nothing is lost but time: :func:`available` says no and training runs in PyTorch.
 """
 
 import ctypes
@@ -16,32 +17,39 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch.nn import functional
 
 from gyro_pipeline.learning.network import Architecture, CalibrationNetwork
-from gyro_pipeline.learning.packing import packed_shape
+from gyro_pipeline.learning.packing import CACHE_LINE, aligned_zeros, packed_shape, to_bfloat16
+from gyro_pipeline.learning.trainer import TorchEngine
+from gyro_pipeline.parameters import Precision
 
 logger = logging.getLogger(__name__)
+
+SOURCES = tuple(
+    Path(__file__).with_name(name) for name in ("fused.c", "fused_float32.h", "fused_bfloat16.h")
+)
+"""The first is compiled and includes one of the others."""
 
 _CACHE = "GYRO_PIPELINE_CACHE"
 # Without -ffast-math: gcc would link code that flushes denormals to zero in the whole process, and
 # a loss that is not a number could pass for one.
 _FLAGS = "-std=gnu11 -O3 -ffp-contract=fast -fno-math-errno -fno-trapping-math -shared -fPIC"
+_DEFINED: dict[Precision, list[str]] = {"float32": [], "bfloat16": ["-DBF16"]}
 _NATIVE = ("-march=native", "-mcpu=native", "")
 """What compilers call the processor of this machine; the last compiles for any of its kind."""
 _TIMEOUT_S = 120
 
-_LINE = 16
-"""Floats of a cache line."""
+_SAMPLE: dict[Precision, type[np.generic]] = {"float32": np.float32, "bfloat16": np.uint16}
+
 # Floats that fit a second cache of 1 MB beside all else; measured, and not critical.
 _WINDOW_CHUNK, _WINDOWS, _WEIGHTS = 20 << 10, 64 << 10, 128 << 10
 
 
 @functools.cache
-def available() -> bool:
+def available(precision: Precision = "float32") -> bool:
     """Whether the fused step can be used here; if not, the log says why, once."""
     try:
-        _check()
+        _check(precision)
     except (OSError, RuntimeError, subprocess.SubprocessError) as reason:
         logger.info("training in PyTorch, not in the several times faster C step: %s", reason)
         return False
@@ -58,22 +66,25 @@ class FusedEngine:
 
         Args:
             network: On the CPU.
-            inputs: Packed windows, shape (n, blocks, width), float32, scaled; used where they are,
-                some percent faster if they start at a multiple of 64 bytes.
+            inputs: Packed windows, shape (n, blocks, width), scaled and finite (a maximum passes
+                over what is not a number), float32 or bfloat16 as
+                :func:`~gyro_pipeline.learning.packing.to_bfloat16` has it; used where they are.
             targets: Shape (n, gyroscopes), float32, scaled; used where they are.
             batch_size: Examples per step.
 
         Raises:
-            ValueError: If the examples do not fit the network or are not contiguous float32.
+            ValueError: If the examples do not fit the network, are of another type or not
+                contiguous.
             RuntimeError: If the step could not be compiled; ask :func:`available` first.
         """
         a = network.architecture
-        _demand("inputs", inputs, (len(inputs), *packed_shape(a)))
-        _demand("targets", targets, (len(inputs), a.gyroscopes))
-        self._library, self._batch_size, self._steps = _library(), batch_size, 0
+        precision: Precision = "bfloat16" if inputs.dtype == np.uint16 else "float32"
+        _demand("inputs", inputs, (len(inputs), *packed_shape(a)), _SAMPLE[precision])
+        _demand("targets", targets, (len(inputs), a.gyroscopes), np.float32)
+        self._library, self._batch_size, self._steps = _library(precision), batch_size, 0
         layout = _Layout(a, min(batch_size, len(inputs)))
         self._index = layout.index
-        self._arrays = {name: _aligned(floats) for name, floats in layout.arrays.items()}
+        self._arrays = {name: aligned_zeros((floats,)) for name, floats in layout.arrays.items()}
         self._arrays |= {"inputs": inputs, "targets": targets}
         self._arrays["seen"][layout.seen] = 1
         self._weights = self._arrays["weights"]
@@ -119,9 +130,10 @@ class FusedEngine:
             value.copy_(torch.from_numpy(self._weights[self._index[name]]))
 
 
-_SIZES = """gyroscopes blocks width span channels pool pooled hidden features tile chunk floats"""
+_SIZES = """gyroscopes blocks width span channels pool pooled hidden features tile chunk refetch
+    kernel_row floats"""
 _ARRAYS = """weights mean square gradient hidden_weight hidden_bias output_weight output_bias
-    convolution_weight convolution_bias seen inputs targets pairs pair_bias active d_active
+    convolution_weight convolution_bias seen inputs targets kernels biases active d_active
     feature d_feature place"""
 
 
@@ -153,8 +165,8 @@ class _Layout:
             **dict.fromkeys(("active", "d_active"), s["tile"] * s["hidden"]),
             **dict.fromkeys(("feature", "place"), s["tile"] * s["features"]),
             "d_feature": s["tile"] * (s["chunk"] * s["channels"] + 16),
-            "pairs": s["channels"] * s["span"],
-            "pair_bias": 2 * s["channels"],
+            "kernels": s["span"] // 2 * s["kernel_row"],
+            "biases": s["kernel_row"],
             "seen": s["span"],
         }
 
@@ -173,6 +185,7 @@ def _padded_sizes(architecture: Architecture) -> dict[str, int]:
         "pooled": a.pooled,
         "hidden": _up(a.hidden, 16),
         "features": _up(a.pooled * channels, 16),
+        "kernel_row": 2 * _up(channels, 16),
     }
 
 
@@ -187,7 +200,8 @@ def _cache_sizes(sizes: dict[str, int], batch_size: int) -> dict[str, int]:
     few_weights = 4 * s["hidden"] * s["features"] <= _WEIGHTS
     by_tile = _WINDOWS // (s["blocks"] * s["width"]) + 1
     tile = min(batch_size, by_tile) if few_weights else batch_size
-    return {"tile": _up(tile, 4), "chunk": max(2, chunk // 2 * 2)}  # so that they fill vectors
+    refetch = int(tile * s["blocks"] * s["width"] > 2 * _WINDOWS)  # gone when they are needed again
+    return {"tile": _up(tile, 4), "chunk": max(2, chunk // 2 * 2), "refetch": refetch}
 
 
 def _parameters(
@@ -209,7 +223,7 @@ def _parameters(
             np.add.outer(gyroscope * s["hidden"], unit),
             a.gyroscopes * s["hidden"],
         ),
-        "output.bias": (gyroscope, _up(a.gyroscopes, _LINE)),
+        "output.bias": (gyroscope, _up(a.gyroscopes, CACHE_LINE)),
         "convolution.weight": (
             np.add.outer(channel * s["span"], kernel),
             s["channels"] * s["span"],
@@ -222,33 +236,28 @@ def _up(size: int, multiple: int) -> int:
     return -(-size // multiple) * multiple
 
 
-def _aligned(floats: int) -> np.ndarray:
-    """Zeros that start with a cache line."""
-    room = np.zeros(floats + _LINE, np.float32)
-    start = -(room.ctypes.data // room.itemsize) % _LINE
-    return room[start : start + floats]
-
-
-def _demand(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
-    if array.shape != shape or array.dtype != np.float32 or not array.flags.c_contiguous:
+def _demand(name: str, array: np.ndarray, shape: tuple[int, ...], dtype: type) -> None:
+    if array.shape != shape or array.dtype != dtype or not array.flags.c_contiguous:
         raise ValueError(
-            f"{name}: expected contiguous float32 of shape {shape}, "
+            f"{name}: expected contiguous {dtype.__name__} of shape {shape}, "
             f"got {array.dtype} of shape {array.shape}"
         )
 
 
 @functools.cache
-def _library() -> ctypes.CDLL:
+def _library(precision: Precision) -> ctypes.CDLL:
     """The compiled step, from the cache if it is there."""
-    source = Path(__file__).with_name("fused.c").read_bytes()
     compiler = _compiler()
     native, described = _native(compiler)
-    command = [*compiler, *_FLAGS.split(), *native]
-    key = hashlib.sha256(b"\0".join([source, " ".join(command).encode(), described])).hexdigest()
+    command = [*compiler, *_FLAGS.split(), *native, *_DEFINED[precision]]
+    sources = [path.read_bytes() for path in SOURCES]
+    key = hashlib.sha256(b"\0".join([*sources, " ".join(command).encode(), described])).hexdigest()
     path = _cache() / f"fused-{key[:16]}.so"
     if not path.exists():
-        _compile(command, source, path)
+        _compile(command, path)
     library = ctypes.CDLL(str(path))  # lets go of the interpreter lock while it runs
+    if not library.fused_usable():
+        raise RuntimeError(f"the system does not let this process multiply {precision}")
     library.fused_epoch.restype = ctypes.c_double
     library.fused_epoch.argtypes = [
         *(ctypes.POINTER(_Engine), ctypes.c_void_p),
@@ -273,26 +282,26 @@ def _native(compiler: list[str]) -> tuple[list[str], bytes]:
     """
     for flag in _NATIVE:
         command = [*compiler, *flag.split(), "-dM", "-E", "-x", "c", "-"]
-        done = _run(command, b"")
+        done = _run(command)
         if done.returncode == 0:
             return flag.split(), done.stdout
     raise RuntimeError(_failure(command, done))
 
 
-def _compile(command: list[str], source: bytes, path: Path) -> None:
+def _compile(command: list[str], path: Path) -> None:
     """Under a name of its own first, as other processes may be doing the same."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         made = Path(folder) / path.name
-        command = [*command, "-x", "c", "-", "-lm", "-o", str(made)]
-        done = _run(command, source)
+        command = [*command, str(SOURCES[0]), "-lm", "-o", str(made)]
+        done = _run(command)
         if done.returncode != 0:
             raise RuntimeError(_failure(command, done))
         made.replace(path)
 
 
-def _run(command: list[str], text: bytes) -> subprocess.CompletedProcess[bytes]:
-    return subprocess.run(command, input=text, capture_output=True, timeout=_TIMEOUT_S, check=False)
+def _run(command: list[str]) -> subprocess.CompletedProcess[bytes]:
+    return subprocess.run(command, input=b"", capture_output=True, timeout=_TIMEOUT_S, check=False)
 
 
 def _failure(command: list[str], done: subprocess.CompletedProcess[bytes]) -> str:
@@ -307,7 +316,7 @@ def _cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gyro_pipeline"
 
 
-def _check() -> None:
+def _check(precision: Precision) -> None:
     """Train a small network that uses every part of the code, and compare with PyTorch."""
     a = Architecture(gyroscopes=3, window=157, channels=19, kernel=19, stride=7, pool=3, hidden=18)
     random = np.random.default_rng(0)
@@ -315,16 +324,14 @@ def _check() -> None:
         torch.manual_seed(0)
         network, got = CalibrationNetwork(a), CalibrationNetwork(a)
     inputs = random.normal(size=(11, *packed_shape(a))).astype(np.float32)
+    if precision == "bfloat16":
+        inputs = to_bfloat16(inputs)
     targets = random.normal(size=(11, a.gyroscopes)).astype(np.float32)
     engine = FusedEngine(network, inputs, targets, batch_size=4)
     engine.epoch(np.arange(11), learning_rate=1e-3)
     engine.load_into(got)
-    optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
-    for part in torch.arange(11).split(4):
-        x, y = torch.from_numpy(inputs)[part], torch.from_numpy(targets)[part]
-        optimizer.zero_grad()
-        functional.mse_loss(network.forward_packed(x), y).backward()
-        optimizer.step()
+    reference = TorchEngine(network, inputs, targets, batch_size=4)
+    reference.epoch(np.arange(11), learning_rate=1e-3)
     for name, expected in network.state_dict().items():
         if not torch.allclose(got.state_dict()[name], expected, rtol=0, atol=1e-5):
             raise RuntimeError(f"after compilation {name} differs from PyTorch's")

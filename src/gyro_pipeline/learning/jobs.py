@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from gyro_pipeline.learning.examples import (
 )
 from gyro_pipeline.learning.fused import FusedEngine
 from gyro_pipeline.learning.network import Architecture, CalibrationNetwork
-from gyro_pipeline.learning.packing import pack
+from gyro_pipeline.learning.packing import pack, to_bfloat16
 from gyro_pipeline.learning.trainer import TorchEngine, predict, train
 from gyro_pipeline.parameters import Training
 
@@ -96,10 +96,12 @@ def run_training(job: TrainingJob, report: Callable[[float], None]) -> TrainedNe
     validation = (
         None if job.validation is None else scaled_examples(job.validation, architecture, scaling)
     )
+    if job.settings.precision == "bfloat16":
+        examples = replace(examples, inputs=to_bfloat16(examples.inputs))
     network = initial_network(architecture, job.seed)
     network.to(device)
     shuffling = torch.Generator().manual_seed(job.seed)
-    compiled = device == "cpu" and fused.available()
+    compiled = device == "cpu" and fused.available(job.settings.precision)
     trained = train(
         network,
         examples,

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -78,22 +79,30 @@ class CalibrationNetwork(nn.Module):
     def forward_packed(self, packed: Tensor) -> Tensor:
         """Biases of windows from :func:`gyro_pipeline.learning.packing.pack`, several times faster.
 
+        Windows in bfloat16 meet kernels that are rounded to it as well. Products, sums and all
+        that follows are float32, and gradients are as if nothing had been rounded.
+
         Args:
-            packed: Shape (n, blocks, width), scaled.
+            packed: Shape (n, blocks, width), scaled, float32 or bfloat16.
 
         Returns:
             Shape (n, gyroscopes), scaled.
         """
         a = self.architecture
         taps, width = -(-a.kernel // a.stride), packed.shape[2]
-        # (channels, gyroscopes, kernel) -> (channels, width, taps, 1): one tap is one block.
-        weight = functional.pad(self.convolution.weight, (0, taps * a.stride - a.kernel))
+        weight = self.convolution.weight
+        if packed.dtype == torch.bfloat16:
+            packed = packed.float()
+            weight = weight + (weight.bfloat16().float() - weight).detach()
+        # (channels, gyroscopes, kernel) -> (channels, width, 1, taps): one tap is one block.
+        weight = functional.pad(weight, (0, taps * a.stride - a.kernel))
         weight = weight.unflatten(2, (taps, a.stride)).permute(0, 1, 3, 2).flatten(1, 2)
-        weight = functional.pad(weight, (0, 0, 0, width - weight.shape[1])).unsqueeze(3)
-        image = packed.unsqueeze(2).permute(0, 3, 1, 2)  # (n, width, blocks, 1), channels last
+        weight = functional.pad(weight, (0, 0, 0, width - weight.shape[1])).unsqueeze(2)
+        # Time is the image's row, since kernels work on several outputs of one row at once.
+        image = packed.unsqueeze(1).permute(0, 3, 1, 2)  # (n, width, 1, blocks), channels last
         convolved = functional.conv2d(image, weight, self.convolution.bias)
-        pooled = functional.max_pool2d(convolved, (a.pool, 1))  # (n, channels, pooled, 1)
-        return self._head(pooled.squeeze(3).transpose(1, 2))
+        pooled = functional.max_pool2d(convolved, (1, a.pool))  # (n, channels, 1, pooled)
+        return self._head(pooled.squeeze(2).transpose(1, 2))
 
     def _head(self, pooled: Tensor) -> Tensor:
         features = functional.leaky_relu(pooled, SLOPE).flatten(1)  # (n, pooled * channels)

@@ -5,19 +5,22 @@ the samples of a block as channels that lie side by side in memory. It holds the
 padded with zeros, and is faster the more the kernel overlaps itself.
 """
 
+import math
+
 import numpy as np
+import torch
 
 from gyro_pipeline.learning.network import Architecture
 
-_ALIGNMENT = 8
-"""Floats that a row is padded to a multiple of: one AVX2 register."""
+CACHE_LINE = 16
+"""Floats of one; as many as the widest registers hold. Rows are padded to a multiple of it."""
 
 
 def packed_shape(architecture: Architecture) -> tuple[int, int]:
     """Blocks and width of one packed window."""
     a = architecture
     blocks = a.convolved - 1 + -(-a.kernel // a.stride)
-    return blocks, -(-a.gyroscopes * a.stride // _ALIGNMENT) * _ALIGNMENT
+    return blocks, -(-a.gyroscopes * a.stride // CACHE_LINE) * CACHE_LINE
 
 
 def pack(
@@ -37,7 +40,7 @@ def pack(
     gyroscopes, n, _ = windows.shape
     blocks, width = packed_shape(a)
     if out is None:
-        out = np.zeros((n, blocks, width), np.float32)
+        out = aligned_zeros((n, blocks, width))
     # (n, blocks, gyroscopes, stride) view of the used part of each row
     cells = out[:, :, : gyroscopes * a.stride].reshape(n, blocks, gyroscopes, a.stride)
     full = min(a.window // a.stride, blocks)
@@ -47,3 +50,23 @@ def pack(
         rest = windows[:, :, full * a.stride :]
         cells[:, full, :, : rest.shape[2]] = rest.transpose(1, 0, 2)
     return out
+
+
+def aligned_zeros(shape: tuple[int, ...]) -> np.ndarray:
+    """Float32 zeros that start with a cache line, so that no register is filled from two."""
+    size = math.prod(shape)
+    room = np.zeros(size + CACHE_LINE, np.float32)
+    start = -(room.ctypes.data // room.itemsize) % CACHE_LINE
+    return room[start : start + size].reshape(shape)
+
+
+def to_bfloat16(packed: np.ndarray) -> np.ndarray:
+    """Packed windows rounded to bfloat16: half the memory, for processors that multiply it.
+
+    Args:
+        packed: Float32 of any shape.
+
+    Returns:
+        Their bits, uint16 of the same shape, as NumPy has no such type.
+    """
+    return torch.from_numpy(packed).bfloat16().view(torch.uint16).numpy()

@@ -52,7 +52,8 @@ class TorchEngine:
 
     Args:
         network: Trained in place.
-        inputs: Packed windows, shape (n, blocks, width), scaled; on the device for good.
+        inputs: Packed windows, shape (n, blocks, width), scaled, float32 or bfloat16; on the
+            device for good.
         targets: Shape (n, gyroscopes), scaled.
         batch_size: Examples per step; the last one of an epoch may be smaller.
     """
@@ -70,8 +71,8 @@ class TorchEngine:
             group["lr"] = learning_rate
         total = torch.zeros((), device=self._inputs.device)
         for batch in torch.from_numpy(order).to(self._inputs.device).split(self._batch_size):
-            outputs = self._network.forward_packed(self._inputs[batch])
-            loss = functional.mse_loss(outputs, self._targets[batch])
+            outputs = self._network.forward_packed(self._inputs.index_select(0, batch))
+            loss = functional.mse_loss(outputs, self._targets.index_select(0, batch))
             self._optimizer.zero_grad()
             loss.backward()
             self._optimizer.step()
@@ -143,9 +144,10 @@ def _device(network: CalibrationNetwork) -> torch.device:
 
 
 def _tensors(examples: Examples, device: torch.device) -> tuple[Tensor, Tensor]:
-    return torch.from_numpy(examples.inputs).to(device), torch.from_numpy(examples.targets).to(
-        device
-    )
+    inputs = torch.from_numpy(examples.inputs)
+    if inputs.dtype == torch.uint16:
+        inputs = inputs.view(torch.bfloat16)
+    return inputs.to(device), torch.from_numpy(examples.targets).to(device)
 
 
 def _weights(network: CalibrationNetwork) -> StateDict:

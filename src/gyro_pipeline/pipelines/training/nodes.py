@@ -3,7 +3,6 @@
 import logging
 import time
 from collections.abc import Iterator, Mapping
-from importlib import resources
 from typing import Any
 
 import pandas as pd
@@ -60,8 +59,8 @@ def plan(
     cells = over_folds(cells, folds, only)
     for cell in cells:
         _check(cell, recordings, training)
-    compiled = resources.files(fused.__package__).joinpath("fused.c").read_text()
-    code = [code_hash([examples, fused, jobs, network, packing, trainer]), compiled]
+    compiled = [path.read_text() for path in fused.SOURCES]
+    code = [code_hash([examples, fused, jobs, network, packing, trainer]), *compiled]
     rows = []
     for cell in cells:
         content = cell.content | {"recordings": recordings.attrs["data_hash"]}
@@ -138,7 +137,9 @@ def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     devices = Devices(recordings, _labelled(bias), roles, virtual, virtual_gyros)
     todo = [devices.job(fp, planned[fp], training) for fp in to_train]
     if todo:
-        fused.available()  # compiles it, or says why not, before the workers need it
+        fused.available(
+            training.precision
+        )  # compiles it, or says why not, before the workers need it
     for job, trained in run_jobs(todo, run_training, execution, label):
         artifacts = {WEIGHTS: trained.artifact, HISTORY: trained.history}
         ended = {
