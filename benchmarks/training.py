@@ -5,6 +5,7 @@
     python benchmarks/training.py --scaling   # two processes against one
     python benchmarks/training.py --study     # the whole study, extrapolated from every cell
     python benchmarks/training.py --memory    # peak memory and time against N and S
+    python benchmarks/training.py --agreement # results of our paths over the whole schedule
 
 All data are random and of the right shape; nothing is read and nothing is kept. What each part
 measures, and its last results: benchmarks/README.md.
@@ -43,13 +44,13 @@ from torch.utils.data import DataLoader, Sampler, TensorDataset
 from gyro_pipeline.conventions import AXES, DIMENSIONS, TEST, TRAIN
 from gyro_pipeline.datasets.recordings import Recordings
 from gyro_pipeline.learning import fused
-from gyro_pipeline.learning.examples import Device
+from gyro_pipeline.learning.examples import Device, Examples
 from gyro_pipeline.learning.executors import available_cores, run_jobs
 from gyro_pipeline.learning.fused import FusedEngine
 from gyro_pipeline.learning.jobs import TrainingJob, initial_network, run_training, sized
 from gyro_pipeline.learning.network import Architecture, CalibrationNetwork
-from gyro_pipeline.learning.packing import pack
-from gyro_pipeline.learning.trainer import Engine, TorchEngine
+from gyro_pipeline.learning.packing import pack, to_bfloat16
+from gyro_pipeline.learning.trainer import Engine, TorchEngine, predict, train
 from gyro_pipeline.parameters import Execution, Parameters
 from gyro_pipeline.pipelines.training.nodes import Devices
 from gyro_pipeline.protocol.splits import assign_roles
@@ -77,6 +78,9 @@ SCALING_LEAD_S, SCALING_S = 20, 5
 """Until all processes are training for sure; how long they are then watched."""
 MEMORY_IMUS, MEMORY_SAMPLES = (1, 4, 12), (1500, 4500)
 MEMORY_RECORDINGS, MEMORY_WINDOWS = 80, 4
+AGREEMENT_SEEDS = 10
+AGREEMENT_SPREAD, AGREEMENT_WINDOWS = 0.1, 640
+"""Of the biases, in units of the samples' noise; in training, and as many to judge by."""
 MEASURED = ["peak_MB", "preparation_s", "epoch_ms"]
 STUDY = "study"
 
@@ -89,6 +93,7 @@ def main() -> None:
         ("scaling", "two processes against one"),
         ("study", "time of the whole study"),
         ("memory", "peak memory against N and S"),
+        ("agreement", "results of our paths over the whole schedule"),
     ):
         parts.add_argument(f"--{part}", action="store_true", help=meaning)
     arguments.add_argument("--sizes", nargs="+", choices=SIZES, default=list(SIZES))
@@ -99,7 +104,8 @@ def main() -> None:
     parameters = Parameters(**loader["parameters"])
     torch.set_num_threads(1)
     print(machine())
-    fused.available()  # compiled now, not while the clock runs
+    for precision in ("float32", "bfloat16"):
+        fused.available(precision)  # compiled now, not while the clock runs
     with tempfile.TemporaryDirectory() as folder:
         if options.scaling:
             scaling(parameters, Path(folder), options.repetitions)
@@ -107,6 +113,8 @@ def main() -> None:
             study(parameters, Path(folder))
         elif options.memory:
             memory(parameters, Path(folder))
+        elif options.agreement:
+            agreement(parameters)
         else:
             one_core(parameters, options.sizes, options.repetitions, options.steps)
 
@@ -316,10 +324,17 @@ def prepared(a: Architecture) -> tuple[dict[str, Run], dict[str, Callable[[], fl
     add("DataLoader", lambda network: loop_way(network, batches(x, y)))
     add("tensors", lambda network: loop_way(network, TensorBatches(x, y)))
     add("packed", lambda network: engine_way(network, TorchEngine, packed, targets))
-    if fused.available():
-        add("fused", lambda network: engine_way(network, FusedEngine, packed, targets))
-    else:
-        print("no C compiler: the fused path is left out")
+    for precision, name, inputs in (
+        ("float32", "fused", packed),
+        ("bfloat16", "fused bf16", to_bfloat16(packed)),
+    ):
+        if fused.available(precision):
+            add(
+                name,
+                lambda network, inputs=inputs: engine_way(network, FusedEngine, inputs, targets),
+            )
+        else:
+            print(f"{name} is left out, as there is no C compiler or no processor for it")
     return ways, losses
 
 
@@ -695,6 +710,47 @@ def peak_memory(job: TrainingJob) -> tuple[float, float, float]:
 def _status(key: str) -> float:
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith(f"{key}:")) * 1024 / 1e6
+
+
+# ------------------------------------------------------- results over the whole schedule
+
+
+def agreement(parameters: Parameters) -> None:
+    """Train to the last epoch by each path, seed by seed; RMSE on windows that did not train."""
+    architecture = sized(parameters.training, 3, 1494)
+    ways: dict[str, tuple[type[Engine], bool]] = {"packed": (TorchEngine, False)}
+    for precision, name in (("float32", "fused"), ("bfloat16", "fused bf16")):
+        if fused.available(precision):
+            ways[name] = (FusedEngine, precision == "bfloat16")
+    rows = []
+    for seed in range(AGREEMENT_SEEDS):
+        training, judging = (_learnable(architecture, seed, part) for part in range(2))
+        row = {}
+        for name, (engine, half) in ways.items():
+            given = replace(training, inputs=to_bfloat16(training.inputs)) if half else training
+            network = initial_network(architecture, seed)
+            shuffling = torch.Generator().manual_seed(seed)
+            nothing = lambda: None  # noqa: E731
+            train(network, given, None, parameters.training, shuffling, nothing, engine)
+            missed = predict(network, torch.from_numpy(judging.inputs)).numpy() - judging.targets
+            row[name] = float(np.sqrt(np.mean(missed**2)))
+        rows.append(row)
+        print(f"seed {seed}: " + ", ".join(f"{k} {v:.6f}" for k, v in row.items()), flush=True)
+    table = pd.DataFrame(rows)
+    for name in table.columns[1:]:
+        off = 100 * (table[name] / table["packed"] - 1)
+        print(
+            f"{name} against packed: mean difference {off.mean():+.3f} % "
+            f"(standard error {off.sem():.3f}), largest {off.abs().max():.3f} %"
+        )
+
+
+def _learnable(a: Architecture, seed: int, part: int) -> Examples:
+    """Noise around biases, as on a device whose mean was subtracted."""
+    random = np.random.default_rng([seed, part])
+    bias = AGREEMENT_SPREAD * random.standard_normal((AGREEMENT_WINDOWS, a.gyroscopes), np.float32)
+    noise = random.standard_normal((a.gyroscopes, AGREEMENT_WINDOWS, a.window), np.float32)
+    return Examples(pack(noise + bias.T[:, :, None], a), bias / np.float32(AGREEMENT_SPREAD))
 
 
 def _fit(what: str, x: pd.Series, y: pd.Series) -> None:

@@ -1,4 +1,4 @@
-"""From recordings to scaled training examples, one recording in memory at a time."""
+"""From recordings to scaled training examples, few recordings in memory at a time."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -10,6 +10,9 @@ from gyro_pipeline.conventions import InputError
 from gyro_pipeline.learning.network import Architecture
 from gyro_pipeline.learning.packing import aligned_zeros, pack, packed_shape
 from gyro_pipeline.protocol.windows import cut_windows
+
+_READ_AT_ONCE = 16
+"""Recordings: enough that finding them in the file costs little, few enough to hold."""
 
 
 @dataclass(frozen=True)
@@ -37,13 +40,15 @@ class Device:
 
     def samples(self) -> Iterator[np.ndarray]:
         """The recordings one by one, shape (gyroscopes, samples), deg/s."""
-        for number in self.numbers:
-            chosen = self.recordings.sel(imu=list(self.imus), recording=number)
-            yield (
-                chosen.transpose("imu", "axis", "sample")
-                .to_numpy()
-                .reshape(len(self.imus) * chosen.sizes["axis"], -1)
-            )
+        rows = self.recordings.get_index("recording").get_indexer(self.numbers)
+        imus = self.recordings.get_index("imu").get_indexer(self.imus)
+        for first in range(0, len(rows), _READ_AT_ONCE):
+            wanted = rows[first : first + _READ_AT_ONCE]
+            # what lies between them as well, as single ones are found far more slowly
+            part = self.recordings.isel(imu=_around(imus), recording=_around(wanted)).load()
+            read = part.transpose("recording", "imu", "axis", "sample").to_numpy()
+            for row in wanted - wanted.min():
+                yield read[row, imus - imus.min()].reshape(-1, read.shape[-1])
 
 
 @dataclass(frozen=True)
@@ -137,6 +142,10 @@ def _centred(
             targets[rows] = bias - centre
             start = rows.stop
     return Examples(inputs, targets)
+
+
+def _around(positions: np.ndarray) -> slice:
+    return slice(int(positions.min()), int(positions.max()) + 1)
 
 
 def _root_mean_square(inputs: np.ndarray, architecture: Architecture) -> float:
