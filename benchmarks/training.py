@@ -47,7 +47,13 @@ from gyro_pipeline.learning import fused
 from gyro_pipeline.learning.examples import Device, Examples
 from gyro_pipeline.learning.executors import available_cores, run_jobs
 from gyro_pipeline.learning.fused import FusedEngine
-from gyro_pipeline.learning.jobs import TrainingJob, initial_network, run_training, sized
+from gyro_pipeline.learning.jobs import (
+    TrainingJob,
+    initial_network,
+    run_training,
+    shuffling,
+    sized,
+)
 from gyro_pipeline.learning.network import Architecture, CalibrationNetwork
 from gyro_pipeline.learning.packing import pack, to_bfloat16
 from gyro_pipeline.learning.trainer import Engine, TorchEngine, predict, train
@@ -346,8 +352,8 @@ def loss(network: CalibrationNetwork, x: Tensor, y: Tensor) -> float:
 class Order(Sampler[int]):
     """Another order of n examples every epoch, the same ones for every way."""
 
-    def __init__(self, n: int) -> None:
-        self._n, self._shuffling = n, torch.Generator().manual_seed(0)
+    def __init__(self, n: int, seed: int = 0) -> None:
+        self._n, self._shuffling = n, shuffling(seed)
 
     def drawn(self) -> Tensor:
         return torch.randperm(self._n, generator=self._shuffling)
@@ -365,43 +371,52 @@ def batches(x: Tensor, y: Tensor) -> DataLoader:
 
 
 class TensorBatches:
-    """Batches of tensors in memory."""
+    """Batches of tensors in memory, that of the device they are on."""
 
-    def __init__(self, x: Tensor, y: Tensor) -> None:
-        self._x, self._y, self._order = x, y, Order(len(x))
+    def __init__(self, x: Tensor, y: Tensor, seed: int = 0) -> None:
+        self._x, self._y, self._order = x, y, Order(len(x), seed)
 
     def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
-        for batch in self._order.drawn().split(BATCH):
+        for batch in self._order.drawn().to(self._x.device).split(BATCH):
             yield self._x[batch], self._y[batch]
 
 
-def loop_way(network: CalibrationNetwork, epoch: DataLoader | TensorBatches) -> Run:
+def loop_way(
+    network: CalibrationNetwork,
+    epoch: DataLoader | TensorBatches,
+    clock: Callable[[], float] = time.process_time,
+) -> Run:
     optimizer = torch.optim.Adam(network.parameters(), lr=RATE)
 
     def run(epochs: int) -> float:
-        started = time.process_time()
+        started = clock()
         for _ in range(epochs):
             for x, y in epoch:
                 optimizer.zero_grad()
                 functional.mse_loss(network(x), y).backward()
                 optimizer.step()
-        return time.process_time() - started
+        return clock() - started
 
     return run
 
 
-def engine_way(
-    network: CalibrationNetwork, engine: type[Engine], packed: np.ndarray, targets: np.ndarray
+def engine_way(  # noqa: PLR0913, PLR0917 - the last two are for benchmarks/gpu.py
+    network: CalibrationNetwork,
+    engine: type[Engine],
+    packed: np.ndarray,
+    targets: np.ndarray,
+    seed: int = 0,
+    clock: Callable[[], float] = time.process_time,
 ) -> Run:
     steps = engine(network, packed, targets, BATCH)  # type: ignore[call-arg]
-    order = Order(len(packed))
+    order = Order(len(packed), seed)
 
     def run(epochs: int) -> float:
-        started = time.process_time()
+        started = clock()
         for _ in range(epochs):
             steps.epoch(order.drawn().numpy(), RATE)
             steps.load_into(network)
-        return time.process_time() - started
+        return clock() - started
 
     return run
 
@@ -483,6 +498,8 @@ def timed_training(job: TrainingJob, report: Callable[[float], None]) -> tuple[f
     started, busy, ends = time.perf_counter(), -time.process_time(), []
 
     def after_epoch(work: float) -> None:
+        if work != job.epoch_work:
+            return  # part of the preparation
         ends.append(time.perf_counter())
         if len(ends) > 3 and ends[-1] - ends[0] > MEASURE_S:  # noqa: PLR2004 - see MEASURE_S
             raise Enough
@@ -514,8 +531,9 @@ def recorded(path: Path, imus: int, recordings: int, samples: int) -> xr.Dataset
 def study_jobs(parameters: Parameters, folder: Path) -> dict[Cell, TrainingJob]:
     """Every distinct training of the three studies, one seed each, longest first."""
     p, jobs, seen = parameters, {}, []
+    samples = max(sensor.samples for sensor in p.sensors.values())
     virtual = recorded(
-        folder / "virtual.nc", p.virtual_gyros.imus, p.virtual_gyros.train_recordings, 13000
+        folder / "virtual.nc", p.virtual_gyros.imus, p.virtual_gyros.train_recordings, samples
     )
     for name, sensor in p.sensors.items():
         real = recorded(folder / f"{name}.nc", sensor.imus, sensor.recordings, sensor.samples)
@@ -543,7 +561,7 @@ def study(parameters: Parameters, folder: Path) -> None:
     for job, (preparation_s, epoch_s, share) in run_jobs(
         list(jobs.values()), timed_training, execution, "cells"
     ):
-        n, steps = _training_windows(job), -(-_training_windows(job) // BATCH)
+        n, steps = job.windows, -(-job.windows // BATCH)
         minutes = (preparation_s + job.settings.epochs * epoch_s) / 60
         rows.append(
             {
@@ -565,11 +583,6 @@ def study(parameters: Parameters, folder: Path) -> None:
     augmentation = table[table.study == "augmentation"]
     _total(f"augmentation, {len(augmentation)} cells, 1 seed (make run)", augmentation, 1, top)
     _total(f"all studies, {len(table)} cells, {STUDY_SEEDS} seeds", table, STUDY_SEEDS, top)
-
-
-def _training_windows(job: TrainingJob) -> int:
-    per_recording = job.devices[0].recordings.sizes["sample"] // job.window
-    return per_recording * sum(len(device.numbers) for device in job.devices)
 
 
 def _total(what: str, table: pd.DataFrame, seeds: int, top: dict[str, float]) -> None:
@@ -625,7 +638,7 @@ def scaling(parameters: Parameters, folder: Path, repetitions: int) -> None:
     cell = next(c for c in jobs if (c.sensor, c.real_gyros, c.virtual_gyros) == ("sparkfun", 12, 0))
     endless = jobs[cell].settings.model_copy(update={"epochs": 10**6, "decay_every": 10**6})
     job = replace(jobs[cell], settings=endless)
-    print(f"epochs per second of {_training_windows(job)} windows of {job.window} samples")
+    print(f"epochs per second of {job.windows} windows of {job.window} samples")
     ratios = []
     for _ in range(repetitions):
         rates = {}

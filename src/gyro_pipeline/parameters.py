@@ -128,9 +128,12 @@ class Training(Parameter):
 
 
 class Execution(Parameter):
-    """How the trainings are run; has no effect on their results."""
+    """How the trainings are run; has no effect on their results but rounding."""
 
-    executor: Literal["processes", "serial"]
+    executor: Literal["auto", "processes", "serial", "batched"] = Field(
+        description="many at once (on a GPU, else on the CPU), in processes or one after the other "
+        "(both on the CPU); auto: batched where there is a GPU, else processes"
+    )
     workers: int | None = Field(ge=1, description="processes; null: one per core")
 
 

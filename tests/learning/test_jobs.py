@@ -192,9 +192,10 @@ def test_the_estimated_work_is_what_is_reported():
     a_job = job()
     reported = []
     trained = run_training(a_job, reported.append)
-    assert len(reported) == len(trained.history) == 6
+    assert len(reported) == 18 + 6  # recordings of two IMUs and to validate, then epochs
+    assert reported[-6:] == [a_job.epoch_work] * len(trained.history)
     assert sum(reported) == pytest.approx(a_job.work)
-    assert job(epochs=12).work == 2 * a_job.work
+    assert job(epochs=12).work == a_job.work + 6 * a_job.epoch_work
     assert job(train=range(1, 5)).work < a_job.work
 
 

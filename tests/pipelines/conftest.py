@@ -51,11 +51,16 @@ class World:
         names = "study recordings roles windows_s seeds only training virtual".split()
         return plan(**{name: getattr(self, name) for name in names})
 
-    def train(self, tracked: Sequence[StoredRun] = (), cells: Any = None) -> list[TrainedRun]:
+    def train(
+        self,
+        tracked: Sequence[StoredRun] = (),
+        cells: Any = None,
+        execution: Execution = SERIAL,
+    ) -> list[TrainedRun]:
         names = "recordings bias roles training splits virtual_gyros virtual".split()
         given = {name: getattr(self, name) for name in names}
         cells = self.plan() if cells is None else cells
-        return list(train(cells=cells, tracked=list(tracked), execution=SERIAL, **given))
+        return list(train(cells=cells, tracked=list(tracked), execution=execution, **given))
 
 
 @pytest.fixture(scope="session")

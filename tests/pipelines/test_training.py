@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.parameters import Only
+from gyro_pipeline.parameters import Execution, Only
 from gyro_pipeline.pipelines.training import nodes
 from gyro_pipeline.pipelines.training.nodes import Devices
 from gyro_pipeline.studies import CNN, HOLD_OUT, MEAN, Cell
@@ -244,6 +244,29 @@ def test_training_again_gives_the_same_weights(world, trained):
         assert torch.equal(weights, last.artifacts[WEIGHTS]["last"][name])
 
 
+def test_training_all_at_once_gives_the_same_runs(world, trained):
+    """The same plan, the same identities, and weights that differ by rounding."""
+    at_once = world.train(execution=Execution(executor="batched", workers=None))
+    found = {run.tags[FINGERPRINT]: run for run in at_once}
+    assert len(found) == len(trained)
+    for run in trained:
+        twin = found[run.tags[FINGERPRINT]]
+        assert twin.params == run.params
+        if run.params["estimator"] == CNN:
+            assert twin.tags["engine"].startswith("batched c")  # pu or uda
+            assert run.tags["engine"] in {"fused", "cpu"}
+            for name, weights in run.artifacts[WEIGHTS]["last"].items():
+                got = twin.artifacts[WEIGHTS]["last"][name]
+                torch.testing.assert_close(got, weights, rtol=0, atol=1e-5)
+            pd.testing.assert_frame_equal(twin.history, run.history, rtol=1e-4)
+
+
+def test_jobs_that_differ_in_their_seed_alone_are_of_one_cell(world):
+    cells = [cell(seed=0), cell(seed=1), cell(virtual_gyros=3)]
+    first, seed, more = (devices(world).job("", one, world.training) for one in cells)
+    assert first.cell == seed.cell != more.cell
+
+
 def test_seeds_differ(world, trained):
     only = Only(real_gyros=3, virtual_gyros=0)
     other = replace(world, seeds=[1], only=only).train()[-1]
@@ -256,10 +279,11 @@ def test_seeds_differ(world, trained):
 
 @pytest.fixture
 def no_training(monkeypatch):
-    def refuse(job, report):
-        raise AssertionError(f"{job.name} is trained")
+    def refuse(jobs, *_):
+        assert [job.name for job in jobs] == []
+        return iter(())
 
-    monkeypatch.setattr(nodes, "run_training", refuse)
+    monkeypatch.setattr(nodes, "run_trainings", refuse)
 
 
 @pytest.mark.usefixtures("no_training")

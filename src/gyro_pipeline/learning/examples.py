@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from gyro_pipeline.conventions import InputError
@@ -40,8 +41,8 @@ class Device:
 
     def samples(self) -> Iterator[np.ndarray]:
         """The recordings one by one, shape (gyroscopes, samples), deg/s."""
-        rows = self.recordings.get_index("recording").get_indexer(self.numbers)
-        imus = self.recordings.get_index("imu").get_indexer(self.imus)
+        rows = self.recordings.get_index("recording").get_indexer(pd.Index(self.numbers))
+        imus = self.recordings.get_index("imu").get_indexer(pd.Index(self.imus))
         for first in range(0, len(rows), _READ_AT_ONCE):
             wanted = rows[first : first + _READ_AT_ONCE]
             # what lies between them as well, as single ones are found far more slowly

@@ -1,5 +1,6 @@
-"""Running pure jobs one after the other, or in one process per core."""
+"""Running pure jobs one after the other, in one process per core, or many at once."""
 
+import heapq
 import logging
 import multiprocessing
 import os
@@ -7,10 +8,11 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from typing import Any, Protocol, TypeVar
 
+import numpy as np
 from tqdm import tqdm
 
 from gyro_pipeline.parameters import Execution
@@ -30,7 +32,16 @@ class Job(Protocol):
         """Estimated cost, in the unit that the job reports."""
 
 
+class Batch(Job, Protocol):
+    """Jobs that are run at once; the work is that of all of them."""
+
+    @property
+    def size(self) -> int:
+        """How many."""
+
+
 J = TypeVar("J", bound=Job)
+B = TypeVar("B", bound=Batch)
 R = TypeVar("R")
 
 
@@ -45,7 +56,7 @@ def run_jobs(
     Args:
         jobs: Picklable, independent of each other.
         function: At module level; calls ``report`` with the work done since its last call.
-        execution: Which executor, and how many workers.
+        execution: ``serial``, or else processes; how many workers.
         label: Names the work in progress lines.
 
     Yields:
@@ -56,14 +67,35 @@ def run_jobs(
         return
     serial = execution.executor == "serial"
     workers = 1 if serial else min(execution.workers or available_cores(), len(ordered))
-    progress = _Progress(label, len(ordered), sum(job.work for job in ordered), workers)
-    run = _run_serially if serial else _run_in_processes
-    try:
-        for job, result in run(ordered, function, workers, progress):
-            progress.one_finished()
-            yield job, result
-    finally:
-        progress.close()
+    progress = _Progress(label, len(ordered), [job.work for job in ordered], workers)
+    logger.info("%s: %d trainings on %d processes", label, len(ordered), workers)
+    if serial:
+        results = _run_serially(ordered, function, progress)
+    else:
+        results = _run_in_processes(ordered, function, workers, progress)
+    yield from _watched(results, progress)
+
+
+def run_batches(
+    batches: Sequence[B], function: Callable[[B, Report], Iterator[R]], label: str
+) -> Iterator[R]:
+    """Run ``function(batch, report)`` for one batch after the other, in this process.
+
+    Args:
+        batches: Each of ``size`` trainings that are made at once.
+        function: Yields the batch's results as they finish; calls ``report`` like a job's.
+        label: Names the work in progress lines.
+
+    Yields:
+        What the function yields.
+    """
+    if not batches:
+        return
+    size = sum(batch.size for batch in batches)
+    progress = _Progress(label, size, [batch.work for batch in batches], 1)
+    logger.info("%s: %d trainings, %d at once", label, size, max(b.size for b in batches))
+    results = (result for batch in batches for result in function(batch, progress.advance))
+    yield from _watched(results, progress)
 
 
 def available_cores() -> int:
@@ -71,49 +103,104 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-class _Progress:
-    """A bar on a terminal, a plain line every half minute elsewhere; both from the work done."""
+class _Plan:
+    """How long it takes workers to do works, each taking the next one when it has none.
 
-    def __init__(self, label: str, jobs: int, work: float, workers: int) -> None:
-        self._label, self._jobs, self._work = label, jobs, work
+    Time is in units of work: one worker does a unit in a unit of time. At the end, when there are
+    fewer works left than workers, the same work takes longer.
+    """
+
+    def __init__(self, works: Sequence[float], workers: int) -> None:
+        ends = [0.0] * workers
+        for work in works:
+            heapq.heapreplace(ends, ends[0] + work)
+        self._times = np.array([0.0, *sorted(ends)])
+        self._works = np.minimum.outer(self._times, ends).sum(1)
+        self.end = float(self._times[-1])
+
+    def time(self, done: float) -> float:
+        """When so much work is done by all workers."""
+        return float(np.interp(done, self._works, self._times))
+
+
+class _Progress:
+    """A bar on a terminal, a plain line every half minute elsewhere; both from the work done.
+
+    Time left is what the plan has left, at the pace since every worker has reported work: what came
+    before, processes that start and import, does not come again. A pace of late would jump with
+    every preparation, which is reported only when it is done.
+    """
+
+    def __init__(self, label: str, jobs: int, works: Sequence[float], workers: int) -> None:
+        self._label, self._jobs, self._plan = label, jobs, _Plan(works, workers)
         self._finished, self._done = 0, 0.0
         self._started = self._logged = time.monotonic()
-        logger.info("%s: %d trainings on %d processes", label, jobs, workers)
+        self._paced_from: tuple[float, float] | None = None  # the clock's time and the plan's
         self._bar = tqdm(
-            total=work,
-            unit=" samples",
-            unit_scale=True,
-            smoothing=0.05,
+            total=self._plan.end,
+            bar_format="{desc}{percentage:3.0f}%|{bar}| {elapsed}{postfix}",
             dynamic_ncols=True,
             desc=f"{label} 0/{jobs}",
             disable=not sys.stderr.isatty(),
         )
 
-    def advance_to(self, done: float) -> None:
-        self._bar.update(done - self._done)
-        self._done = done
-        if self._bar.disable and time.monotonic() - self._logged >= _LOG_EVERY_S:
+    def advance(self, work: float) -> None:
+        """Note work done since this was last called."""
+        self.advance_to(self._done + work)
+
+    def advance_to(self, done: float, all_at_work: bool = True) -> None:
+        """Note all work done so far, and whether every worker has had its part in it."""
+        before, self._done = self._plan.time(self._done), done
+        at, now = self._plan.time(done), time.monotonic()
+        if self._paced_from is None and all_at_work:
+            self._paced_from = now, at
+        self._bar.set_postfix_str(f"{self._left()} left", refresh=False)
+        self._bar.update(at - before)
+        if self._bar.disable and now - self._logged >= _LOG_EVERY_S:
+            self._logged = now
             self._log()
 
     def one_finished(self) -> None:
+        """Count a training."""
         self._finished += 1
         self._bar.set_description(f"{self._label} {self._finished}/{self._jobs}")
 
     def close(self) -> None:
+        """Say how long it took."""
         self._bar.close()
         if self._finished:
             seconds = time.monotonic() - self._started
             logger.info("%s: %d trainings in %s", self._label, self._finished, _clock(seconds))
 
+    def seconds_left(self) -> float | None:
+        """At the pace so far; None before there is one."""
+        at = self._plan.time(self._done)
+        if self._paced_from is None or at <= self._paced_from[1]:
+            return None
+        then, was = self._paced_from
+        return (self._plan.end - at) * (time.monotonic() - then) / (at - was)
+
+    def _left(self) -> str:
+        seconds = self.seconds_left()
+        return "unknown" if seconds is None else _clock(seconds)
+
     def _log(self) -> None:
-        self._logged = time.monotonic()
-        rate = self._done / (self._logged - self._started)
-        left = _clock((self._work - self._done) / rate) if rate else "unknown"
         logger.info(
-            "%s: %d of %d trainings done, %.0f %%, %.0f million samples/s, %s left",
+            "%s: %d of %d trainings done, %.0f %%, %s left",
             *(self._label, self._finished, self._jobs),
-            *(100 * self._done / self._work, rate / 1e6, left),
+            *(100 * self._plan.time(self._done) / self._plan.end, self._left()),
         )
+
+
+def _watched(results: Generator[R, None, None], progress: _Progress) -> Iterator[R]:
+    """The same results, counted."""
+    try:
+        for result in results:
+            progress.one_finished()
+            yield result
+    finally:
+        results.close()  # now, not when it is collected: it ends the workers
+        progress.close()
 
 
 def _clock(seconds: float) -> str:
@@ -121,30 +208,24 @@ def _clock(seconds: float) -> str:
 
 
 def _run_serially(
-    jobs: Sequence[J], function: Callable[[J, Report], R], workers: int, progress: _Progress
-) -> Iterator[tuple[J, R]]:
-    done = 0.0
-
-    def report(work: float) -> None:
-        nonlocal done
-        done += work
-        progress.advance_to(done)
-
+    jobs: Sequence[J], function: Callable[[J, Report], R], progress: _Progress
+) -> Generator[tuple[J, R], None, None]:
     for job in jobs:
-        yield job, function(job, report)
+        yield job, function(job, progress.advance)
 
 
 def _run_in_processes(
     jobs: Sequence[J], function: Callable[[J, Report], R], workers: int, progress: _Progress
-) -> Iterator[tuple[J, R]]:
+) -> Generator[tuple[J, R], None, None]:
     spawn = multiprocessing.get_context("spawn")
-    done = spawn.Value("d", 0.0)
-    pool = ProcessPoolExecutor(workers, spawn, initializer=_start_worker, initargs=(done,))
+    done, at_work = spawn.Value("d", 0.0), spawn.Value("i", 0)
+    shared = (done, at_work)
+    pool = ProcessPoolExecutor(workers, spawn, initializer=_start_worker, initargs=shared)
     try:
         pending = {pool.submit(_call, function, job): job for job in jobs}
         while pending:
             finished, _ = wait(pending, timeout=_POLL_S, return_when=FIRST_COMPLETED)
-            progress.advance_to(done.value)
+            progress.advance_to(done.value, at_work.value >= workers)
             for future in finished:
                 yield pending.pop(future), future.result()
     except BaseException:  # also an interrupt, or a consumer that stops asking
@@ -157,11 +238,13 @@ def _run_in_processes(
 
 _done: Any = None
 """In a worker: work done by all workers, shared with the parent."""
+_at_work: Any = None
+"""How many workers have reported work; None in one that has."""
 
 
-def _start_worker(done: Any) -> None:
-    global _done  # noqa: PLW0603 - the one way to hand a worker what cannot be pickled
-    _done = done
+def _start_worker(done: Any, at_work: Any) -> None:
+    global _done, _at_work  # noqa: PLW0603 - the one way to hand a worker what cannot be pickled
+    _done, _at_work = done, at_work
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
@@ -178,5 +261,10 @@ def _call(function: Callable[[J, Report], R], job: J) -> R:
 
 
 def _report(work: float) -> None:
+    global _at_work  # noqa: PLW0603
     with _done.get_lock():
         _done.value += work
+    if _at_work is not None:
+        with _at_work.get_lock():
+            _at_work.value += 1
+        _at_work = None

@@ -1,8 +1,7 @@
 """One training as a pure job: everything it needs comes in, everything it makes goes out."""
 
-import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -13,6 +12,7 @@ import torch
 from gyro_pipeline.learning import fused
 from gyro_pipeline.learning.examples import (
     Device,
+    Examples,
     Scaling,
     scaled_examples,
     training_examples,
@@ -20,11 +20,16 @@ from gyro_pipeline.learning.examples import (
 from gyro_pipeline.learning.fused import FusedEngine
 from gyro_pipeline.learning.network import Architecture, CalibrationNetwork
 from gyro_pipeline.learning.packing import pack, to_bfloat16
-from gyro_pipeline.learning.trainer import TorchEngine, predict, train
+from gyro_pipeline.learning.trainer import TorchEngine, Trained, predict, train
 from gyro_pipeline.parameters import Training
 
-_EPOCH_OVERHEAD = 500_000
-"""What an epoch costs beside its training samples, mostly validation, in samples; measured."""
+# What a training costs, in samples of three gyroscopes (0.8 ns); measured in every cell.
+_EPOCH_OVERHEAD = 800_000
+"""Of an epoch beside its training samples, mostly validation."""
+_LARGE = 15_000_000
+"""So many samples cost twice as much each as a few, which stay in the caches."""
+RECORDING_WORK = 500_000
+"""To read, scale and pack one."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,8 @@ class TrainingJob:
         window: Samples.
         settings: The network's sizes and schedule.
         seed: Of the initial weights and the order of examples.
+        cell: Equal for jobs that differ in their seeds alone, so that they can share examples;
+            None where that is not known.
     """
 
     name: str
@@ -46,6 +53,7 @@ class TrainingJob:
     window: int
     settings: Training
     seed: int
+    cell: Hashable = None
 
     @property
     def architecture(self) -> Architecture:
@@ -54,16 +62,28 @@ class TrainingJob:
         return sized(self.settings, gyroscopes, self.window)
 
     @property
+    def windows(self) -> int:
+        """Training examples."""
+        per_recording = self.devices[0].recordings.sizes["sample"] // self.window
+        return per_recording * sum(len(device.numbers) for device in self.devices)
+
+    @property
+    def recordings(self) -> int:
+        """Read for training and validation; IMUs side by side count once."""
+        used = [*self.devices, *([self.validation] if self.validation else [])]
+        return sum(len(device.numbers) for device in used)
+
+    @property
     def epoch_work(self) -> float:
         """Estimated cost of an epoch, in samples of three gyroscopes."""
-        per_recording = self.devices[0].recordings.sizes["sample"] // self.window
-        windows = per_recording * sum(len(device.numbers) for device in self.devices)
-        return windows * self.window * len(self.devices[0].imus) + _EPOCH_OVERHEAD
+        samples = self.windows * self.window * len(self.devices[0].imus)
+        return samples * (1 + samples / _LARGE) + _EPOCH_OVERHEAD
 
     @property
     def work(self) -> float:
         """Estimated cost of the training, in samples of three gyroscopes."""
-        return self.epoch_work * len(self.settings.learning_rates())
+        epochs = len(self.settings.learning_rates())
+        return self.recordings * RECORDING_WORK + epochs * self.epoch_work
 
 
 @dataclass(frozen=True)
@@ -77,41 +97,71 @@ class TrainedNetwork:
 
 
 def run_training(job: TrainingJob, report: Callable[[float], None]) -> TrainedNetwork:
-    """Run one training on one thread, or on the GPU where there is one.
+    """Run one training on one thread of the processor.
 
     Args:
         job: What to train.
-        report: Told the work done after every epoch.
+        report: Told the work done after every recording that is prepared, and after every epoch.
 
     Returns:
         Weights at the last and the best validation epoch with all that an estimate needs.
     """
     started = time.time()
-    device = "cuda" if torch.cuda.is_available() else "cpu"
     torch.set_num_threads(1)
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # cuBLAS repeats itself with this
-    torch.use_deterministic_algorithms(True, warn_only=device == "cuda")
-    architecture = job.architecture
-    examples, scaling = training_examples(job.devices, architecture, job.settings.centring)
-    validation = (
-        None if job.validation is None else scaled_examples(job.validation, architecture, scaling)
-    )
+    torch.use_deterministic_algorithms(True)
+    examples, validation, scaling = prepared(job, lambda: report(RECORDING_WORK))
     if job.settings.precision == "bfloat16":
         examples = replace(examples, inputs=to_bfloat16(examples.inputs))
-    network = initial_network(architecture, job.seed)
-    network.to(device)
-    shuffling = torch.Generator().manual_seed(job.seed)
-    compiled = device == "cpu" and fused.available(job.settings.precision)
+    compiled = fused.available(job.settings.precision)
     trained = train(
-        network,
+        initial_network(job.architecture, job.seed),
         examples,
         validation,
         job.settings,
-        shuffling,
+        shuffling(job.seed),
         after_epoch=lambda: report(job.epoch_work),
         engine=FusedEngine if compiled else TorchEngine,
     )
-    artifact = {
+    artifact = stored(job.architecture, scaling, trained)
+    return TrainedNetwork(artifact, trained.history, started, "fused" if compiled else "cpu")
+
+
+@dataclass(frozen=True)
+class _Watched(Device):
+    """A device that tells when one of its recordings has been used."""
+
+    after_each: Callable[[], None]
+
+    def samples(self) -> Iterator[np.ndarray]:
+        """See :class:`Device`."""
+        for samples in super().samples():
+            yield samples
+            self.after_each()
+
+
+def prepared(
+    job: TrainingJob, after_each: Callable[[], None]
+) -> tuple[Examples, Examples | None, Scaling]:
+    """Training and validation examples, and the scaling of both; the same for every seed.
+
+    Args:
+        job: What to prepare for.
+        after_each: Called after every recording, ``job.recordings`` times.
+    """
+
+    def watched(device: Device) -> Device:
+        return _Watched(device.recordings, device.bias, device.imus, device.numbers, after_each)
+
+    devices, a = [watched(device) for device in job.devices], job.architecture
+    examples, scaling = training_examples(devices, a, job.settings.centring)
+    if job.validation is None:
+        return examples, None, scaling
+    return examples, scaled_examples(watched(job.validation), a, scaling), scaling
+
+
+def stored(architecture: Architecture, scaling: Scaling, trained: Trained) -> dict[str, Any]:
+    """The artifact of a training: plain values and tensors."""
+    return {
         "architecture": asdict(architecture),
         "scaling": {
             "centre": torch.from_numpy(scaling.centres[0]),
@@ -122,7 +172,6 @@ def run_training(job: TrainingJob, report: Callable[[float], None]) -> TrainedNe
         "best": trained.best,
         "best_epoch": trained.best_epoch,
     }
-    return TrainedNetwork(artifact, trained.history, started, "fused" if compiled else device)
 
 
 def sized(settings: Training, gyroscopes: int, window: int) -> Architecture:
@@ -136,6 +185,11 @@ def initial_network(architecture: Architecture, seed: int) -> CalibrationNetwork
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return CalibrationNetwork(architecture)
+
+
+def shuffling(seed: int) -> torch.Generator:
+    """Draws the order of the examples, and nothing else."""
+    return torch.Generator().manual_seed(seed)
 
 
 class NetworkEstimator:

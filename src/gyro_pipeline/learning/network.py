@@ -93,7 +93,7 @@ class CalibrationNetwork(nn.Module):
         weight = self.convolution.weight
         if packed.dtype == torch.bfloat16:
             packed = packed.float()
-            weight = weight + (weight.bfloat16().float() - weight).detach()
+            weight = as_bfloat16(weight)
         # (channels, gyroscopes, kernel) -> (channels, width, 1, taps): one tap is one block.
         weight = functional.pad(weight, (0, taps * a.stride - a.kernel))
         weight = weight.unflatten(2, (taps, a.stride)).permute(0, 1, 3, 2).flatten(1, 2)
@@ -107,3 +107,8 @@ class CalibrationNetwork(nn.Module):
     def _head(self, pooled: Tensor) -> Tensor:
         features = functional.leaky_relu(pooled, SLOPE).flatten(1)  # (n, pooled * channels)
         return self.output(functional.leaky_relu(self.hidden(features), SLOPE))
+
+
+def as_bfloat16(weight: Tensor) -> Tensor:
+    """The nearest numbers of bfloat16, with the gradient of what was not rounded."""
+    return weight + (weight.bfloat16().to(weight.dtype) - weight).detach()

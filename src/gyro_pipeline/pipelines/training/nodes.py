@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import pandas as pd
@@ -10,10 +11,19 @@ import xarray as xr
 
 from gyro_pipeline.conventions import AXES, TEST_IMU, TRAIN, VALIDATION, InputError
 from gyro_pipeline.fingerprints import code_hash, fingerprint
-from gyro_pipeline.learning import examples, fused, jobs, network, packing, trainer
+from gyro_pipeline.learning import (
+    batched,
+    examples,
+    fused,
+    jobs,
+    network,
+    packing,
+    trainer,
+    trainings,
+)
 from gyro_pipeline.learning.examples import Device
-from gyro_pipeline.learning.executors import run_jobs
-from gyro_pipeline.learning.jobs import TrainingJob, run_training
+from gyro_pipeline.learning.jobs import TrainingJob
+from gyro_pipeline.learning.trainings import run_trainings
 from gyro_pipeline.parameters import Execution, Only, Splits, Study, Training, VirtualGyros
 from gyro_pipeline.protocol.splits import check_roles, with_role
 from gyro_pipeline.protocol.windows import window_size
@@ -59,8 +69,8 @@ def plan(
     cells = over_folds(cells, folds, only)
     for cell in cells:
         _check(cell, recordings, training)
-    compiled = [path.read_text() for path in fused.SOURCES]
-    code = [code_hash([examples, fused, jobs, network, packing, trainer]), *compiled]
+    modules = [batched, examples, fused, jobs, network, packing, trainer, trainings]
+    code = [code_hash(modules), *(path.read_text() for path in fused.SOURCES)]
     rows = []
     for cell in cells:
         content = cell.content | {"recordings": recordings.attrs["data_hash"]}
@@ -136,11 +146,7 @@ def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
             yield run(fp, time.time(), {})
     devices = Devices(recordings, _labelled(bias), roles, virtual, virtual_gyros)
     todo = [devices.job(fp, planned[fp], training) for fp in to_train]
-    if todo:
-        fused.available(
-            training.precision
-        )  # compiles it, or says why not, before the workers need it
-    for job, trained in run_jobs(todo, run_training, execution, label):
+    for job, trained in run_trainings(todo, execution, label):
         artifacts = {WEIGHTS: trained.artifact, HISTORY: trained.history}
         ended = {
             "best_epoch": str(trained.artifact["best_epoch"]),
@@ -179,6 +185,7 @@ class Devices:
             window=window_size(cell.window_s, rate_hz, samples, cell.sensor),
             settings=training,
             seed=cell.seed,
+            cell=replace(cell, seed=0),
         )
 
     def _real(self, imus: tuple[int, ...], fold: int, role: str) -> Device:
