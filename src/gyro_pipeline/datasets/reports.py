@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from gyro_pipeline.conventions import InputError, Missing
 from gyro_pipeline.datasets.atomic import replacing
-from gyro_pipeline.datasets.tables import Table
+from gyro_pipeline.datasets.tables import Table, read_table
 
 _PNG_DPI = 160
 _WITHOUT_EXPONENT = 1e4
@@ -64,7 +64,7 @@ class ReportTable(AbstractDataset[pd.DataFrame | Missing, pd.DataFrame]):
 
     def load(self) -> pd.DataFrame:
         """Read the table, all digits of it."""
-        return Table(str(self._csv)).load()
+        return read_table(self._csv)
 
     def save(self, data: pd.DataFrame | Missing) -> None:
         """Write the three files, or remove those of a result that can no longer be made.
