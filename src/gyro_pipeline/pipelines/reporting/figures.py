@@ -88,7 +88,7 @@ def gyroscopes_10s(results: pd.DataFrame, published: Published) -> Figure | Miss
         axes[0].set_ylabel("RMSE against the recording's mean [mdps]")
         share_legend(figure, axes, columns=4)
         figure.suptitle(
-            f"sparkfun: Method 2, {window_s:g} s of calibration ({source_of(shown.iloc[0])})"
+            f"sparkfun: Method 2, {window_s:g} s of calibration; {source_of(shown.iloc[0])}"
         )
     return figure
 
@@ -122,9 +122,7 @@ def saving_against_turn_on_spread(
         for ax in axes[2:]:
             ax.set_xlabel("turn-on spread τ [mdps], points of a sensor side by side")
         share_legend(figure, axes, columns=3)
-        figure.suptitle(
-            f"What {window_s:g} s can save ({source_of(shown.iloc[0])} data unless said otherwise)"
-        )
+        figure.suptitle(f"What {window_s:g} s can save; {source_of(shown.iloc[0])}")
     return figure
 
 
@@ -200,7 +198,7 @@ def _on_curve(
             _draw_panel(ax, shown, curve[curve.windows == windows], windows, claims, by)
         axes[0].set_ylabel("RMSE against the recording's mean [mdps]")
         share_legend(figure, axes, columns=3)
-        figure.suptitle(f"{title} ({source_of(first)})")
+        figure.suptitle(f"{title}; {source_of(first)}")
     return figure
 
 
@@ -250,7 +248,7 @@ def _draw_panel(  # noqa: PLR0917 - what a panel shows
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter("{x:g}")
     # The curve against the recording's own mean ends at 0, which has no logarithm.
-    ax.set_ylim(bottom=0.08)
+    ax.set_ylim(0.08, 1.5 * (curve.rmse_dps / MDPS)[curve.time_s >= _TICKS_S[0]].max())
 
 
 def _draw_bars(
@@ -291,22 +289,24 @@ def _draw_savings(
         claim.time_saving_pct,
         color="black",
         ls=":",
-        label="published (with so many gyroscopes as the panel's title says)",
+        label="the paper's saving",
     )
-    ax.axvline(_COMMON_SPREAD_MDPS, color="grey", ls="--", lw=1, label="common for consumer parts")
+    ax.axvline(
+        _COMMON_SPREAD_MDPS, color="grey", ls="--", lw=1, label="common for consumer parts: 10 mdps"
+    )
     for i, (_, row) in enumerate(own.iterrows()):
         shift = 1 + 0.14 * (i - (len(own) - 1) / 2)
         label = f"network, {row.real_gyros} real, 95 % interval"
         _draw_saving(ax, row, shift, COLOURS[i], MARKERS[i], label)
     for row in others:
-        label = f"network, {row.real_gyros} real, {source_of(row)}, k-fold"
-        label = label if row.folds > 1 else label.removesuffix(", k-fold")
+        split = "k-fold" if row.folds > 1 else "hold-out"
+        label = f"network, {row.real_gyros} real, source {source_of(row)}, {split}"
         _draw_saving(ax, row, 1, "black", "*", label)
     ax.set(
         xscale="log",
         xlim=(_SPREADS_MDPS[0], _SPREADS_MDPS[-1]),
         ylim=_SAVINGS_PCT,
-        title=f"{claim.sensor}, published with {claim.real_gyros} gyroscopes",
+        title=f"{claim.sensor}; the paper's with {claim.real_gyros} gyroscopes",
     )
     ax.xaxis.set_major_formatter("{x:g}")
 
