@@ -8,7 +8,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gyro_pipeline.conventions import ALL, FIRST, MDPS, PAPER, Missing
 from gyro_pipeline.parameters import Published, PublishedResult
@@ -228,7 +228,7 @@ def _draw_panel(  # noqa: PLR0917 - what a panel shows
         ax.errorbar(
             rows.window_s * shift,
             rmse,
-            yerr=[rmse - lo, hi - rmse],
+            yerr=_reach(rmse, lo, hi),
             fmt=MARKERS[i],
             color=COLOURS[i],
             capsize=2.5,
@@ -262,7 +262,7 @@ def _draw_bars(
         places,
         rmse,
         0.6,
-        yerr=[rmse - lo, hi - rmse],
+        yerr=_reach(rmse, lo, hi),
         color=COLOURS[0],
         capsize=3,
         label="network, 95 % interval",
@@ -314,8 +314,8 @@ def _draw_savings(
 def _draw_saving(  # noqa: PLR0917 - what a point shows
     ax: Axes, row: pd.Series, shift: float, colour: str, marker: str, label: str
 ) -> None:
-    spread, low, high = (equal_spread(row, bound) / MDPS for bound in ("", "_hi", "_lo"))
-    x = np.clip([spread * shift, low, high], _SPREADS_MDPS[0], _SPREADS_MDPS[-1])
+    spreads = np.array([equal_spread(row, bound) for bound in ("", "_hi", "_lo")]) / MDPS
+    x = np.clip(spreads * shift, _SPREADS_MDPS[0], _SPREADS_MDPS[-1])
     saving, lo, hi = (
         float(np.clip(row[f"time_saving_pct_{ALL}{end}"], *_SAVINGS_PCT))
         for end in ("", "_lo", "_hi")
@@ -324,8 +324,8 @@ def _draw_saving(  # noqa: PLR0917 - what a point shows
     ax.errorbar(
         x[0],
         saving,
-        yerr=[[saving - lo], [hi - saving]],
-        xerr=[[x[0] - x[1]], [x[2] - x[0]]] if np.isfinite(x).all() else None,
+        yerr=_reach([saving], [lo], [hi]),
+        xerr=_reach(x[:1], x[1:2], x[2:]),
         fmt=outside.get(saving, marker),
         color=colour,
         capsize=2.5,
@@ -333,6 +333,13 @@ def _draw_saving(  # noqa: PLR0917 - what a point shows
         clip_on=False,
         label=label,
     )
+
+
+def _reach(values: ArrayLike, lo: ArrayLike, hi: ArrayLike) -> NDArray[np.float64]:
+    """Lengths of error bars, shape (2, n); a bootstrap interval need not hold its value."""
+    given = np.asarray(values, np.float64)
+    lengths = [given - np.asarray(lo, np.float64), np.asarray(hi, np.float64) - given]
+    return np.maximum(lengths, 0.0)
 
 
 def _suffix(windows: str) -> str:
