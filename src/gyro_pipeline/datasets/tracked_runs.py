@@ -124,6 +124,7 @@ class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
     def _stored(self, run: Run, study: str) -> StoredRun:
         return StoredRun(
             run_id=run.info.run_id,
+            experiment_id=run.info.experiment_id,
             study=study,
             finished=run.info.status == RunStatus.to_string(RunStatus.FINISHED),
             started_ms=run.info.start_time,

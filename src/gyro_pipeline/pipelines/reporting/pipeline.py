@@ -16,6 +16,7 @@ from gyro_pipeline.pipelines.reporting.nodes import (
     sparkfun_12_real,
     three_gyroscopes,
 )
+from gyro_pipeline.pipelines.reporting.report import write_report
 
 _Makers = Mapping[str, Sequence[Callable[..., Any]]]
 
@@ -30,7 +31,7 @@ def create_pipeline(studies: Mapping[str, Sequence[str]]) -> Pipeline:
     Args:
         studies: All sensors of each study.
     """
-    nodes, gaps = [], []
+    nodes, gaps, reported = [], [], []
     for study, sensors in studies.items():
         stage = f"{study}.reporting"
         pooled = [f"{stage}.results", f"{stage}.curves"]
@@ -46,6 +47,7 @@ def create_pipeline(studies: Mapping[str, Sequence[str]]) -> Pipeline:
                 namespace="reporting",
             )
         )
+        reported += [pooled[0], *runs]
         made: list[tuple[Callable[..., Any], str, list[str]]] = [
             (results_table, f"{stage}.tables.results", pooled[:1])
         ]
@@ -59,15 +61,25 @@ def create_pipeline(studies: Mapping[str, Sequence[str]]) -> Pipeline:
         for function, output, inputs in made:
             gap = f"{stage}.gaps.{function.__name__}"
             gaps.append(gap)
+            reported.append(output)
             name = f"{function.__name__}_{study}"
             nodes.append(Node(function, inputs, [output, gap], name=name, namespace="reporting"))
-    nodes.append(
+    given = {name: f"params:{name}" for name in ("source", "only", "sensors", "published")}
+    suffix = "_".join(studies)
+    nodes += [
+        Node(
+            write_report,
+            given | {"folder": "reporting.folder"} | {name: name for name in [*reported, *gaps]},
+            ["reporting.report", "reporting.gaps"],
+            name=f"write_report_of_{suffix}",
+            namespace="reporting",
+        ),
         Node(
             refuse_gaps,
-            ["params:only", *gaps],
+            ["params:only", "reporting.gaps"],
             None,
-            name="refuse_gaps_in_" + "_".join(studies),
+            name=f"refuse_gaps_in_{suffix}",
             namespace="reporting",
-        )
-    )
+        ),
+    ]
     return Pipeline(nodes)
