@@ -27,6 +27,7 @@ PIPELINES = {
     "reporting",
 }
 MEMORY = "kedro.io.MemoryDataset"
+SHARED = {"mlflow.db", "data/08_reporting/report"}  # by all sources
 
 # The package says so itself, but pytest sets filters of its own.
 pytestmark = pytest.mark.filterwarnings("ignore:One or more dataset names contain")
@@ -135,6 +136,8 @@ def test_every_pattern_is_used(pipelines):
         ("dot.raw_logs.files", "simulated_logs.SimulatedLogs"),
         ("augmentation.reporting.tables.results", "reports.ReportTable"),
         ("augmentation.reporting.figures.dot_3_real", "reports.ReportFigure"),
+        ("reporting.folder", "report_page.ReportFolder"),
+        ("reporting.report", "report_page.ReportPage"),
     ],
 )
 def test_names_get_their_own_kind_of_dataset(name, kind):
@@ -153,7 +156,7 @@ def test_a_studys_runs_are_narrowed_to_it_and_tracked_ones_are_not():
 def test_every_stored_path_has_the_source_and_a_name_of_its_own(pipelines, env):
     source = configuration(env)["globals"]["source"]
     stored = paths(env, datasets_of(pipelines(env)))
-    assert {path for path in stored.values() if source not in Path(path).parts} == {"mlflow.db"}
+    assert {path for path in stored.values() if source not in Path(path).parts} == SHARED
     files = [path for name, path in stored.items() if path != "mlflow.db" and "files" not in name]
     assert len(files) > 5
     assert len(files) == len(set(files))
@@ -168,7 +171,7 @@ def test_sources_never_share_a_path(pipelines):
     }
     assert set(by_source) == {"simulated", "simulated_smoke", "published"}
     base, smoke, real = by_source.values()
-    assert base & smoke == base & real == smoke & real == {"mlflow.db"}
+    assert base & smoke == base & real == smoke & real == SHARED
 
 
 @pytest.mark.parametrize("env", ["base", *ENVS])

@@ -58,7 +58,7 @@ class ReportPage(AbstractDataset[Mapping[str, Any], None]):
         return {"filepath": str(self._html)}
 
 
-class ReportFolder(AbstractDataset[None, dict[str, pd.DataFrame | Path]]):
+class ReportFolder(AbstractDataset[Any, dict[str, pd.DataFrame | Path]]):
     """All tables and figures in a folder, whichever study or program left them there.
 
     Args:
@@ -83,7 +83,7 @@ class ReportFolder(AbstractDataset[None, dict[str, pd.DataFrame | Path]]):
             found[f"figures/{path.stem}"] = path
         return found
 
-    def save(self, data: None) -> None:
+    def save(self, data: Any) -> None:
         """Refuse: its tables and figures are datasets of their own."""
         raise DatasetError(f"{self._path}: tables and figures are saved one by one")
 
