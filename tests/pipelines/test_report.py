@@ -13,7 +13,7 @@ from gyro_pipeline.datasets.report_page import ReportFolder, ReportPage
 from gyro_pipeline.datasets.reports import ReportFigure, ReportTable
 from gyro_pipeline.parameters import Only
 from gyro_pipeline.pipelines.reporting.captions import CAPTIONS
-from gyro_pipeline.pipelines.reporting.pipeline import FIGURES, TABLES
+from gyro_pipeline.pipelines.reporting.pipeline import create_pipeline
 from gyro_pipeline.pipelines.reporting.report import write_report
 from gyro_pipeline.tracking import StoredRun
 
@@ -75,16 +75,21 @@ def write(parameters, rows):
     """The report's content on these rows, with anything changed."""
 
     def make(source="simulated", only=None, folder=None, runs=None, **made):
-        base = parameters("base").model_dump()
-        base["published"] = [row for row in base["published"] if row["sensor"] == "sparkfun"]
+        base = parameters("base")
+        sensors = {name: sensor.model_dump() for name, sensor in base.sensors.items()}
+        claims = [row for row in base.published.results if row.sensor == "sparkfun"]
+        published = base.published.model_copy(update={"results": claims})
         runs = runs or [stored(0, "mean"), stored(1), stored(2)]
         given = {
             "augmentation.reporting.results": pd.DataFrame(rows),
-            "augmentation.sparkfun.evaluation.runs": runs,
+            "augmentation.reporting.measured_elsewhere": pd.DataFrame(
+                columns=["source", "run_ids"]
+            ),
+            "augmentation.reporting.all_runs": runs,
             "augmentation.reporting.tables.three_gyroscopes": TABLE,
             "augmentation.reporting.gaps.three_gyroscopes": (),
         }
-        parts = [base["sensors"], base["published"], folder or {}]
+        parts = [sensors, published, folder or {}]
         return write_report(source, only or Only(), *parts, **given | made)
 
     return make
@@ -104,10 +109,18 @@ def sentence(content, words):
 
 
 def test_every_table_and_figure_of_the_paper_has_a_caption():
-    for kind, makers in (("tables", TABLES), ("figures", FIGURES)):
-        for study, functions in makers.items():
-            for function in functions:
-                assert CAPTIONS[f"{kind}/{study}_{function.__name__}"].pipeline == study
+    made = create_pipeline({study: [] for study in ("augmentation", "real2real", "input_channels")},
+                           sensors=["sparkfun"]).all_outputs()  # fmt: skip
+    places = {
+        f"{kind}/{study.replace('.', '_')}{name}"
+        for study, _, rest in (address.partition("reporting.") for address in made)
+        for kind, _, name in [rest.partition(".")]
+        if kind in ("tables", "figures") and name != "results"
+    }
+    assert places == CAPTIONS.keys()
+    for place, caption in CAPTIONS.items():
+        name = place.split("/")[1]
+        assert name.startswith(caption.pipeline) or caption.pipeline == "reporting"
 
 
 def test_it_says_what_was_run(write):
@@ -132,8 +145,10 @@ def test_measured_recordings_are_called_so(write):
 
 def test_findings_are_counted(write):
     content, _ = write()
-    # 72/57 is within 1 - sqrt(10 / 87) = 66 %, the other three are beyond
-    assert sentence(content, "exceed the limit").startswith("3 of 4 published results exceed")
+    # 72/57 is within 1 - sqrt(10 / 87) = 66 %, the other four are beyond
+    limit = sentence(content, "exceed the limit")
+    assert limit.startswith("4 of 5 published results exceed")
+    assert "with T = 87 s on sparkfun. It holds" in limit
     # of 57 and 79, the ceiling is 57; 57 is in 50 +- 10, 79 is not in 54 +- 10
     assert sentence(content, "training set was run here") == (
         "Of the 2 published results whose training set was run here, 1 exceed the ceiling on "
@@ -165,6 +180,17 @@ def test_networks_stand_between_the_mean_and_the_ceiling(write):
     ]
 
 
+def test_results_on_measured_data_of_another_source_are_named(write):
+    measured = result(9, 10.0, source="published")
+    runs = [stored(0, "mean"), stored(1), stored(2), stored(9, simulated="0")]
+    elsewhere = pd.DataFrame([measured])
+    content, _ = write(runs=runs, **{"augmentation.reporting.measured_elsewhere": elsewhere})
+    assert dict(content["facts"])["Beside them"].endswith("recordings of published")
+    assert content["simulated"]
+    labels = [row["label"] for row in content["studies"][0]["rows"]]
+    assert labels[-1] == "sparkfun, 3 real, 10 s: A 10 % (published)"
+
+
 def test_nothing_is_said_of_a_constant_on_measured_data(write, rows):
     for row in rows:
         row["simulated"] = False
@@ -177,7 +203,7 @@ def test_a_training_that_studies_share_counts_once(write, rows):
     again = pd.DataFrame([row | {"run_ids": f"run{n + 3}"} for n, row in enumerate(rows)])
     twins = [stored(n + 3, "cnn" if n else "mean", fingerprint=f"fingerprint{n}") for n in range(3)]
     content, _ = write(
-        **{"real2real.reporting.results": again, "real2real.sparkfun.evaluation.runs": twins}
+        **{"real2real.reporting.results": again, "real2real.reporting.all_runs": twins}
     )
     assert dict(content["facts"])["Networks"].startswith("2 trained")
     assert "2 of 2 networks" in sentence(content, "At 10 s")
@@ -203,7 +229,9 @@ def test_what_is_missing_is_shown_and_named(write, rows):
     assert gaps == (COMMAND,)
     shown = item(content, "tables", "Three real gyroscopes")
     assert shown["table"] is None
-    assert shown["command"] == "kedro run --pipeline=augmentation --env=smoke"
+    assert shown["missing"] == [f"{COMMAND} --env=smoke"]
+    other = item(content, "figures", "DOT: 3 real gyroscopes and virtual ones")
+    assert other["missing"] == ["kedro run --pipeline=augmentation --env=smoke"]
     assert content["studies"][0]["missing"] == [f"{COMMAND} --env=smoke"]
 
 
@@ -281,7 +309,7 @@ def test_markdown_links_the_figures_and_says_the_same(write, page, figure, tmp_p
     assert "](simulated/figures/augmentation_dot_3_real.png)" in text
     assert (tmp_path / "simulated/figures/augmentation_dot_3_real.png").exists()
     assert "| <b>Real2Real</b> | 51 [40, 60] |" in text
-    assert "Not made: runs are missing. Run `kedro run --pipeline=augmentation --env=smoke`" in text
+    assert "Not made. What it needs comes from\n\n- `kedro run --pipeline=augmentation" in text
     assert "`7/run1`" in text
     for finding in content["findings"]:
         assert finding in text
@@ -292,7 +320,7 @@ def test_a_narrowed_run_says_why_something_is_missing(write, page, tmp_path):
     for suffix in ("html", "md"):
         text = (tmp_path / f"report.{suffix}").read_text()
         assert "Not made: this run was narrowed to sensor=sparkfun, window_s=10.0" in text
-        assert "runs are missing" not in text
+        assert "What it needs" not in text
 
 
 def test_a_page_is_only_written(page):

@@ -15,7 +15,7 @@ from markupsafe import Markup
 
 from gyro_pipeline.datasets.atomic import replacing
 from gyro_pipeline.datasets.reports import to_html, to_markdown
-from gyro_pipeline.datasets.tables import Table
+from gyro_pipeline.datasets.tables import read_table
 
 _CODE = re.compile(r"`([^`]+)`")
 
@@ -78,7 +78,7 @@ class ReportFolder(AbstractDataset[Any, dict[str, pd.DataFrame | Path]]):
         """
         found: dict[str, pd.DataFrame | Path] = {}
         for path in sorted(self._path.glob("tables/[!.]*.csv")):
-            found[f"tables/{path.stem}"] = Table(str(path)).load()
+            found[f"tables/{path.stem}"] = read_table(path)
         for path in sorted(self._path.glob("figures/[!.]*.png")):
             found[f"figures/{path.stem}"] = path
         return found

@@ -14,10 +14,11 @@ from matplotlib.figure import Figure
 
 from gyro_pipeline.conventions import InputError, Missing
 from gyro_pipeline.datasets.atomic import replacing
-from gyro_pipeline.datasets.tables import Table
+from gyro_pipeline.datasets.tables import Table, read_table
 
 _PNG_DPI = 160
 _WITHOUT_EXPONENT = 1e4
+_SENTENCE = 40  # characters
 
 _LATEX = str.maketrans(
     {
@@ -65,7 +66,7 @@ class ReportTable(AbstractDataset[pd.DataFrame | Missing, pd.DataFrame | Missing
 
     def load(self) -> pd.DataFrame | Missing:
         """Read the table, all digits of it; Missing where it was not made."""
-        return Table(str(self._csv)).load() if self._csv.is_file() else Missing(())
+        return read_table(self._csv) if self._csv.is_file() else Missing(())
 
     def save(self, data: pd.DataFrame | Missing) -> None:
         """Write the three files, or remove those of a result that can no longer be made.
@@ -172,13 +173,22 @@ def to_html(table: pd.DataFrame) -> str:
         table: Its index is not written.
 
     Returns:
-        A ``table`` with everything in it escaped; numeric columns have the class ``number``.
+        A ``table`` with everything in it escaped. Cells of numeric columns have the class
+        ``number``, sentences the class ``long``.
     """
-    marks = [' class="number"' if right else "" for right in _numeric(table)]
+    numeric = _numeric(table)
 
     def row(tag: str, texts: list[str]) -> str:
-        cells = zip(marks, texts, strict=True)
-        return "".join(f"<{tag}{mark}>{escape(text)}</{tag}>" for mark, text in cells)
+        classes = [
+            "number" if right else "long" if len(text) > _SENTENCE else ""
+            for right, text in zip(numeric, texts, strict=True)
+        ]
+        return "".join(
+            f'<{tag} class="{kind}">{escape(text)}</{tag}>'
+            if kind
+            else f"<{tag}>{escape(text)}</{tag}>"
+            for kind, text in zip(classes, texts, strict=True)
+        )
 
     head = row("th", list(table.columns.map(str)))
     body = "\n".join(f"<tr>{row('td', texts)}</tr>" for texts in _texts(table))

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from gyro_pipeline.conventions import ALL, MDPS
-from gyro_pipeline.parameters import Published, Sensor
+from gyro_pipeline.parameters import Published, PublishedResult, Sensor
 from gyro_pipeline.physics.ceiling import best_gain, pooled
 from gyro_pipeline.protocol.scores import holm
 from gyro_pipeline.studies import CNN
@@ -50,7 +50,7 @@ def compare(networks: pd.DataFrame, sensors: Mapping[str, Sensor]) -> pd.DataFra
 def find(
     networks: pd.DataFrame,
     runs: Sequence[StoredRun],
-    published: Sequence[Published],
+    published: Published,
     sensors: Mapping[str, Sensor],
 ) -> list[str]:
     """Say what the results mean, each sentence from the numbers at hand.
@@ -64,9 +64,9 @@ def find(
     Returns:
         One paragraph each, without those for which there is nothing to count.
     """
-    told = [_beyond_any_ceiling(published, sensors)]
+    told = [_beyond_any_ceiling(published.results, sensors)]
     if not networks.empty:
-        told += [_beyond_this_ceiling(networks, published)]
+        told += [_beyond_this_ceiling(networks, published.results)]
         for window_s, of_window in networks.groupby("window_s"):
             told += [_ranked(float(str(window_s)), of_window, sensors)]
         told += [
@@ -77,23 +77,22 @@ def find(
     return [paragraph for paragraph in told if paragraph]
 
 
-def _beyond_any_ceiling(published: Sequence[Published], sensors: Mapping[str, Sensor]) -> str:
+def _beyond_any_ceiling(published: Sequence[PublishedResult], sensors: Mapping[str, Sensor]) -> str:
     known = [one for one in published if one.sensor in sensors]
     limits = [
         100 * best_gain(np.sqrt(one.window_s / sensors[one.sensor].recording_s)) for one in known
     ]
     beyond = sum(one.accuracy_gain_pct > a for one, a in zip(known, limits, strict=True))
-    lengths = {
-        one.sensor: f"{sensors[one.sensor].recording_s:g} s on {one.sensor}" for one in known
-    }
+    names = dict.fromkeys(one.sensor for one in known)
+    lengths = ", ".join(f"{sensors[name].recording_s:g} s on {name}" for name in names)
     return (
         f"{beyond} of {len(known)} published results exceed the limit A = 1 − √(T0/T), with T = "
-        f"{lengths}. It holds for white noise even if the bias is known "
-        "exactly, and no training set can move it."
+        f"{lengths}. It holds for white noise even if the bias is known exactly, and no training "
+        "set can move it."
     )
 
 
-def _beyond_this_ceiling(networks: pd.DataFrame, published: Sequence[Published]) -> str:
+def _beyond_this_ceiling(networks: pd.DataFrame, published: Sequence[PublishedResult]) -> str:
     claims = pd.DataFrame([one.model_dump() for one in published])
     ours = networks[(networks.method == 2) | (networks.real_gyros == 3)]  # noqa: PLR2004
     both = claims.merge(ours, on=[*_CELL, "real_gyros", "virtual_gyros"], suffixes=("", "_first"))

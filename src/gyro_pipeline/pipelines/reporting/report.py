@@ -18,13 +18,15 @@ Reasons = tuple[str, ...]
 Part = pd.DataFrame | Path | Missing | list[StoredRun] | Reasons
 _BASE = ("base", "local")
 _RESULTS = "_results"
+_FEW = 6
+"""So many missing commands are named where the table or figure would be."""
 
 
 def write_report(
     source: str,
     only: Only,
     sensors: dict[str, Any],
-    published: list[dict[str, Any]],
+    published: Published,
     folder: dict[str, pd.DataFrame | Path],
     **made: Part,
 ) -> tuple[dict[str, Any], Reasons]:
@@ -34,15 +36,16 @@ def write_report(
         source: Where the logs come from.
         only: What the run was narrowed to.
         sensors: All of them, as configured.
-        published: The paper's results.
+        published: What the paper states.
         folder: Tables and figures of this source, also those that other runs left there.
-        **made: By its address, what the studies of this run gave: results, evaluated runs,
-            tables, figures, and their gaps.
+        **made: By its address, what this run gave: results, also those measured elsewhere, the
+            studies' runs, tables, figures, and their gaps.
 
     Returns:
         Variables of the report's templates, and the commands that make what is missing.
     """
-    results = _results(made)
+    results = _results(made, ".reporting.results")
+    elsewhere = _results(made, ".reporting.measured_elsewhere")
     runs = {run.run_id: run for part in made.values() if isinstance(part, list) for run in part}
     used = [runs[run_id] for ids in results.run_ids.dropna() for run_id in ids.split()]
     known_sensors = {name: Sensor(**sensor) for name, sensor in sensors.items()}
@@ -55,35 +58,35 @@ def write_report(
     narrowed = ", ".join(f"{k}={v}" for k, v in only.model_dump(exclude_none=True).items())
 
     def items(places: Iterable[str]) -> list[dict[str, Any]]:
-        return [_item(p, shown.get(p), env) | {"earlier": p not in fresh} for p in places]
+        return [_item(place, shown, env) | {"earlier": place not in fresh} for place in places]
 
     content = {
         "source": source,
         "smoke": "smoke" in source,
         "simulated": bool(used) and all(run.tags["simulated"] == "1" for run in used),
-        "facts": _facts(source, narrowed, used, known_sensors),
+        "facts": _facts(source, narrowed, used, known_sensors, sorted(set(elsewhere.source))),
         "tables": items(p for p in CAPTIONS if p.startswith("tables/")),
         "figures": items(p for p in CAPTIONS if p.startswith("figures/")),
         "results": items(whole),
         "comparison": compare(networks, known_sensors),
-        "findings": find(networks, used, [Published(**row) for row in published], known_sensors),
+        "findings": find(networks, used, published, known_sensors),
         "further": items(further),
         "narrowed": narrowed,
         "studies": [
-            _study(str(name), of_study, runs, env)
-            for name, of_study in results.groupby("study", sort=False)
+            _study(name, own, elsewhere[elsewhere.study == name], runs, env)
+            for name, own in results.groupby("study", sort=False)
         ],
     }
     gaps = [reason for part in made.values() if isinstance(part, tuple) for reason in part]
     return content, tuple(dict.fromkeys(gaps))
 
 
-def _results(made: Mapping[str, Part]) -> pd.DataFrame:
-    """Results of all studies, with the column ``study``."""
+def _results(made: Mapping[str, Part], kind: str) -> pd.DataFrame:
+    """Of all studies, with the column ``study``."""
     parts = [
         part.assign(study=address.split(".", maxsplit=1)[0])
         for address, part in made.items()
-        if address.endswith(".reporting.results") and isinstance(part, pd.DataFrame)
+        if address.endswith(kind) and isinstance(part, pd.DataFrame)
     ]
     return pd.concat(parts, ignore_index=True)
 
@@ -111,7 +114,11 @@ def _env(runs: Iterable[StoredRun]) -> str:
 
 
 def _facts(
-    source: str, narrowed: str, runs: Sequence[StoredRun], sensors: Mapping[str, Sensor]
+    source: str,
+    narrowed: str,
+    runs: Sequence[StoredRun],
+    sensors: Mapping[str, Sensor],
+    elsewhere: Sequence[str],
 ) -> list[tuple[str, str]]:
     """What was run, in plain words."""
     if not runs:
@@ -136,7 +143,11 @@ def _facts(
         "Code": _code(runs),
         "Environment": ", ".join(f"`{e}`" for e in sorted({r.tags["kedro_env"] for r in runs})),
     }
-    return [*facts.items()] + ([("Narrowed to", f"`only`: {narrowed}")] if narrowed else [])
+    if narrowed:
+        facts["Narrowed to"] = f"`only`: {narrowed}"
+    if elsewhere:
+        facts["Beside them"] = f"results on measured recordings of {', '.join(elsewhere)}"
+    return [*facts.items()]
 
 
 def _data(source: str, runs: Iterable[StoredRun]) -> str:
@@ -174,22 +185,29 @@ def _code(runs: Sequence[StoredRun]) -> str:
     return f"commit {', '.join(sorted(commits))}; {'; '.join(sorted(versions))}"
 
 
-def _item(place: str, part: Part | None, env: str) -> dict[str, Any]:
-    """A table or figure with its title, caption and the command that makes it."""
+def _item(place: str, shown: Mapping[str, Part], env: str) -> dict[str, Any]:
+    """A table or figure with its title, caption and the commands that make it."""
     caption = CAPTIONS.get(place) or _plain_caption(place)
+    part, gap = shown.get(place), shown.get(f"gaps/{place.split('/', maxsplit=1)[1]}")
+    command = f"kedro run --pipeline={caption.pipeline}" if caption.pipeline else ""
+    missing = gap if isinstance(gap, tuple) and 0 < len(gap) <= _FEW else (command,)
     return {
         "anchor": place.replace("/", "-"),
         "title": caption.title,
         "caption": caption.text,
-        "command": caption.pipeline and f"kedro run --pipeline={caption.pipeline}{env}",
+        "command": command and command + env,
+        "missing": [one + env for one in missing],
         "table": _narrow(part) if isinstance(part, pd.DataFrame) else None,
         "figure": part if isinstance(part, Path) else None,
     }
 
 
 def _narrow(table: pd.DataFrame) -> pd.DataFrame:
-    """Without what the page says elsewhere: its head names the source, its end the runs."""
-    return table.drop(columns=["Source", "source", "Runs", "runs"], errors="ignore")
+    """Without what the page says elsewhere (source, section, runs), and columns of dashes."""
+    said = ["Runs", "runs", "Section"]
+    said += [name for name in ("Source", "source") if name in table and table[name].nunique() == 1]
+    said += [str(name) for name in table if (table[name] == "–").all()]
+    return table.drop(columns=said, errors="ignore")
 
 
 def _plain_caption(place: str) -> Caption:
@@ -203,17 +221,22 @@ def _plain_caption(place: str) -> Caption:
 
 
 def _study(
-    name: str, results: pd.DataFrame, runs: Mapping[str, StoredRun], env: str
+    name: Any,
+    results: pd.DataFrame,
+    elsewhere: pd.DataFrame,
+    runs: Mapping[str, StoredRun],
+    env: str,
 ) -> dict[str, Any]:
     """Which command and which runs made the results of a study, and what is missing."""
-    rows = [
-        {"label": _label(row), "runs": [runs[run_id] for run_id in row.run_ids.split()]}
-        for _, row in results[results.missing.isna()].iterrows()
-    ]
+    own = [(row, "") for _, row in results[results.missing.isna()].iterrows()]
+    others = [(row, f" ({row.source})") for _, row in elsewhere.iterrows()]
     return {
         "name": name,
         "command": f"kedro run --pipeline={name}{env}",
-        "rows": rows,
+        "rows": [
+            {"label": _label(row) + where, "runs": [runs[one] for one in row.run_ids.split()]}
+            for row, where in own + others
+        ],
         "missing": [command + env for command in results.missing.dropna()],
     }
 
