@@ -144,6 +144,12 @@ def test_names_get_their_own_kind_of_dataset(name, kind):
     assert resolver("base").resolve_pattern(name)["type"] == f"gyro_pipeline.datasets.{kind}"
 
 
+def test_kedro_viz_shows_every_dataset_in_the_layer_of_its_stage(pipelines):
+    for name in datasets_of(pipelines()):
+        layer = resolver("base").resolve_pattern(name)["metadata"]["kedro-viz"]["layer"]
+        assert layer in name.split("."), name
+
+
 def test_a_studys_runs_are_narrowed_to_it_and_tracked_ones_are_not():
     runs = resolver("base").resolve_pattern("real2real.ng.evaluation.runs")
     assert (runs["study"], runs["sensor"], runs["source"]) == ("real2real", "ng", "simulated")
