@@ -17,6 +17,7 @@ import psutil
 from kedro.io import AbstractDataset
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Param, Run, RunStatus, RunTag, ViewType
+from mlflow.exceptions import MlflowException
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.atomic import check_writable, replacing
@@ -137,7 +138,13 @@ class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
 
     def _load_artifact(self, run_id: str, name: str) -> Any:
         with tempfile.TemporaryDirectory() as folder:
-            path = Path(self._client.download_artifacts(run_id, name, folder))
+            try:
+                path = Path(self._client.download_artifacts(run_id, name, folder))
+            except MlflowException as error:
+                raise InputError(
+                    f"run {run_id}: its artifact {name} cannot be read ({error}); if the store was "
+                    "moved, `python -m gyro_pipeline.store --artifacts-in mlruns` tells it so"
+                ) from error
             return _READERS[path.suffix](path)
 
     def _save_trained(self, trained: TrainedRun) -> None:
