@@ -25,6 +25,7 @@ PIPELINES = {
     "input_channels",
     "real2real",
     "reporting",
+    "virtual_gyros",
 }
 MEMORY = "kedro.io.MemoryDataset"
 SHARED = {"mlflow.db", "data/08_reporting/report"}  # by all sources
@@ -96,6 +97,7 @@ def test_every_dataset_of_every_pipeline_has_an_entry(pipelines, env):
         "sparkfun.raw_logs.recording",
         "augmentation.sparkfun.training.run",
         "augmentation.reporting.result",
+        "reporting.table.dataset_hours",
         "sparkfun.windowed_splits.role",
         "recordings",
     ],
@@ -138,6 +140,10 @@ def test_every_pattern_is_used(pipelines):
         ("augmentation.reporting.figures.dot_3_real", "reports.ReportFigure"),
         ("reporting.folder", "report_page.ReportFolder"),
         ("reporting.report", "report_page.ReportPage"),
+        ("reporting.tables.dataset_hours", "reports.ReportTable"),
+        ("reporting.figures.allan_deviation", "reports.ReportFigure"),
+        ("real2real.reporting.measured_elsewhere", "tables.Table"),
+        ("real2real.reporting.all_runs", "tracked_runs.TrackedRuns"),
     ],
 )
 def test_names_get_their_own_kind_of_dataset(name, kind):
@@ -150,12 +156,31 @@ def test_kedro_viz_shows_every_dataset_in_the_layer_of_its_stage(pipelines):
         assert layer in name.split("."), name
 
 
+def test_data_that_a_report_may_lack_name_the_pipeline_that_makes_them(pipelines):
+    registered = pipelines()
+    stored = [
+        name
+        for name in registered["reporting"].inputs()
+        if name != "reporting.folder" and not name.startswith("params:") and "runs" not in name
+    ]
+    assert "ng.ground_truth.allan" in stored
+    for name in stored:
+        sensor = name.split(".")[0]
+        made_by = resolver("base").resolve_pattern(name)["made_by"]
+        pipeline, only = made_by.removeprefix("kedro run --pipeline=").split(" --params=")
+        assert only == f"only.sensor={sensor}"
+        assert name in registered[pipeline].all_outputs()
+
+
 def test_a_studys_runs_are_narrowed_to_it_and_tracked_ones_are_not():
     runs = resolver("base").resolve_pattern("real2real.ng.evaluation.runs")
     assert (runs["study"], runs["sensor"], runs["source"]) == ("real2real", "ng", "simulated")
     tracked = resolver("base").resolve_pattern("ng.training.tracked")
     assert "study" not in tracked
     assert tracked["sensor"] == "ng"
+    everywhere = resolver("base").resolve_pattern("real2real.reporting.all_runs")
+    assert everywhere["study"] == "real2real"
+    assert not {"sensor", "source"} & set(everywhere)
 
 
 @pytest.mark.parametrize("env", ["base", *ENVS])
@@ -185,7 +210,7 @@ def test_only_messages_between_nodes_stay_in_memory(pipelines, env):
     names = datasets_of(pipelines(env))
     kept = {name for name in names if resolver(env).resolve_pattern(name)["type"] == MEMORY}
     assert kept
-    assert all("reporting.gaps" in name for name in kept)
+    assert all(".reporting.gaps." in f".{name}" for name in kept)
 
 
 # environments

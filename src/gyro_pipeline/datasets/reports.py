@@ -20,6 +20,10 @@ _PNG_DPI = 160
 _WITHOUT_EXPONENT = 1e4
 _SENTENCE = 40  # characters
 
+_LONGEST = 35
+_BROKEN = r"p{4cm}"
+"""How LaTeX sets columns with texts of more characters than that."""
+
 _LATEX = str.maketrans(
     {
         "\\": r"\textbackslash{}",
@@ -202,16 +206,19 @@ def to_latex(table: pd.DataFrame) -> str:
         table: Its index is not written.
 
     Returns:
-        A ``tabular`` with the rules of the package ``booktabs``, for a plain article.
+        A ``tabular`` with the rules of the package ``booktabs``, for a plain article. Long texts
+        are broken into lines.
 
     Raises:
         InputError: A character that a plain article cannot set.
     """
-    alignment = "".join("r" if right else "l" for right in _numeric(table))
-    head, *body = [
-        " & ".join(_latex(cell) for cell in row) + r" \\"
-        for row in (list(table.columns.map(str)), *_texts(table))
-    ]
+    rows = [list(table.columns.map(str)), *_texts(table)]
+    long = [max(map(len, column)) > _LONGEST for column in zip(*rows, strict=True)]
+    alignment = "".join(
+        _BROKEN if broken else "r" if right else "l"
+        for broken, right in zip(long, _numeric(table), strict=True)
+    )
+    head, *body = [" & ".join(_latex(cell) for cell in row) + r" \\" for row in rows]
     begin = rf"\begin{{tabular}}{{{alignment}}}"
     lines = [begin, r"\toprule", head, r"\midrule", *body, r"\bottomrule", r"\end{tabular}"]
     return "\n".join(lines) + "\n"

@@ -8,7 +8,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gyro_pipeline.conventions import ALL, FIRST, MDPS, PAPER, Missing
 from gyro_pipeline.parameters import Published, PublishedResult
@@ -88,7 +88,7 @@ def gyroscopes_10s(results: pd.DataFrame, published: Published) -> Figure | Miss
         axes[0].set_ylabel("RMSE against the recording's mean [mdps]")
         share_legend(figure, axes, columns=4)
         figure.suptitle(
-            f"sparkfun: Method 2, {window_s:g} s of calibration ({source_of(shown.iloc[0])})"
+            f"sparkfun: Method 2, {window_s:g} s of calibration; {source_of(shown.iloc[0])}"
         )
     return figure
 
@@ -122,9 +122,7 @@ def saving_against_turn_on_spread(
         for ax in axes[2:]:
             ax.set_xlabel("turn-on spread τ [mdps], points of a sensor side by side")
         share_legend(figure, axes, columns=3)
-        figure.suptitle(
-            f"What {window_s:g} s can save ({source_of(shown.iloc[0])} data unless said otherwise)"
-        )
+        figure.suptitle(f"What {window_s:g} s can save; {source_of(shown.iloc[0])}")
     return figure
 
 
@@ -200,7 +198,7 @@ def _on_curve(
             _draw_panel(ax, shown, curve[curve.windows == windows], windows, claims, by)
         axes[0].set_ylabel("RMSE against the recording's mean [mdps]")
         share_legend(figure, axes, columns=3)
-        figure.suptitle(f"{title} ({source_of(first)})")
+        figure.suptitle(f"{title}; {source_of(first)}")
     return figure
 
 
@@ -230,7 +228,7 @@ def _draw_panel(  # noqa: PLR0917 - what a panel shows
         ax.errorbar(
             rows.window_s * shift,
             rmse,
-            yerr=[rmse - lo, hi - rmse],
+            yerr=_reach(rmse, lo, hi),
             fmt=MARKERS[i],
             color=COLOURS[i],
             capsize=2.5,
@@ -250,7 +248,7 @@ def _draw_panel(  # noqa: PLR0917 - what a panel shows
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter("{x:g}")
     # The curve against the recording's own mean ends at 0, which has no logarithm.
-    ax.set_ylim(bottom=0.08)
+    ax.set_ylim(0.08, 1.5 * (curve.rmse_dps / MDPS)[curve.time_s >= _TICKS_S[0]].max())
 
 
 def _draw_bars(
@@ -264,7 +262,7 @@ def _draw_bars(
         places,
         rmse,
         0.6,
-        yerr=[rmse - lo, hi - rmse],
+        yerr=_reach(rmse, lo, hi),
         color=COLOURS[0],
         capsize=3,
         label="network, 95 % interval",
@@ -291,22 +289,24 @@ def _draw_savings(
         claim.time_saving_pct,
         color="black",
         ls=":",
-        label="published (with so many gyroscopes as the panel's title says)",
+        label="the paper's saving",
     )
-    ax.axvline(_COMMON_SPREAD_MDPS, color="grey", ls="--", lw=1, label="common for consumer parts")
+    ax.axvline(
+        _COMMON_SPREAD_MDPS, color="grey", ls="--", lw=1, label="common for consumer parts: 10 mdps"
+    )
     for i, (_, row) in enumerate(own.iterrows()):
         shift = 1 + 0.14 * (i - (len(own) - 1) / 2)
         label = f"network, {row.real_gyros} real, 95 % interval"
         _draw_saving(ax, row, shift, COLOURS[i], MARKERS[i], label)
     for row in others:
-        label = f"network, {row.real_gyros} real, {source_of(row)}, k-fold"
-        label = label if row.folds > 1 else label.removesuffix(", k-fold")
+        split = "k-fold" if row.folds > 1 else "hold-out"
+        label = f"network, {row.real_gyros} real, source {source_of(row)}, {split}"
         _draw_saving(ax, row, 1, "black", "*", label)
     ax.set(
         xscale="log",
         xlim=(_SPREADS_MDPS[0], _SPREADS_MDPS[-1]),
         ylim=_SAVINGS_PCT,
-        title=f"{claim.sensor}, published with {claim.real_gyros} gyroscopes",
+        title=f"{claim.sensor}; the paper's with {claim.real_gyros} gyroscopes",
     )
     ax.xaxis.set_major_formatter("{x:g}")
 
@@ -314,8 +314,8 @@ def _draw_savings(
 def _draw_saving(  # noqa: PLR0917 - what a point shows
     ax: Axes, row: pd.Series, shift: float, colour: str, marker: str, label: str
 ) -> None:
-    spread, low, high = (equal_spread(row, bound) / MDPS for bound in ("", "_hi", "_lo"))
-    x = np.clip([spread * shift, low, high], _SPREADS_MDPS[0], _SPREADS_MDPS[-1])
+    spreads = np.array([equal_spread(row, bound) for bound in ("", "_hi", "_lo")]) / MDPS
+    x = np.clip(spreads * shift, _SPREADS_MDPS[0], _SPREADS_MDPS[-1])
     saving, lo, hi = (
         float(np.clip(row[f"time_saving_pct_{ALL}{end}"], *_SAVINGS_PCT))
         for end in ("", "_lo", "_hi")
@@ -324,8 +324,8 @@ def _draw_saving(  # noqa: PLR0917 - what a point shows
     ax.errorbar(
         x[0],
         saving,
-        yerr=[[saving - lo], [hi - saving]],
-        xerr=[[x[0] - x[1]], [x[2] - x[0]]] if np.isfinite(x).all() else None,
+        yerr=_reach([saving], [lo], [hi]),
+        xerr=_reach(x[:1], x[1:2], x[2:]),
         fmt=outside.get(saving, marker),
         color=colour,
         capsize=2.5,
@@ -333,6 +333,13 @@ def _draw_saving(  # noqa: PLR0917 - what a point shows
         clip_on=False,
         label=label,
     )
+
+
+def _reach(values: ArrayLike, lo: ArrayLike, hi: ArrayLike) -> NDArray[np.float64]:
+    """Lengths of error bars, shape (2, n); a bootstrap interval need not hold its value."""
+    given = np.asarray(values, np.float64)
+    lengths = [given - np.asarray(lo, np.float64), np.asarray(hi, np.float64) - given]
+    return np.maximum(lengths, 0.0)
 
 
 def _suffix(windows: str) -> str:

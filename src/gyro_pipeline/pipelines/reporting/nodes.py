@@ -159,7 +159,7 @@ def refuse_gaps(only: Only, *reasons: Reasons) -> None:
         return
     if only != Only():
         logger.info(
-            "narrowed by only: %d results or recordings of the whole report are not there yet; "
+            "narrowed by only: %d results or recordings are not there yet; "
             "`kedro run --pipeline=reporting` lists them",
             len(commands),
         )

@@ -7,11 +7,12 @@ import pandas as pd
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import AXES, MDPS, TEST_IMU
 from gyro_pipeline.parameters import GroundTruth, Published
-from gyro_pipeline.physics.allan import FLICKER_FLOOR
+from gyro_pipeline.physics.allan import FLICKER_FLOOR, SHORTEST_FIT_SAMPLES
 from gyro_pipeline.physics.bias import settling_time_s
 from gyro_pipeline.pipelines.reporting.style import CEILING, COLOURS, LOOK, share_legend
 from gyro_pipeline.pipelines.reporting.tables import source_name
@@ -19,6 +20,9 @@ from gyro_pipeline.pipelines.reporting.tables import source_name
 _GYROSCOPES = (1, 4, 10)
 _FROM_S = 1.0
 """A running mean of less is mostly off the figure."""
+
+_POINTS = 1300
+"""More points of a running mean would not be seen."""
 
 _HOUR_S = 3600
 
@@ -37,7 +41,7 @@ def running_average(
     times_s, means = _running_mean(_samples(recordings, one), recordings.attrs["rate_hz"])
     value, tolerance = one.bias_dps / MDPS, ground_truth.tolerance_mdps
     with LOOK():
-        figure = Figure(figsize=(7.5, 3.8), layout="constrained")
+        figure = Figure(figsize=(8.5, 4.2), layout="constrained")
         ax = figure.subplots()
         ax.plot(times_s, means / MDPS, color=COLOURS[0], label="running average")
         ax.axhline(value, color="black", lw=1, label="ground truth: mean of the recording")
@@ -57,8 +61,8 @@ def running_average(
         )
         _limit(ax, (means / MDPS)[times_s >= _FROM_S] - value, tolerance, value)
         ax.set(xlim=(0, times_s[-1]), xlabel="time [s]", ylabel="angular rate [mdps]")
-        share_legend(figure, [ax], columns=4)
-        figure.suptitle(f"Running average of {_name(recordings, one)}")
+        share_legend(figure, [ax], columns=2)
+        figure.suptitle(f"Running average of one gyroscope: {_name(recordings, one)}")
     return figure
 
 
@@ -73,7 +77,7 @@ def calibrated_signal(recordings: xr.Dataset, bias: pd.DataFrame) -> Figure:
     samples = _samples(recordings, one)
     times_s = np.arange(len(samples)) / recordings.attrs["rate_hz"]
     with LOOK():
-        figure = Figure(figsize=(7.5, 3.8), layout="constrained")
+        figure = Figure(figsize=(8.5, 4.2), layout="constrained")
         ax = figure.subplots()
         # as pixels also in the SVG, which would hold every sample otherwise
         style: dict[str, Any] = {"lw": 0.4, "rasterized": True}
@@ -85,7 +89,7 @@ def calibrated_signal(recordings: xr.Dataset, bias: pd.DataFrame) -> Figure:
         share_legend(figure, [ax], columns=3)
         for line in figure.legends[0].get_lines():
             line.set_linewidth(2)
-        figure.suptitle(f"Raw and calibrated signal of {_name(recordings, one)}")
+        figure.suptitle(f"Raw and calibrated signal: {_name(recordings, one)}")
     return figure
 
 
@@ -123,12 +127,12 @@ def mg_convergence(recordings: xr.Dataset, bias: pd.DataFrame, ground_truth: Gro
                 color=COLOURS[2],
                 alpha=0.2,
                 lw=0,
-                label=f"± {tolerance:g} mdps",
+                label=f"± {tolerance:g} mdps; settled: stays within from then on",
             )
             settled = float(settling_time_s(together, rate_hz, tolerance * MDPS))
             plural = "s" if count > 1 else ""
             ax.set(
-                title=f"{count} gyroscope{plural}: within from {settled:.1f} s on",
+                title=f"{count} gyroscope{plural}, settled at {settled:.1f} s",
                 xlabel="time [s]",
                 xlim=(0, times_s[-1]),
             )
@@ -137,8 +141,8 @@ def mg_convergence(recordings: xr.Dataset, bias: pd.DataFrame, ground_truth: Gro
         axes[0].set_ylabel("running average less ground truth [mdps]")
         share_legend(figure, axes, columns=3)
         figure.suptitle(
-            f"Running average of several gyroscopes, {recordings.attrs['sensor']} recording "
-            f"{one.recording} ({_source(recordings)})"
+            f"Running average of several gyroscopes: {one.sensor} recording {one.recording}; "
+            f"{_source(recordings)}"
         )
     return figure
 
@@ -152,7 +156,7 @@ def allan_deviation(published: Published, **stored: Any) -> Figure:
     """
     with LOOK():
         figure = Figure(figsize=(9.5, 7.2), layout="constrained")
-        axes = figure.subplots(2, 2).ravel()
+        axes = figure.subplots(2, 2, sharex=True, sharey=True).ravel()
         for ax, sheet in zip(axes, published.specifications, strict=True):
             recordings, allan, noise = (
                 stored[f"{sheet.sensor}_{name}"] for name in ("recordings", "allan", "noise")
@@ -167,13 +171,13 @@ def allan_deviation(published: Published, **stored: Any) -> Figure:
                     ls=":",
                     label="white noise of the datasheet",
                 )
-            ax.set_title(f"{sheet.name} ({_source(recordings)})")
+            ax.set_title(f"{sheet.name}; {_source(recordings)}")
         for ax in axes[::2]:
             ax.set_ylabel("Allan deviation [mdps]")
         for ax in axes[2:]:
             ax.set_xlabel("averaging time [s]")
         share_legend(figure, axes, columns=3)
-        figure.suptitle("Overlapping Allan deviation; N, B and K are means over gyroscopes")
+        figure.suptitle("Overlapping Allan deviation; N, B and K over all gyroscopes")
     return figure
 
 
@@ -186,9 +190,9 @@ def _draw_allan(ax: Axes, allan: xr.Dataset, noise: pd.DataFrame) -> None:
     columns = ["white_dps_rts", "instability_dps", "random_walk_dps_per_rts"]
     squares = (noise[columns] ** 2).mean()
     white, instability, walk = np.sqrt(squares)
-    model = squares.iloc[0] / times_s + FLICKER_FLOOR * squares.iloc[1]
-    model = np.sqrt(model + squares.iloc[2] * times_s / 3)
-    ax.plot(times_s, model / MDPS, color=CEILING, ls="--", lw=1.5, label="fit of N, B, K")
+    fitted_s = times_s[SHORTEST_FIT_SAMPLES * times_s[0] <= times_s]
+    model = white**2 / fitted_s + FLICKER_FLOOR * instability**2 + walk**2 * fitted_s / 3
+    ax.plot(fitted_s, np.sqrt(model) / MDPS, color=CEILING, ls="--", lw=1.5, label="fit of N, B, K")
     ax.text(
         0.04,
         0.06,
@@ -197,8 +201,10 @@ def _draw_allan(ax: Axes, allan: xr.Dataset, noise: pd.DataFrame) -> None:
         transform=ax.transAxes,
     )
     ax.set(xscale="log", yscale="log")
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_formatter("{x:g}")
+    ax.minorticks_off()
 
 
 def _first(bias: pd.DataFrame) -> pd.Series:
@@ -214,9 +220,10 @@ def _samples(recordings: xr.Dataset, one: pd.Series) -> NDArray[np.float64]:
 def _running_mean(
     samples: NDArray[np.float64], rate_hz: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Times in s, shape (n,), and the mean of all samples until then, shape (..., n)."""
-    counts = np.arange(1, samples.shape[-1] + 1)
-    return counts / rate_hz, np.cumsum(samples, axis=-1) / counts
+    """Times in s, shape (points,), and the mean of all samples until then, shape (..., points)."""
+    step = max(1, samples.shape[-1] // _POINTS)
+    counts = np.arange(step, samples.shape[-1] + 1, step)
+    return counts / rate_hz, np.cumsum(samples, axis=-1)[..., counts - 1] / counts
 
 
 def _limit(ax: Axes, shown: NDArray[np.float64], tolerance: float, middle: float = 0.0) -> None:
@@ -227,8 +234,8 @@ def _limit(ax: Axes, shown: NDArray[np.float64], tolerance: float, middle: float
 
 def _name(recordings: xr.Dataset, one: pd.Series) -> str:
     return (
-        f"one gyroscope: {one.sensor} IMU {one.imu}, axis {one.axis}, recording {one.recording} "
-        f"({_source(recordings)})"
+        f"{one.sensor} IMU {one.imu}, axis {one.axis}, recording {one.recording}; "
+        f"{_source(recordings)}"
     )
 
 

@@ -44,9 +44,10 @@ def results_table(results: pd.DataFrame, elsewhere: pd.DataFrame) -> pd.DataFram
         results: From ``pool_results``, which keeps every figure and its interval.
         elsewhere: From ``pool_measured_elsewhere``.
     """
-    made = pd.concat([results[results.missing.isna()], elsewhere]).reset_index(drop=True)
-    if made.empty:
+    own = results[results.missing.isna()]
+    if own.empty:
         return Missing(tuple(results.missing))
+    made = pd.concat([part for part in (own, elsewhere) if len(part)], ignore_index=True)
     columns = ["sensor", "estimator", "method", "real_gyros", "virtual_gyros", "window_s"]
     table = made[columns].copy()
     for windows in (ALL, FIRST):
