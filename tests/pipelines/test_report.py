@@ -127,7 +127,8 @@ def test_it_says_what_was_run(write):
     content, _ = write()
     facts = dict(content["facts"])
     assert facts["Data"].startswith("Simulated recordings (source `simulated`)")
-    assert facts["Recordings"].startswith("29.0 h")  # 12 gyroscopes, 100 recordings of 87 s
+    # 80 recordings of 12 gyroscopes and 20 of 3, of 87 s: the paper's 24.65 h
+    assert facts["Recordings"].startswith("24.6 h")
     assert facts["Networks"] == "2 trained, of 1200 epochs (the paper: 1200)"
     assert facts["Code"].startswith("commit `0123456789ab` with uncommitted changes")
     assert facts["Trained"].startswith("2023-11-14 22:13")
@@ -150,9 +151,9 @@ def test_findings_are_counted(write):
     assert limit.startswith("4 of 5 published results exceed")
     assert "with T = 87 s on sparkfun. It holds" in limit
     # of 57 and 79, the ceiling is 57; 57 is in 50 +- 10, 79 is not in 54 +- 10
-    assert sentence(content, "training set was run here") == (
-        "Of the 2 published results whose training set was run here, 1 exceed the ceiling on "
-        "these data, and 1 lie within the 95 % interval of ours."
+    assert sentence(content, "training set that was run here") == (
+        "2 published results have a training set that was run here. Beyond the ceiling on these "
+        "data: 1. Within the 95 % interval of ours: 1."
     )
     ranked = sentence(content, "At 10 s")
     assert ranked.startswith("At 10 s, 2 of 2 networks are better than the running mean")

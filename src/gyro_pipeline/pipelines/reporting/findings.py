@@ -102,9 +102,9 @@ def _beyond_this_ceiling(networks: pd.DataFrame, published: Sequence[PublishedRe
     bound = both[f"{_CEILING_GAIN}_hi"].astype(float).fillna(both[_CEILING_GAIN])
     inside = (both[f"{_GAIN}_lo"] <= claimed) & (claimed <= both[f"{_GAIN}_hi"])
     return (
-        f"Of the {len(both)} published results whose training set was run here, "
-        f"{(claimed > bound.round()).sum()} exceed the ceiling on these data, and {inside.sum()} "
-        "lie within the 95 % interval of ours."
+        f"{len(both)} published results have a training set that was run here. Beyond the ceiling "
+        f"on these data: {(claimed > bound.round()).sum()}. Within the 95 % interval of ours: "
+        f"{inside.sum()}."
     )
 
 

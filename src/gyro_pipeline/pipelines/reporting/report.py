@@ -163,15 +163,20 @@ def _recordings(sensors: Mapping[str, Sensor], simulated: bool) -> str:
     """How many hours; of measured ones, the configuration does not know the number."""
     if not simulated:
         return ", ".join(f"{name}: {one.recording_s:g} s each" for name, one in sensors.items())
-    hours = {
-        name: len(AXES) * one.imus * one.recordings * one.recording_s / 3600
-        for name, one in sensors.items()
-    }
+    seconds = [
+        len(AXES)
+        * (one.imus * one.train_recordings + one.recordings - one.train_recordings)
+        * one.recording_s
+        for one in sensors.values()
+    ]
     each = ", ".join(
         f"{name} {one.imus} × {one.recordings} of {one.recording_s:g} s"
         for name, one in sensors.items()
     )
-    return f"{sum(hours.values()):.1f} h, summed over gyroscopes (IMUs × recordings: {each})"
+    return (
+        f"{sum(seconds) / 3600:.1f} h: training recordings of every gyroscope, test recordings of "
+        f"IMU 1 (IMUs × recordings: {each})"
+    )
 
 
 def _code(runs: Sequence[StoredRun]) -> str:
