@@ -310,18 +310,20 @@ def test_markdown_links_the_figures_and_says_the_same(write, page, figure, tmp_p
     assert "](simulated/figures/augmentation_dot_3_real.png)" in text
     assert (tmp_path / "simulated/figures/augmentation_dot_3_real.png").exists()
     assert "| <b>Real2Real</b> | 51 [40, 60] |" in text
-    assert "Not made. What it needs comes from\n\n- `kedro run --pipeline=augmentation" in text
+    assert "**Not made**:\n\n- Twelve real gyroscopes: run `kedro run --pipeline=augm" in text
     assert "`7/run1`" in text
     for finding in content["findings"]:
         assert finding in text
 
 
-def test_a_narrowed_run_says_why_something_is_missing(write, page, tmp_path):
+def test_a_narrowed_run_says_why_something_is_missing(write, rows, page, tmp_path):
+    rows[2] |= {"missing": COMMAND, "run_ids": None}
     page.save(write(only=Only(sensor="sparkfun", window_s=10))[0])
     for suffix in ("html", "md"):
         text = (tmp_path / f"report.{suffix}").read_text()
-        assert "Not made: this run was narrowed to sensor=sparkfun, window_s=10.0" in text
-        assert "What it needs" not in text
+        assert "since this run was narrowed to sensor=sparkfun, window_s=10.0:" in text
+        assert "- Twelve real gyroscopes\n" in text or "<li>Twelve real gyroscopes</li>" in text
+        assert COMMAND not in text
 
 
 def test_a_page_is_only_written(page):

@@ -73,7 +73,7 @@ def write_report(
         "further": items(further),
         "narrowed": narrowed,
         "studies": [
-            _study(name, own, elsewhere[elsewhere.study == name], runs, env)
+            _study(name, own, elsewhere[elsewhere.study == name], runs, env, narrowed)
             for name, own in results.groupby("study", sort=False)
         ],
     }
@@ -201,6 +201,7 @@ def _item(place: str, shown: Mapping[str, Part], env: str) -> dict[str, Any]:
         "title": caption.title,
         "caption": caption.text,
         "command": command and command + env,
+        "made": isinstance(part, pd.DataFrame | Path),
         "missing": [one + env for one in missing],
         "table": _narrow(part) if isinstance(part, pd.DataFrame) else None,
         "figure": part if isinstance(part, Path) else None,
@@ -231,6 +232,7 @@ def _study(
     elsewhere: pd.DataFrame,
     runs: Mapping[str, StoredRun],
     env: str,
+    narrowed: str,
 ) -> dict[str, Any]:
     """Which command and which runs made the results of a study, and what is missing."""
     own = [(row, "") for _, row in results[results.missing.isna()].iterrows()]
@@ -242,7 +244,8 @@ def _study(
             {"label": _label(row) + where, "runs": [runs[one] for one in row.run_ids.split()]}
             for row, where in own + others
         ],
-        "missing": [command + env for command in results.missing.dropna()],
+        # of a run that was narrowed on purpose, nothing is
+        "missing": [] if narrowed else [command + env for command in results.missing.dropna()],
     }
 
 
