@@ -29,6 +29,8 @@ def test_after_a_move_the_artifacts_are_found_again(moved):
     (first, *_) = before = runs(moved)
     with pytest.raises(InputError, match=r"cannot be read .* `python -m gyro_pipeline.store"):
         first.load("errors.parquet")
+    with pytest.raises(InputError, match=r"moved here, where the store keeps artifacts, is not"):
+        TrackedRuns(str(moved / "mlflow.db"), "x")._experiment_id("augmentation")
     assert relocate(moved / "mlflow.db", str(moved / "mlruns")) >= len(before)
     after = runs(moved)
     assert [run.run_id for run in after] == [run.run_id for run in before]
