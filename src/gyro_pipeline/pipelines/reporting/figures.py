@@ -277,6 +277,7 @@ def _draw_bars(
     ax.plot(known, stated, **_hollow(COLOURS[1], "D"), mew=1.8, label="published")
     ax.set_xticks(places, networks.real_gyros.astype(str).tolist())
     ax.set(xlabel="gyroscopes in the training set", title=_TITLES[windows])
+    ax.set_axisbelow(True)
     ax.grid(False, axis="x")
 
 

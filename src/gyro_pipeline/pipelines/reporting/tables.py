@@ -58,7 +58,7 @@ def results_table(results: pd.DataFrame, elsewhere: pd.DataFrame) -> pd.DataFram
                 table[f"{short} {windows} %"] = made[base + suffix].round(0) + 0.0  # no "-0"
     table["ceiling mdps"] = (made.ceiling_rmse_dps / MDPS).round(3)
     table.insert(1, "source", [source_of(row) for _, row in made.iterrows()])
-    logger.info("\n%s", table.to_string(index=False, na_rep="–"))
+    logger.info("results\n%s", table.to_string(index=False, na_rep="–"))
     return table.assign(split=made.folds.map(_split), runs=made.run_ids.map(_short))
 
 
