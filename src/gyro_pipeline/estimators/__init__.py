@@ -44,6 +44,7 @@ ESTIMATORS: Mapping[str, Callable[[], FittedEstimator]] = {
     "best_linear_warm_up": lambda: BestLinear(warm_up=True),
     "best_linear_history": lambda: BestLinear(history=True),
     "ridge": Ridge,
+    "ridge_same_time": lambda: Ridge(same_time=True),
 }
 """All estimators without a network, by the name that runs and tables give them."""
 

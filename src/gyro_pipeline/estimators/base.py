@@ -1,6 +1,6 @@
 """The one interface of all estimators, and what they share."""
 
-from typing import ClassVar, Protocol, Self
+from typing import Protocol, Self
 
 import numpy as np
 import xarray as xr
@@ -20,10 +20,13 @@ class Estimator(Protocol):
     recordings. Whoever shows one of its estimates says so: ``ORIENTATION_NOTE``.
     """
 
-    recommended: ClassVar[bool]
-    """Whether it is one to use; the others are there to be compared with."""
-    uses_prior: ClassVar[bool]
-    """Whether what it learned about the bias enters its estimates."""
+    @property
+    def recommended(self) -> bool:
+        """Whether it is one to use; the others are there to be compared with."""
+
+    @property
+    def uses_prior(self) -> bool:
+        """Whether what it learned about the bias enters its estimates."""
 
     def estimate(
         self,

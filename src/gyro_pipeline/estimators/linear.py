@@ -31,6 +31,8 @@ from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, fit_recording_model
 _FLAT = 1e6
 """Prior standard deviation that tells nothing, in units of the noise of a whole recording."""
 
+_PENALTIES, _FOLDS = 41, 10
+
 
 class BestLinear:
     """The best linear predictor under the fitted noise and prior, axis by axis.
@@ -44,8 +46,8 @@ class BestLinear:
 
     The bias is the settled one, without the warm-up and the random walk since power-on.
 
-    An unseen device has the mean noise of the known ones, and their mean and spread as its prior.
-    Where fewer than three are known, the prior is flat.
+    For an unseen device the model is fitted to the recordings of all known ones, whose spread is
+    then that from unit to unit. Where fewer than three devices are known, the prior is flat.
 
     Args:
         warm_up: Whether the sensor warms up.
@@ -68,30 +70,25 @@ class BestLinear:
         """See :class:`~gyro_pipeline.estimators.FittedEstimator`.
 
         Raises:
-            InputError: Fewer than three training recordings of a device.
+            InputError: Fewer than three training recordings.
         """
-        known = known_imus(recordings, imu)
-        devices = [self._models(recordings, one) for one in known]
+        known, rate_hz = known_imus(recordings, imu), float(recordings.attrs["rate_hz"])
         seen = known == [imu]
-        self._axes = (
-            devices[0] if seen else [_unseen(models) for models in zip(*devices, strict=True)]
-        )
+        rates = np.concatenate([samples_of(recordings, one) for one in known])
+        axes = range(rates.shape[1])
+        figures: list[NoiseFigures | None] = [None for _ in axes]
+        if self._noise == "allan":
+            figures = [*allan_fit(recordings, imu)]
+        fits = [fit_recording_model(rates[:, a], rate_hz, self._warm_up, figures[a]) for a in axes]
+        self._axes = fits if seen else [_of_unseen(model, len(known)) for model in fits]
         self._histories: list[BiasHistory] | None = None
         if self._history and seen:
             numbers, labels = labels_of(recordings, imu)
             self._histories = [
-                BiasHistory.fit(numbers, labels[:, a], model) for a, model in enumerate(self._axes)
+                BiasHistory.fit(numbers, labels[:, a], model) for a, model in enumerate(fits)
             ]
         self._estimates: dict[tuple[int, int, int, str, int | None], LinearEstimate] = {}
         return self
-
-    def _models(self, recordings: xr.Dataset, imu: int) -> list[RecordingModel]:
-        rates, rate_hz = samples_of(recordings, imu), float(recordings.attrs["rate_hz"])
-        axes = range(rates.shape[1])
-        known: list[NoiseFigures | None] = [None for _ in axes]
-        if self._noise == "allan":
-            known = [*allan_fit(recordings, imu)]
-        return [fit_recording_model(rates[:, a], rate_hz, self._warm_up, known[a]) for a in axes]
 
     def estimate(
         self,
@@ -128,40 +125,31 @@ class BestLinear:
         return self._estimates[key]
 
 
-def _unseen(devices: tuple[RecordingModel, ...]) -> RecordingModel:
-    """The model of a device of the same kind as some that are known, for one axis."""
-    first = devices[0]
-    figures = np.array([[d.noise.white, d.noise.instability, d.noise.random_walk] for d in devices])
-    noise = NoiseFigures(*map(float, np.sqrt(np.mean(figures**2, axis=0))))
-    means = np.stack([device.mean for device in devices])
-    covariance = np.mean([device.covariance for device in devices], axis=0)
-    if len(devices) < FEWEST_RECORDINGS:
-        flat = _FLAT * noise.white * np.sqrt(first.rate_hz / first.samples)
-        covariance = covariance + np.diag(flat**2 * np.eye(len(first.mean))[0])
-    else:
-        between = np.atleast_2d(np.cov(means, rowvar=False))
-        covariance = covariance + between * (1 + 1 / len(devices))
-    time_constant_s = float(np.mean([device.time_constant_s for device in devices]))
-    return replace(
-        first,
-        noise=noise,
-        mean=means.mean(axis=0),
-        covariance=covariance,
-        time_constant_s=time_constant_s,
-    )
+def _of_unseen(model: RecordingModel, devices: int) -> RecordingModel:
+    """The model of a new device, from one fitted to the recordings of so many others."""
+    covariance = model.covariance * (1 + 1 / devices)
+    if devices < FEWEST_RECORDINGS:
+        covariance[0, 0] = _FLAT**2 * model.noise_covariance(np.array([0, model.samples]))[0, 0]
+    return replace(model, covariance=covariance)
 
 
 class Ridge:
     """Ridge regression of the target on the block means of the window.
 
-    It knows no model: one regression per axis and place of the window, from training windows of
-    the same time after power-on, towards the training mean. The penalty is the one with the least
-    leave-one-recording-out error on the training recordings. The bias is learned from the mean of
-    the samples outside the window. It has no sigma.
+    It knows no model: one regression per axis, from all non-overlapping training windows, towards
+    the training mean. The penalty is the one with the least error on left-out training recordings.
+    The bias is learned from the mean of the samples outside the window. It has no sigma.
+
+    Args:
+        same_time: One regression for each place of the window, from training windows of the same
+            time after power-on, which a sensor that warms up needs.
     """
 
     recommended: ClassVar[bool] = False
     uses_prior: ClassVar[bool] = True
+
+    def __init__(self, same_time: bool = False) -> None:
+        self._same_time = same_time
 
     def fit(self, recordings: xr.Dataset, imu: int = TEST_IMU) -> Self:
         """See :class:`~gyro_pipeline.estimators.FittedEstimator`."""
@@ -169,7 +157,7 @@ class Ridge:
         known = [samples_of(recordings, one) for one in known_imus(recordings, imu)]
         self._rates = np.concatenate(known)
         self._means = self._rates.mean(axis=-1, dtype=np.float64)
-        self._lines: dict[tuple[int, int, int, str], LinearEstimate] = {}
+        self._lines: dict[tuple[int, int | None, int, str], LinearEstimate] = {}
         return self
 
     def estimate(
@@ -181,15 +169,13 @@ class Ridge:
     ) -> Estimates:
         """See :class:`~gyro_pipeline.estimators.Estimator`; sigma is NaN."""
         check_target(target)
-        size = windows.shape[-1]
-        starts = np.broadcast_to(
-            np.rint(np.asarray(start_s) * self._rate_hz).astype(int), len(windows)
-        )
+        starts = np.rint(np.asarray(start_s) * self._rate_hz).astype(int)
+        starts = np.broadcast_to(starts if self._same_time else 0, len(windows))
         biases = np.empty(windows.shape[:2])
         for start in np.unique(starts):
             chosen = starts == start
             for axis in range(windows.shape[1]):
-                line = self._line(axis, int(start), size, target)
+                line = self._line(axis, int(start), windows.shape[-1], target)
                 biases[chosen, axis] = line(windows[chosen, axis])
         return biases, np.full(biases.shape, np.nan)
 
@@ -197,36 +183,50 @@ class Ridge:
         key = axis, start, size, target
         if key not in self._lines:
             edges = block_edges(size, round(BLOCK_S * self._rate_hz))
-            blocks = block_means(self._rates[:, axis, start : start + size], edges)
-            aim, samples = self._means[:, axis], self._rates.shape[-1]
+            rates, samples = self._rates[:, axis], self._rates.shape[-1]
+            count = 1 if self._same_time else samples // size
+            windows = rates[:, start : start + count * size].reshape(len(rates), count, size)
+            blocks = block_means(windows, edges)
+            aims = np.repeat(self._means[:, axis, None], count, axis=1)
             if target == BIAS:
-                inside = blocks @ np.diff(edges)
-                aim = (aim * samples - inside) / (samples - size)
-            weights, constant = ridge_regression(blocks, aim)
+                aims = (aims * samples - blocks @ np.diff(edges)) / (samples - size)
+            weights, constant = ridge_regression(blocks, aims)
             self._lines[key] = LinearEstimate(edges, weights, constant, np.nan)
         return self._lines[key]
 
 
 def ridge_regression(
-    inputs: NDArray[np.float64], aim: NDArray[np.float64]
+    inputs: NDArray[np.float64], aims: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], float]:
-    """Ridge regression with the penalty of the least leave-one-out error.
+    """Ridge regression with the penalty that does best on left-out groups.
 
     Args:
-        inputs: (n, m).
-        aim: (n,).
+        inputs: (groups, windows, m); the windows of a group are left out together.
+        aims: (groups, windows).
 
     Returns:
-        Weights (m,) and the constant. The left-out errors are exact: residual / (1 - leverage)
-        (Allen 1974, Technometrics 16).
+        Weights (m,), and the constant.
     """
-    middle, level = inputs.mean(axis=0), aim.mean()
-    u, singular, vt = np.linalg.svd(inputs - middle, full_matrices=False)
-    along = u.T @ (aim - level)
-    penalties = singular.max() ** 2 * np.geomspace(1e-4, 1e4, 41)
-    shrinkage = singular**2 / (singular**2 + penalties[:, None])  # (penalties, singular values)
-    residuals = (aim - level) - shrinkage * along @ u.T
-    leverage = shrinkage @ (u**2).T + 1 / len(aim)
-    best = np.argmin(np.sum((residuals / (1 - leverage)) ** 2, axis=1))
-    weights = vt.T @ (along * singular / (singular**2 + penalties[best]))
-    return weights, float(level - weights @ middle)
+    scale = inputs.var(axis=(0, 1)).sum() * aims.size
+    penalties = scale * np.geomspace(1e-4, 1e4, _PENALTIES)
+    parts = np.arange(len(inputs)) % min(len(inputs), _FOLDS)
+    errors = np.zeros(_PENALTIES)
+    for part in np.unique(parts):
+        left, rest = parts == part, parts != part
+        weights, constants = _ridges(inputs[rest], aims[rest], penalties)
+        off = inputs[left] @ weights.T + constants - aims[left][..., None]
+        errors += np.sum(off**2, axis=(0, 1))
+    weights, constants = _ridges(inputs, aims, penalties[[np.argmin(errors)]])
+    return weights[0], float(constants[0])
+
+
+def _ridges(
+    inputs: NDArray[np.float64], aims: NDArray[np.float64], penalties: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Weights (penalties, m) and constants (penalties,)."""
+    x, y = inputs.reshape(-1, inputs.shape[-1]), aims.ravel()
+    middle, level = x.mean(axis=0), y.mean()
+    squares, axes = np.linalg.eigh((x - middle).T @ (x - middle))
+    along = axes.T @ (x - middle).T @ (y - level)
+    weights = along / (squares + penalties[:, None]) @ axes.T
+    return weights, level - weights @ middle
