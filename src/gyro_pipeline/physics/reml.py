@@ -20,6 +20,7 @@ recordings nowhere else than without it.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, optimize
+from threadpoolctl import threadpool_limits
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.physics.allan import NoiseFigures
@@ -40,6 +41,7 @@ _STEP = 1e-3  # of the numerical gradient, in logarithms
 _TIME_CONSTANTS = (0.02, 0.1, 0.3, 1.0, 3.0)  # of the recording: limits, and where searches start
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")  # of matrices so small, more only wait
 def fit_recording_model(
     recordings: NDArray[np.floating],
     rate_hz: float,
