@@ -25,6 +25,7 @@ PIPELINES = {
     "input_channels",
     "real2real",
     "reporting",
+    "virtual_gyros",
 }
 MEMORY = "kedro.io.MemoryDataset"
 
@@ -95,6 +96,7 @@ def test_every_dataset_of_every_pipeline_has_an_entry(pipelines, env):
         "sparkfun.raw_logs.recording",
         "augmentation.sparkfun.training.run",
         "augmentation.reporting.result",
+        "reporting.table.dataset_hours",
         "sparkfun.windowed_splits.role",
         "recordings",
     ],
@@ -135,10 +137,30 @@ def test_every_pattern_is_used(pipelines):
         ("dot.raw_logs.files", "simulated_logs.SimulatedLogs"),
         ("augmentation.reporting.tables.results", "reports.ReportTable"),
         ("augmentation.reporting.figures.dot_3_real", "reports.ReportFigure"),
+        ("reporting.tables.dataset_hours", "reports.ReportTable"),
+        ("reporting.figures.allan_deviation", "reports.ReportFigure"),
+        ("real2real.reporting.measured_elsewhere", "tables.Table"),
+        ("real2real.reporting.all_runs", "tracked_runs.TrackedRuns"),
     ],
 )
 def test_names_get_their_own_kind_of_dataset(name, kind):
     assert resolver("base").resolve_pattern(name)["type"] == f"gyro_pipeline.datasets.{kind}"
+
+
+def test_data_that_a_report_may_lack_name_the_pipeline_that_makes_them(pipelines):
+    registered = pipelines()
+    stored = [
+        name
+        for name in registered["reporting"].inputs()
+        if not name.startswith("params:") and not name.endswith("runs")
+    ]
+    assert "ng.ground_truth.allan" in stored
+    for name in stored:
+        sensor = name.split(".")[0]
+        made_by = resolver("base").resolve_pattern(name)["made_by"]
+        pipeline, only = made_by.removeprefix("kedro run --pipeline=").split(" --params=")
+        assert only == f"only.sensor={sensor}"
+        assert name in registered[pipeline].all_outputs()
 
 
 def test_a_studys_runs_are_narrowed_to_it_and_tracked_ones_are_not():
@@ -147,6 +169,9 @@ def test_a_studys_runs_are_narrowed_to_it_and_tracked_ones_are_not():
     tracked = resolver("base").resolve_pattern("ng.training.tracked")
     assert "study" not in tracked
     assert tracked["sensor"] == "ng"
+    everywhere = resolver("base").resolve_pattern("real2real.reporting.all_runs")
+    assert everywhere["study"] == "real2real"
+    assert not {"sensor", "source"} & set(everywhere)
 
 
 @pytest.mark.parametrize("env", ["base", *ENVS])
@@ -176,7 +201,7 @@ def test_only_messages_between_nodes_stay_in_memory(pipelines, env):
     names = datasets_of(pipelines(env))
     kept = {name for name in names if resolver(env).resolve_pattern(name)["type"] == MEMORY}
     assert kept
-    assert all(".reporting.gaps." in name for name in kept)
+    assert all(".reporting.gaps." in f".{name}" for name in kept)
 
 
 # environments

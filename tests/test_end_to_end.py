@@ -35,6 +35,27 @@ REPORTED = {
     *(f"figures/augmentation_{sensor}_{real}_real.{kind}"
       for sensor in ("sparkfun", "dot") for real in (3, 12) for kind in ("png", "svg")),
 }  # fmt: skip
+# What `kedro run` writes: the five tables of the paper, every figure, and all results.
+FORMATS = {"tables": ("csv", "md", "tex"), "figures": ("png", "svg")}
+TABLES = {
+    "augmentation_three_gyroscopes",
+    "augmentation_multiple_gyroscopes",
+    "real2real_generalization",
+    "sensor_specifications",
+    "dataset_hours",
+}
+RESULTS = {"augmentation_results", "real2real_results", "input_channels_results"}
+FIGURES = {
+    "running_average", "calibrated_signal", "mg_convergence", "allan_deviation",
+    "input_channels_input_channels", "real2real_training_data", "real2real_gyroscopes_10s",
+    "real2real_saving_against_turn_on_spread", "augmentation_sparkfun_3_real",
+    "augmentation_sparkfun_12_real", "augmentation_dot_3_real", "augmentation_dot_12_real",
+}  # fmt: skip
+
+
+def files_of(**names):
+    return {f"{kind}/{name}.{ending}" for kind in names for name in names[kind]
+            for ending in FORMATS[kind]}  # fmt: skip
 
 
 def by_estimator(runs, estimator):
@@ -109,6 +130,30 @@ def channels(smoke, changed):
     only = {"window_s": 10}
     done = smoke.project.run_here("input_channels", "smoke", only=only, execution=SERIAL)
     return done, smoke.project.runs("input_channels")
+
+
+@pytest.fixture(scope="module")
+def whole(smoke, channels):
+    return step(smoke.project, smoke.project.run_here("__default__", "smoke", execution=SERIAL))
+
+
+@pytest.fixture(scope="module")
+def without_a_run(smoke, whole):
+    """Nine gyroscopes of DOT at 10 s: in one table and one figure."""
+    project = smoke.project
+    wanted = ("dot", "9", "0", "10.0")
+    (run,) = [one for one in whole.real2real if cell(one) == wanted]
+    MlflowClient(f"sqlite:///{project.store}").delete_run(run.info.run_id)
+    return step(project, project.run_here("reporting", "smoke"))
+
+
+@pytest.fixture(scope="module")
+def without_recordings(smoke, without_a_run):
+    """Of one sensor, and its roles."""
+    project = smoke.project
+    for layer, name in (("02_intermediate", "recordings.nc"), ("05_model_input", "roles.csv")):
+        (project.folder / "data" / layer / "simulated_smoke" / "ng" / name).unlink()
+    return step(project, project.run_here("reporting", "smoke"))
 
 
 # The first run
@@ -289,6 +334,9 @@ def test_reporting_makes_what_it_can_and_names_what_is_missing(repeated, incompl
     for part in ("sensor=dot", "real_gyros=12", "virtual_gyros=24", "window_s=10", "seed=0"):
         assert f"only.{part}" in command
     assert "--pipeline=input_channels" in incomplete.output
+    assert "--pipeline=ground_truth --params=only.sensor=ng" in incomplete.output
+    assert "tables/sensor_specifications.csv" not in incomplete.report
+    assert "figures/running_average.png" in incomplete.report
     assert "tables/input_channels_results.csv" not in incomplete.report
     assert len(incomplete.augmentation) == 27  # nothing was trained
 
@@ -311,6 +359,20 @@ def test_another_hyper_parameter_trains_anew_and_keeps_what_was(repaired, change
     assert "2 runs planned, 1 skipped" in changed.output
 
 
+def test_its_report_uses_the_new_run_and_says_what_it_does_not_use(smoke, repaired, changed):
+    line = "24 older runs with other settings or data are in the store and not used"
+    assert f"augmentation: {line}" in changed.output
+    folder = smoke.project.folder / "data/07_model_output/simulated_smoke"
+    # later steps have written these anew
+    old = set(identities(by_estimator(repaired.augmentation, "cnn")))
+    new = set(identities(changed.augmentation)) - set(identities(repaired.augmentation))
+    assert len(old) == 24
+    report = changed.report["tables/augmentation_results.csv"].decode()
+    assert all(run_id[:8] in report for run_id in new)
+    assert not [run_id for run_id in old if run_id[:8] in report]
+    assert pd.read_csv(folder / "augmentation_unused.csv").columns[0] == "run_id"
+
+
 def test_method_1_shares_its_cell_of_one_imu(smoke, channels):
     done, runs = channels
     assert done.code == 0, done.output
@@ -325,6 +387,36 @@ def test_method_1_shares_its_cell_of_one_imu(smoke, channels):
     for run in networks.values():
         errors = pd.read_parquet(smoke.project.artifacts(run) / "errors.parquet")
         assert errors.groupby(["weights", "truth", "recording", "window"]).size().eq(3).all()
+
+
+def test_the_whole_run_writes_every_table_and_figure(whole):
+    assert whole.code == 0, whole.output
+    assert set(whole.report) == files_of(tables=TABLES | RESULTS, figures=FIGURES)
+    line = "augmentation: 1 older runs with other settings or data are in the store and not used"
+    assert line in whole.output
+
+
+def test_a_deleted_run_is_missed_by_exactly_what_needs_it(whole, without_a_run):
+    assert without_a_run.code != 0
+    gone = files_of(
+        tables=["real2real_generalization"], figures=["real2real_saving_against_turn_on_spread"]
+    )
+    assert set(without_a_run.report) == set(whole.report) - gone
+    assert set(re.findall(r"kedro run --pipeline=\S+ --params=\S+", without_a_run.output)) == {
+        "kedro run --pipeline=real2real --params=only.sensor=dot,only.window_s=10,"
+        "only.real_gyros=9,only.virtual_gyros=0,only.seed=0"
+    }
+    results = without_a_run.report["tables/real2real_results.csv"].splitlines()
+    assert len(results) == len(whole.report["tables/real2real_results.csv"].splitlines()) - 1
+
+
+def test_deleted_recordings_are_missed_by_exactly_what_needs_them(
+    without_a_run, without_recordings
+):
+    gone = files_of(tables=["sensor_specifications", "dataset_hours"], figures=["allan_deviation"])
+    assert set(without_recordings.report) == set(without_a_run.report) - gone
+    for stage in ("ground_truth", "virtual_gyros"):
+        assert f"kedro run --pipeline={stage} --params=only.sensor=ng" in without_recordings.output
 
 
 def test_ground_truth_alone(new_project):
@@ -358,11 +450,11 @@ def memsense(new_project):
         "--env=memsense_real",
         "--params=training.epochs=2,execution.executor=serial",
     )
-    return done, project.runs("real2real")
+    return project, done, project.runs("real2real")
 
 
 def test_the_real_file_gives_a_run_of_each_fold(memsense):
-    done, runs = memsense
+    _, done, runs = memsense
     assert done.code == 0, done.output
     assert {run.info.status for run in runs} == {"FINISHED"}
     folds = Counter(
@@ -380,10 +472,30 @@ def test_the_real_file_gives_a_run_of_each_fold(memsense):
 
 
 def test_the_running_means_error_on_the_real_file_is_the_known_one(memsense):
-    done, runs = memsense
+    _, done, runs = memsense
     (mean,) = [r for r in by_estimator(runs, "mean") if r.data.params["window_s"] == "10.0"]
     assert f"{mean.data.metrics['test_rmse_dps']:.7f}" == "0.0015854"
     assert f"{mean.data.metrics['test_rmse_dps_all']:.6f}" == "0.001508"
     (line,) = [one for one in done.output.splitlines() if "memsense mean 10 s: RMSE" in one]
     assert "0.0015854 deg/s" in line
     assert "0.001508 " in line
+
+
+def test_the_real_file_stands_beside_the_simulated_one_in_the_report(memsense):
+    project, _, runs = memsense
+    training = {"epochs": 2}
+    done = project.run_here("real2real", "smoke", training=training, execution=SERIAL)
+    assert done.code == 0, done.output
+    folder = project.folder / REPORT / "tables"
+    table = pd.read_csv(folder / "real2real_generalization.csv")
+    assert table["Sensor"].tolist() == ["sparkfun", "dot", "ng", "memsense", "memsense"]
+    row = table.iloc[-1]
+    assert row["Source"] == "published (measured)"
+    assert row["Gyroscopes"] == "3 real"
+    assert row["Split"] == "k-fold, 11 folds"
+    assert row["Published S/A %"] == "75/75 (6 real)"
+    ids = {run.info.run_id[:8] for run in runs if run.data.params["window_s"] == "10.0"}
+    assert set(row["Runs"].split()) <= ids
+    assert len(row["Runs"].split()) == 11
+    results = pd.read_csv(folder / "real2real_results.csv")
+    assert (results.source == "published (measured)").sum() == 4

@@ -14,11 +14,11 @@ from typing import Any
 from kedro.framework.context import KedroContext
 from kedro.framework.hooks import hook_impl
 from kedro.io import CatalogProtocol
-from kedro.pipeline import Pipeline
+from kedro.pipeline import Node, Pipeline
 from pydantic import ValidationError
 
 from gyro_pipeline import pipeline_registry
-from gyro_pipeline.conventions import InputError
+from gyro_pipeline.conventions import InputError, Missing
 from gyro_pipeline.datasets.atomic import check_writable
 from gyro_pipeline.datasets.tracked_runs import TrackedRuns
 from gyro_pipeline.parameters import Parameters
@@ -58,9 +58,16 @@ class Preflight:
                 check_writable(path)
 
     @hook_impl
+    def before_node_run(self, node: Node, inputs: dict[str, Any]) -> None:
+        """Refuse data that are not there; only the report goes on, to say what it lacks."""
+        for name, value in inputs.items():
+            if isinstance(value, Missing) and node.namespace != "reporting":
+                raise InputError(f"{name} is not there; make it: {', '.join(value.reasons)}")
+
+    @hook_impl
     def after_pipeline_run(self, pipeline: Pipeline, catalog: CatalogProtocol) -> None:
         """Say where the results are and how to look at them."""
-        tables = [name for name in pipeline.all_outputs() if ".reporting.tables." in name]
+        tables = [name for name in pipeline.all_outputs() if "reporting.tables." in name]
         folders = {path.parent.parent for name in tables for path in _paths(catalog.get(name))}
         for folder in sorted(folders):
             logger.info("tables and figures: %s", _relative(folder, self._project))

@@ -22,14 +22,6 @@ class Parameter(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Datasheet(Parameter):
-    """What the manufacturer states (paper, table of sensor specifications)."""
-
-    rate_hz: tuple[float, float] = Field(description="lowest and highest sample rate, Hz")
-    noise_density_mdps_rthz: float | None = Field(description="one-sided, mdps/sqrt(Hz)")
-    bias_stability_dph: float | None = Field(description="bias instability, deg/h")
-
-
 class SimulatedNoise(Parameter):
     """The stand-in for a sensor whose files are not at hand (sources: conf/base/globals.yml)."""
 
@@ -41,14 +33,13 @@ class SimulatedNoise(Parameter):
 
 
 class Sensor(Parameter):
-    """One brand of gyroscope: how it was recorded, its datasheet, and its simulated stand-in."""
+    """One brand of gyroscope: how it was recorded, and its simulated stand-in."""
 
     imus: int = Field(ge=1)
     recordings: int = Field(ge=2, description="power-ons per IMU")
     train_recordings: int = Field(ge=1, description="of these, the ones in the training file")
     samples: int = Field(ge=2, description="per recording and axis")
     recording_s: float = Field(gt=0, description="T, seconds (paper, section IV-A)")
-    datasheet: Datasheet
     simulated: SimulatedNoise
 
     @property
@@ -181,8 +172,8 @@ class Only(Parameter):
     fold: int | None = None
 
 
-class Published(Parameter):
-    """One published result; numbers that no run made are typed in here and nowhere else."""
+class PublishedResult(Parameter):
+    """One row of the paper's result tables."""
 
     table: str = Field(description="our name of the paper's table")
     section: str = Field(description="where the paper says so")
@@ -193,6 +184,50 @@ class Published(Parameter):
     window_s: float
     time_saving_pct: float
     accuracy_gain_pct: float
+
+
+class PublishedSpecification(Parameter):
+    """One row of the paper's table of sensor specifications: what the manufacturer states."""
+
+    section: str
+    sensor: str
+    name: str = Field(description="as the paper writes it")
+    rate_hz: tuple[float, float] = Field(description="lowest and highest sample rate, Hz")
+    noise_density_mdps_rthz: float | None = Field(description="one-sided, mdps/sqrt(Hz)")
+    bias_stability_dph: float | None = Field(description="bias instability, deg/h")
+
+
+class PublishedHours(Parameter):
+    """One row of the paper's table of dataset hours."""
+
+    section: str
+    dataset: int
+    sensor: str
+    virtual: bool
+    train_h: float
+    test_h: float
+    total_h: float
+    note: str = Field("", description="how it is read where the paper contradicts itself")
+
+
+class Published(Parameter):
+    """What the paper states: numbers that no run made are typed in here and nowhere else."""
+
+    results: list[PublishedResult]
+    specifications: list[PublishedSpecification]
+    hours: list[PublishedHours]
+
+    def of_table(self, table: str) -> list[PublishedResult]:
+        """Rows of one of the paper's result tables, in its order."""
+        return [row for row in self.results if row.table == table]
+
+    def of_networks(self, sensor: str, **gyros: int) -> list[PublishedResult]:
+        """Results of a sensor with some counts, e.g. ``real_gyros=3``."""
+        return [
+            row
+            for row in self.results
+            if row.sensor == sensor and all(getattr(row, key) == n for key, n in gyros.items())
+        ]
 
 
 class Parameters(Parameter):
@@ -210,14 +245,26 @@ class Parameters(Parameter):
     seeds: list[int] = Field(min_length=1)
     studies: dict[str, Study]
     only: Only
-    published: list[Published]
+    published: Published
+
+    @property
+    def _known(self) -> str:
+        return f"conf/base/globals.yml knows {', '.join(self.sensors)}"
+
+    @model_validator(mode="after")
+    def _the_paper_speaks_of_known_sensors(self) -> Self:
+        p = self.published
+        for sensor in (row.sensor for rows in (p.specifications, p.hours) for row in rows):
+            if sensor not in self.sensors:
+                raise ValueError(f"published: unknown sensor {sensor!r}; {self._known}")
+        return self
 
     @model_validator(mode="after")
     def _studies_ask_for_what_sensors_give(self) -> Self:
         for name, values in (("seeds", self.seeds), ("windows_s", self.windows_s)):
             if len(set(values)) < len(values):
                 raise ValueError(f"{name}: {values} names one of them twice")
-        known = f"conf/base/globals.yml knows {', '.join(self.sensors)}"
+        known = self._known
         for study, asked in self.studies.items():
             if asked.experiment != study:
                 raise ValueError(f"studies.{study}.experiment: expected {study!r}")

@@ -41,15 +41,18 @@ def register_pipelines() -> dict[str, Pipeline]:
         + reporting.create_pipeline({study: every_sensor[study]})
         for study in parameters.studies
     }
-    pipelines["ground_truth"] = sum(
-        (
-            raw_logs.create_pipeline(sensor) + ground_truth.create_pipeline(sensor)
-            for sensor in parameters.sensors
-            if wanted in (None, sensor)
-        ),
-        Pipeline([]),
+    known = [sensor for sensor in parameters.sensors if wanted in (None, sensor)]
+    drawn = _virtual_sensors(parameters)
+    pipelines["ground_truth"] = sum(map(_measured, known), Pipeline([]))
+    pipelines["virtual_gyros"] = sum(
+        (_measured(sensor) + _split(sensor, sensor in drawn) for sensor in known), Pipeline([])
     )
-    pipelines["reporting"] = reporting.create_pipeline(every_sensor)
+    published = parameters.published
+    pipelines["reporting"] = reporting.create_pipeline(
+        every_sensor,
+        sensors=[row.sensor for row in published.specifications],
+        virtual=[row.sensor for row in published.hours if row.virtual],
+    )
     pipelines["__default__"] = _runs(parameters, sensors) + pipelines["reporting"]
     return pipelines
 
@@ -60,12 +63,31 @@ def _runs(parameters: Parameters, studies: dict[str, list[str]]) -> Pipeline:
     for study, sensors in studies.items():
         for sensor in sensors:
             virtual = any(parameters.studies[study].sensors[sensor].virtual_gyros)
-            whole += raw_logs.create_pipeline(sensor) + ground_truth.create_pipeline(sensor)
-            whole += windowed_splits.create_pipeline(sensor)
-            whole += virtual_gyros.create_pipeline(sensor) if virtual else Pipeline([])
+            whole += _measured(sensor) + _split(sensor, virtual)
             whole += training.create_pipeline(study, sensor, virtual)
             whole += evaluation.create_pipeline(study, sensor)
     return whole
+
+
+def _measured(sensor: str) -> Pipeline:
+    """From raw logs to the bias table and the noise figures."""
+    return raw_logs.create_pipeline(sensor) + ground_truth.create_pipeline(sensor)
+
+
+def _split(sensor: str, virtual: bool) -> Pipeline:
+    """The roles of the recordings, and the virtual gyroscopes drawn from those that train."""
+    drawn = virtual_gyros.create_pipeline(sensor) if virtual else Pipeline([])
+    return windowed_splits.create_pipeline(sensor) + drawn
+
+
+def _virtual_sensors(parameters: Parameters) -> set[str]:
+    """Sensors of which some study trains on virtual gyroscopes."""
+    return {
+        sensor
+        for study in parameters.studies.values()
+        for sensor, grid in study.sensors.items()
+        if any(grid.virtual_gyros)
+    }
 
 
 def base_parameters() -> Parameters:

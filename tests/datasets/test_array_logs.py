@@ -18,11 +18,6 @@ SENSORS = {
         "train_recordings": 80,
         "samples": 13000,
         "recording_s": 52,
-        "datasheet": {
-            "rate_hz": [250, 250],
-            "noise_density_mdps_rthz": 14.8,
-            "bias_stability_dph": 2.6,
-        },
         "simulated": {
             "noise_mdps_rts": [5.3, 4.7, 6.0],
             "turn_on_spread_mdps": [0.4, 0, 2.0],

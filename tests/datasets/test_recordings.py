@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 from kedro.io import DatasetError
 
-from gyro_pipeline.conventions import InputError
+from gyro_pipeline.conventions import InputError, Missing
 from gyro_pipeline.datasets.atomic import replacing
 from gyro_pipeline.datasets.recordings import Recordings
 
@@ -146,3 +146,12 @@ def test_a_folder_that_cannot_be_written_to_is_named(tmp_path, monkeypatch):
         replacing(tmp_path / "table.csv"),
     ):
         pass
+
+
+def test_recordings_that_are_not_there_name_what_makes_them_where_that_is_known(tmp_path):
+    with pytest.raises(DatasetError, match="No such file"):
+        kept(tmp_path).load()
+    known = Recordings(str(tmp_path / "new" / "dot.nc"), made_by="make it")
+    assert known.load() == Missing(("make it",))
+    known.save(made())
+    xr.testing.assert_identical(known.load(), made())

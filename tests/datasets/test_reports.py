@@ -49,6 +49,11 @@ def test_latex_escapes_what_would_be_read_as_commands():
     )
 
 
+def test_latex_breaks_long_texts_into_lines():
+    table = pd.DataFrame({"runs": ["0123abcd " * 5], "note": ["short"], "n": [1]})
+    assert to_latex(table).startswith("\\begin{tabular}{p{4cm}lr}\n")
+
+
 def test_latex_of_symbols():
     text = to_latex(pd.DataFrame({"τ ± σ": ["a\\b~c^d", "{$#} < √2 → 4²"]}))
     assert "$\\tau$ $\\pm$ $\\sigma$ \\\\" in text

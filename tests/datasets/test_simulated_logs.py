@@ -11,7 +11,6 @@ from gyro_pipeline.datasets import simulated_logs
 from gyro_pipeline.datasets.recordings import Recordings
 from gyro_pipeline.datasets.simulated_logs import SimulatedLogs
 
-DATASHEET = {"rate_hz": [100, 100], "noise_density_mdps_rthz": None, "bias_stability_dph": None}
 SENSORS = {
     "dot": {
         "imus": 2,
@@ -19,7 +18,6 @@ SENSORS = {
         "train_recordings": 30,
         "samples": 400,
         "recording_s": 4,
-        "datasheet": DATASHEET,
         "simulated": {
             "noise_mdps_rts": [3.0, 6.0, 12.0],
             "turn_on_spread_mdps": [0.0, 50.0, 500.0],
@@ -118,13 +116,6 @@ def test_other_settings_are_written_anew_and_said(tmp_path, caplog, changes):
     assert len(caplog.records) == 1
     assert "writing simulated dot logs anew, since their settings have changed" in caplog.text
     xr.testing.assert_identical(new, simulated(tmp_path / "fresh", **changes).load())
-
-
-def test_a_changed_datasheet_does_not_touch_the_files(tmp_path):
-    simulated(tmp_path).load()
-    before = stamps(tmp_path)
-    simulated(tmp_path, datasheet=DATASHEET | {"bias_stability_dph": 10}).load()
-    assert stamps(tmp_path) == before
 
 
 def interrupt(*_, **__):

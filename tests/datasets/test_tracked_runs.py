@@ -181,6 +181,7 @@ def test_loading_narrows_to_study_sensor_and_source(store):
         )
 
     assert found() == sorted(one for one in everything if one[2] == "simulated")
+    assert found(source=None) == sorted(everything)
     assert found(source="published", sensor="ng") == [
         ("augmentation", "ng", "published"),
         ("real2real", "ng", "published"),

@@ -136,3 +136,9 @@ def trained(world: World) -> list[TrainedRun]:
 def stored(trained: list[TrainedRun], as_stored: Callable[..., StoredRun]) -> list[StoredRun]:
     """The same as the store gives it, waiting for its evaluation."""
     return [as_stored(run, f"run{number}") for number, run in enumerate(trained)]
+
+
+@pytest.fixture(scope="session")
+def make_bias(parameters: Callable[..., Any]) -> Callable[..., pd.DataFrame]:
+    """The ground truth of recordings, from their Allan variances."""
+    return lambda recordings, allan: measure_bias(recordings, allan, parameters().ground_truth)

@@ -13,10 +13,14 @@ from matplotlib.figure import Figure
 
 from gyro_pipeline.conventions import InputError, Missing
 from gyro_pipeline.datasets.atomic import replacing
-from gyro_pipeline.datasets.tables import Table
+from gyro_pipeline.datasets.tables import Table, read_table
 
 _PNG_DPI = 160
 _WITHOUT_EXPONENT = 1e4
+
+_LONGEST = 35
+_BROKEN = r"p{4cm}"
+"""How LaTeX sets columns with texts of more characters than that."""
 
 _LATEX = str.maketrans(
     {
@@ -64,7 +68,7 @@ class ReportTable(AbstractDataset[pd.DataFrame | Missing, pd.DataFrame]):
 
     def load(self) -> pd.DataFrame:
         """Read the table, all digits of it."""
-        return Table(str(self._csv)).load()
+        return read_table(self._csv)
 
     def save(self, data: pd.DataFrame | Missing) -> None:
         """Write the three files, or remove those of a result that can no longer be made.
@@ -171,16 +175,19 @@ def to_latex(table: pd.DataFrame) -> str:
         table: Its index is not written.
 
     Returns:
-        A ``tabular`` with the rules of the package ``booktabs``, for a plain article.
+        A ``tabular`` with the rules of the package ``booktabs``, for a plain article. Long texts
+        are broken into lines.
 
     Raises:
         InputError: A character that a plain article cannot set.
     """
-    alignment = "".join("r" if right else "l" for right in _numeric(table))
-    head, *body = [
-        " & ".join(_latex(cell) for cell in row) + r" \\"
-        for row in (list(table.columns.map(str)), *_texts(table))
-    ]
+    rows = [list(table.columns.map(str)), *_texts(table)]
+    long = [max(map(len, column)) > _LONGEST for column in zip(*rows, strict=True)]
+    alignment = "".join(
+        _BROKEN if broken else "r" if right else "l"
+        for broken, right in zip(long, _numeric(table), strict=True)
+    )
+    head, *body = [" & ".join(_latex(cell) for cell in row) + r" \\" for row in rows]
     begin = rf"\begin{{tabular}}{{{alignment}}}"
     lines = [begin, r"\toprule", head, r"\midrule", *body, r"\bottomrule", r"\end{tabular}"]
     return "\n".join(lines) + "\n"

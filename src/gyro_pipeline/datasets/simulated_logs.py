@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 from gyro_pipeline.datasets.array_logs import LAYOUT, ArrayLogs
 from gyro_pipeline.datasets.atomic import replacing
-from gyro_pipeline.datasets.recordings import Recordings
+from gyro_pipeline.datasets.recordings import Recordings, open_recordings
 from gyro_pipeline.parameters import Sensor
 from gyro_pipeline.physics.noise import simulate_noise
 
@@ -76,7 +76,7 @@ class SimulatedLogs(AbstractDataset[xr.Dataset, xr.Dataset]):
             why = "" if found is None else " anew, since their settings have changed"
             _LOG.info("writing simulated %s logs%s: %s", self._sensor, why, self._train.parent)
             self._write()
-        truth = Recordings(str(self._truth)).load().load()
+        truth = open_recordings(self._truth).load()
         logs = self._arrays.load()
         if truth.attrs["data_hash"] != logs.attrs["data_hash"]:
             raise InputError(
@@ -103,7 +103,7 @@ class SimulatedLogs(AbstractDataset[xr.Dataset, xr.Dataset]):
 
     def _settings(self) -> str:
         """All that the files depend on."""
-        entry = self._arrays.entry.model_dump(mode="json", exclude={"datasheet"})
+        entry = self._arrays.entry.model_dump(mode="json")
         return json.dumps({**entry, "seed": self._seed}, sort_keys=True)
 
     def _settings_on_disk(self) -> str | None:
@@ -111,9 +111,9 @@ class SimulatedLogs(AbstractDataset[xr.Dataset, xr.Dataset]):
         if not self._exists():
             return None
         try:
-            with Recordings(str(self._truth)).load() as truth:
+            with open_recordings(self._truth) as truth:
                 return truth.attrs.get("settings")
-        except DatasetError:  # damaged: as good as not written
+        except InputError:  # damaged: as good as not written
             return None
 
     def _write(self) -> None:

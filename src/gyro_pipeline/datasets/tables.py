@@ -7,24 +7,32 @@ import pandas as pd
 from kedro.io import AbstractDataset
 from kedro_datasets._typing import TablePreview
 
+from gyro_pipeline.conventions import Missing
 from gyro_pipeline.datasets.atomic import replacing
 
 
-class Table(AbstractDataset[pd.DataFrame, pd.DataFrame]):
+class Table(AbstractDataset[pd.DataFrame, pd.DataFrame | Missing]):
     """Keeps a table as CSV, without its index; numbers come back exactly as they were.
 
     Args:
         filepath: The CSV file.
+        made_by: The command that makes it. Where it is given and there is no file, ``load``
+            returns it as :class:`Missing`, so that a report can say what it lacks.
         metadata: For other tools, such as Kedro-Viz.
     """
 
-    def __init__(self, filepath: str, metadata: dict[str, Any] | None = None) -> None:
+    def __init__(
+        self, filepath: str, made_by: str | None = None, metadata: dict[str, Any] | None = None
+    ) -> None:
         self._filepath = Path(filepath)
+        self._made_by = made_by
         self.metadata = metadata
 
-    def load(self) -> pd.DataFrame:
+    def load(self) -> pd.DataFrame | Missing:
         """Read the table; an empty cell is a missing value, and nothing else is."""
-        return pd.read_csv(self._filepath, keep_default_na=False, na_values=[""])
+        if self._made_by and not self._exists():
+            return Missing((self._made_by,))
+        return read_table(self._filepath)
 
     def save(self, data: pd.DataFrame) -> None:
         """Write the table.
@@ -44,10 +52,15 @@ class Table(AbstractDataset[pd.DataFrame, pd.DataFrame]):
         Returns:
             Columns and rows as Kedro-Viz takes them.
         """
-        return TablePreview(self.load().head(nrows).to_dict(orient="split"))
+        return TablePreview(read_table(self._filepath).head(nrows).to_dict(orient="split"))
 
     def _exists(self) -> bool:
         return self._filepath.is_file()
 
     def _describe(self) -> dict[str, Any]:
         return {"filepath": str(self._filepath)}
+
+
+def read_table(path: Path) -> pd.DataFrame:
+    """Read a table that :class:`Table` wrote."""
+    return pd.read_csv(path, keep_default_na=False, na_values=[""])

@@ -39,7 +39,7 @@ _LOG_BATCH = 1000  # most metrics that one call takes
 
 
 class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
-    """Trained runs of one study, or of all, narrowed to a sensor and a source.
+    """Trained runs of one study, or of all, of one source, or of all, and of one sensor, or of all.
 
     Loading returns the trained runs, newest first, and ends what dead processes left unfinished as
     KILLED; of these, a trained run can still be evaluated. Saving takes one run at a time: a
@@ -50,7 +50,7 @@ class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
     def __init__(
         self,
         path: str,
-        source: str,
+        source: str | None = None,
         sensor: str | None = None,
         study: str | None = None,
         metadata: dict[str, Any] | None = None,
@@ -59,13 +59,14 @@ class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
 
         Args:
             path: SQLite file of the store; ``MLFLOW_TRACKING_URI`` wins where set.
-            source: Only runs on logs from there.
+            source: Only runs on logs from there; None for all.
             sensor: Only runs on this sensor; None for all.
             study: Only runs of this study, which is the MLflow experiment; None for all.
             metadata: For Kedro plugins.
         """
         self._path = Path(path)
-        self._only = {"source": source} | ({"sensor": sensor} if sensor else {})
+        wanted = {"source": source, "sensor": sensor}
+        self._only = {key: value for key, value in wanted.items() if value}
         self._study = study
         self.metadata = metadata
         self.provenance: dict[str, str] = {}

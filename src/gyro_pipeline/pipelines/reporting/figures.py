@@ -1,100 +1,350 @@
-"""How the figures look: results in, a matplotlib figure out."""
+"""The figures of results: one function each, results in, a figure out."""
 
 from collections.abc import Sequence
 from typing import Any
 
-import matplotlib as mpl
+import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
+from numpy.typing import ArrayLike, NDArray
 
-from gyro_pipeline.conventions import ALL, FIRST, MDPS
-from gyro_pipeline.parameters import Published
+from gyro_pipeline.conventions import ALL, FIRST, MDPS, PAPER, Missing
+from gyro_pipeline.parameters import Published, PublishedResult
+from gyro_pipeline.physics.ceiling import best_saving, ceiling_rmse, running_mean_rmse
+from gyro_pipeline.pipelines.reporting.style import CEILING, COLOURS, LOOK, MARKERS, share_legend
+from gyro_pipeline.pipelines.reporting.tables import measured_elsewhere, source_of
 from gyro_pipeline.studies import CNN, MEAN
 
-# Okabe and Ito's palette: distinct for all common kinds of colour vision.
-_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
-_MARKERS = ("o", "s", "^", "D")
 _TITLES = {ALL: "all windows (main result)", FIRST: "first window (the paper's way)"}
 _TICKS_S = (1, 2, 5, 10, 20, 30, 60, 100)
 _SHIFT = 0.11
 """Points of one window stand side by side: so much apart, relative to the time."""
 
+_COMMON_SPREAD_MDPS = 10
+"""Turn-on spread that is common for consumer parts."""
 
-def draw_augmentation(
-    results: pd.DataFrame, curves: pd.DataFrame, published: Sequence[Published]
-) -> Figure:
-    """Running-mean RMSE against its length, with the networks' points at theirs.
+_SPREADS_MDPS = np.geomspace(0.03, 30, 200)
+_SAVINGS_PCT = (-25.0, 100.0)
+"""Savings outside are drawn at the edge, as arrows."""
 
-    Args:
-        results: The running mean and the networks of one sensor and number of real gyroscopes.
-        curves: The running mean's, of that sensor.
-        published: The paper's results for the same networks.
-    """
-    with mpl.rc_context({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3}):
-        figure = Figure(figsize=(9.5, 4.4), layout="constrained")
+
+def sparkfun_3_real(
+    results: pd.DataFrame, curves: pd.DataFrame, published: Published
+) -> Figure | Missing:
+    """SparkFun, 3 real and virtual gyroscopes (paper, section IV-E, first figure)."""
+    return _augmentation(results, curves, published, "sparkfun", 3)
+
+
+def sparkfun_12_real(
+    results: pd.DataFrame, curves: pd.DataFrame, published: Published
+) -> Figure | Missing:
+    """SparkFun, 12 real and virtual gyroscopes (paper, section IV-E, second figure)."""
+    return _augmentation(results, curves, published, "sparkfun", 12)
+
+
+def dot_3_real(
+    results: pd.DataFrame, curves: pd.DataFrame, published: Published
+) -> Figure | Missing:
+    """Movella DOT, 3 real and virtual gyroscopes (paper, section IV-F, first figure)."""
+    return _augmentation(results, curves, published, "dot", 3)
+
+
+def dot_12_real(
+    results: pd.DataFrame, curves: pd.DataFrame, published: Published
+) -> Figure | Missing:
+    """Movella DOT, 12 real and virtual gyroscopes (paper, section IV-F, second figure)."""
+    return _augmentation(results, curves, published, "dot", 12)
+
+
+def input_channels(results: pd.DataFrame, curves: pd.DataFrame) -> Figure | Missing:
+    """Method 1, more gyroscopes as input channels, SparkFun (paper, section IV-C, figure)."""
+    title = "sparkfun: Method 1, gyroscopes as input channels"
+    return _on_curve(_of(results, "sparkfun"), curves, [], "real_gyros", title)
+
+
+def training_data(
+    results: pd.DataFrame, curves: pd.DataFrame, published: Published
+) -> Figure | Missing:
+    """Method 2, more gyroscopes as training data, SparkFun (paper, section IV-D, first figure)."""
+    claims = published.of_networks("sparkfun", virtual_gyros=0)
+    title = "sparkfun: Method 2, gyroscopes as training data"
+    return _on_curve(_of(results, "sparkfun"), curves, claims, "real_gyros", title)
+
+
+def gyroscopes_10s(results: pd.DataFrame, published: Published) -> Figure | Missing:
+    """RMSE at 10 s against the number of gyroscopes (paper, section IV-D, second figure)."""
+    claims = published.of_networks("sparkfun", virtual_gyros=0)
+    window_s = claims[0].window_s
+    shown = _of(results, "sparkfun").query("window_s == @window_s")
+    if lacking := tuple(shown.missing.dropna()):
+        return Missing(lacking)
+    with LOOK():
+        figure = Figure(figsize=(9.5, 4.2), layout="constrained")
         axes = figure.subplots(1, 2, sharey=True)
         for ax, windows in zip(axes, (ALL, FIRST), strict=True):
-            _draw_panel(ax, results, curves[curves.windows == windows], windows, published)
+            _draw_bars(ax, shown, claims, windows)
         axes[0].set_ylabel("RMSE against the recording's mean [mdps]")
-        handles, labels = axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
-        first = results.iloc[0]
-        real = results.real_gyros.max()
+        share_legend(figure, axes, columns=4)
         figure.suptitle(
-            f"{first.sensor}: {real} real gyroscopes and virtual ones "
-            f"({'simulated' if first.simulated else 'measured'} data, source {first.source!r})"
+            f"sparkfun: Method 2, {window_s:g} s of calibration; {source_of(shown.iloc[0])}"
         )
     return figure
 
 
-def _draw_panel(
+def saving_against_turn_on_spread(
+    results: pd.DataFrame, elsewhere: pd.DataFrame, published: Published
+) -> Figure | Missing:
+    """What can be saved at 10 s against the turn-on spread, and what the networks save.
+
+    A sensor's curve is the ceiling with its N and T and one spread on all axes. A network stands
+    at the spread that gives its own ceiling: the sensor's, where its axes have one.
+
+    Args:
+        results: Networks on real recordings.
+        elsewhere: On measured data of other sources.
+        published: For the paper's savings and the number of gyroscopes they are for.
+    """
+    claims = published.of_table("generalization")
+    window_s = claims[0].window_s
+    shown = results[(results.window_s == window_s) & (results.estimator == CNN)]
+    if lacking := tuple(shown.missing.dropna()):
+        return Missing(lacking)
+    with LOOK():
+        figure = Figure(figsize=(9.5, 7.2), layout="constrained")
+        axes = figure.subplots(2, 2, sharex=True, sharey=True).ravel()
+        for ax, claim in zip(axes, claims, strict=True):
+            own = shown[shown.sensor == claim.sensor].sort_values("real_gyros")
+            _draw_savings(ax, own, measured_elsewhere(elsewhere, claim), claim)
+        for ax in axes[::2]:
+            ax.set_ylabel("time saving S, all windows [%]")
+        for ax in axes[2:]:
+            ax.set_xlabel("turn-on spread τ [mdps], points of a sensor side by side")
+        share_legend(figure, axes, columns=3)
+        figure.suptitle(f"What {window_s:g} s can save; {source_of(shown.iloc[0])}")
+    return figure
+
+
+def equal_spread(row: pd.Series, bound: str = "") -> float:
+    """The turn-on spread tau that, on all axes, gives the ceiling of a result.
+
+    It inverts rho^2 = r + (1 - r) q / (1 + q) with q = tau^2 T0 / N^2; see physics/ceiling.py.
+
+    Args:
+        row: A result.
+        bound: ``_lo`` or ``_hi`` for an end of the ceiling gain's interval; tau falls with it.
+
+    Returns:
+        deg/s; 0 where the ceiling is that of a known bias.
+    """
+    rho = 1 - row[f"ceiling_accuracy_gain_pct{bound}"] / 100
+    r = row.window_s / row.recording_s
+    beta = np.clip((rho**2 - r) / (1 - r), 0, 1 - 1e-9)
+    return float(_pooled_noise(row) * np.sqrt(beta / (1 - beta) / row.window_s))
+
+
+def _pooled_noise(row: pd.Series) -> float:
+    """N over all axes, deg/s sqrt(s), from the running mean that the ceiling is compared with."""
+    mean = row.ceiling_rmse_dps / (1 - row.ceiling_accuracy_gain_pct / 100)
+    return float(mean / np.sqrt(1 / row.window_s - 1 / row.recording_s))
+
+
+def _best_saving_pct(row: pd.Series, spreads_dps: NDArray[np.float64]) -> NDArray[np.float64]:
+    noise, times = _pooled_noise(row), (row.window_s, row.recording_s)
+    limit = ceiling_rmse(noise, spreads_dps, *times, PAPER)
+    rho = limit / running_mean_rmse(noise, *times, PAPER)
+    return 100 * best_saving(rho, row.window_s / row.recording_s)
+
+
+def _of(results: pd.DataFrame, sensor: str) -> pd.DataFrame:
+    return results[results.sensor == sensor]
+
+
+def _augmentation(
+    results: pd.DataFrame, curves: pd.DataFrame, published: Published, sensor: str, real: int
+) -> Figure | Missing:
+    of_sensor = _of(results, sensor)
+    shown = of_sensor[of_sensor.real_gyros.isin([0, real])]  # 0: the running mean
+    claims = published.of_networks(sensor, real_gyros=real)
+    title = f"{sensor}: {real} real gyroscopes and virtual ones"
+    return _on_curve(shown, curves, claims, "virtual_gyros", title)
+
+
+def _on_curve(
+    shown: pd.DataFrame,
+    curves: pd.DataFrame,
+    claims: Sequence[PublishedResult],
+    by: str,
+    title: str,
+) -> Figure | Missing:
+    """Running-mean RMSE against its length, with the networks' points at theirs.
+
+    Args:
+        shown: The running mean and the networks of one sensor.
+        curves: The running mean's, of all sensors.
+        claims: The paper's results for the same networks.
+        by: What the networks differ in, ``real_gyros`` or ``virtual_gyros``.
+        title: Without the source.
+    """
+    if lacking := tuple(shown.missing.dropna()):
+        return Missing(lacking)
+    first = shown.iloc[0]
+    curve = _of(curves, first.sensor)
+    with LOOK():
+        figure = Figure(figsize=(9.5, 4.8), layout="constrained")
+        axes = figure.subplots(1, 2, sharey=True)
+        for ax, windows in zip(axes, (ALL, FIRST), strict=True):
+            _draw_panel(ax, shown, curve[curve.windows == windows], windows, claims, by)
+        axes[0].set_ylabel("RMSE against the recording's mean [mdps]")
+        share_legend(figure, axes, columns=3)
+        figure.suptitle(f"{title}; {source_of(first)}")
+    return figure
+
+
+def _draw_panel(  # noqa: PLR0917 - what a panel shows
     ax: Axes,
     results: pd.DataFrame,
     curve: pd.DataFrame,
     windows: str,
-    published: Sequence[Published],
+    claims: Sequence[PublishedResult],
+    by: str,
 ) -> None:
-    suffix = "" if windows == FIRST else f"_{windows}"
+    suffix, kind = _suffix(windows), by.removesuffix("_gyros")
     ax.plot(curve.time_s, curve.rmse_dps / MDPS, color="black", lw=1.2, label="running mean")
     limits = results[results.estimator == MEAN].sort_values("window_s")
     ax.plot(
         limits.window_s,
         limits.ceiling_rmse_dps / MDPS,
-        **_bar("#D55E00"),
+        **_bar(CEILING),
         label="ceiling: expected of the best possible",
     )
     networks = results[results.estimator == CNN]
-    sizes = sorted(networks.virtual_gyros.unique())
-    for i, virtual in enumerate(sizes):
-        rows = networks[networks.virtual_gyros == virtual]
+    sizes = sorted(networks[by].unique())
+    for i, size in enumerate(sizes):
+        rows = networks[networks[by] == size]
         shift = 1 + _SHIFT * (i - (len(sizes) - 1) / 2)
         rmse, lo, hi = (rows[f"test_rmse_dps{suffix}{end}"] / MDPS for end in ("", "_lo", "_hi"))
         ax.errorbar(
             rows.window_s * shift,
             rmse,
-            yerr=[rmse - lo, hi - rmse],
-            fmt=_MARKERS[i],
-            color=_COLOURS[i],
+            yerr=_reach(rmse, lo, hi),
+            fmt=MARKERS[i],
+            color=COLOURS[i],
             capsize=2.5,
             ms=5,
-            label=f"network, {virtual} virtual, 95 % interval",
+            label=f"network, {size} {kind}, 95 % interval",
         )
-        for claim in (claim for claim in published if claim.virtual_gyros == virtual):
+        for claim in [claim for claim in claims if getattr(claim, by) == size][:1]:
             mean = rows[rows.window_s == claim.window_s][f"mean_rmse_dps{suffix}"] / MDPS
             ax.plot(
                 claim.window_s * shift,
                 mean * (1 - claim.accuracy_gain_pct / 100),
-                **_hollow(_COLOURS[i], _MARKERS[i]),
-                label=f"published, {virtual} virtual",
+                **_hollow(COLOURS[i], MARKERS[i]),
+                label=f"published, {size} {kind}",
             )
     _time_axis(ax, float(curve.time_s.max()))
     ax.set(yscale="log", title=_TITLES[windows])
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter("{x:g}")
     # The curve against the recording's own mean ends at 0, which has no logarithm.
-    ax.set_ylim(bottom=0.08)
+    ax.set_ylim(0.08, 1.5 * (curve.rmse_dps / MDPS)[curve.time_s >= _TICKS_S[0]].max())
+
+
+def _draw_bars(
+    ax: Axes, shown: pd.DataFrame, claims: Sequence[PublishedResult], windows: str
+) -> None:
+    suffix = _suffix(windows)
+    networks = shown[shown.estimator == CNN].sort_values("real_gyros")
+    places = np.arange(len(networks))
+    rmse, lo, hi = (networks[f"test_rmse_dps{suffix}{end}"] / MDPS for end in ("", "_lo", "_hi"))
+    ax.bar(
+        places,
+        rmse,
+        0.6,
+        yerr=_reach(rmse, lo, hi),
+        color=COLOURS[0],
+        capsize=3,
+        label="network, 95 % interval",
+    )
+    mean = float(networks[f"mean_rmse_dps{suffix}"].iloc[0]) / MDPS
+    ax.axhline(mean, color="black", lw=1.5, label="model-based: running mean")
+    limit = float(networks.ceiling_rmse_dps.iloc[0]) / MDPS
+    ax.axhline(limit, color=CEILING, ls="--", lw=1.5, label="ceiling: expected of the best")
+    gains = {claim.real_gyros: claim.accuracy_gain_pct for claim in claims}
+    known = [i for i, gyros in enumerate(networks.real_gyros) if gyros in gains]
+    stated = [mean * (1 - gains[networks.real_gyros.iloc[i]] / 100) for i in known]
+    ax.plot(known, stated, **_hollow(COLOURS[1], "D"), mew=1.8, label="published")
+    ax.set_xticks(places, networks.real_gyros.astype(str).tolist())
+    ax.set(xlabel="gyroscopes in the training set", title=_TITLES[windows])
+    ax.set_axisbelow(True)
+    ax.grid(False, axis="x")
+
+
+def _draw_savings(
+    ax: Axes, own: pd.DataFrame, others: Sequence[pd.Series], claim: PublishedResult
+) -> None:
+    curve = _best_saving_pct(own.iloc[0], _SPREADS_MDPS * MDPS)
+    ax.plot(_SPREADS_MDPS, curve, color=CEILING, lw=1.5, label="ceiling")
+    ax.axhline(
+        claim.time_saving_pct,
+        color="black",
+        ls=":",
+        label="the paper's saving",
+    )
+    ax.axvline(
+        _COMMON_SPREAD_MDPS, color="grey", ls="--", lw=1, label="common for consumer parts: 10 mdps"
+    )
+    for i, (_, row) in enumerate(own.iterrows()):
+        shift = 1 + 0.14 * (i - (len(own) - 1) / 2)
+        label = f"network, {row.real_gyros} real, 95 % interval"
+        _draw_saving(ax, row, shift, COLOURS[i], MARKERS[i], label)
+    for row in others:
+        split = "k-fold" if row.folds > 1 else "hold-out"
+        label = f"network, {row.real_gyros} real, source {source_of(row)}, {split}"
+        _draw_saving(ax, row, 1, "black", "*", label)
+    ax.set(
+        xscale="log",
+        xlim=(_SPREADS_MDPS[0], _SPREADS_MDPS[-1]),
+        ylim=_SAVINGS_PCT,
+        title=f"{claim.sensor}; the paper's with {claim.real_gyros} gyroscopes",
+    )
+    ax.xaxis.set_major_formatter("{x:g}")
+
+
+def _draw_saving(  # noqa: PLR0917 - what a point shows
+    ax: Axes, row: pd.Series, shift: float, colour: str, marker: str, label: str
+) -> None:
+    spreads = np.array([equal_spread(row, bound) for bound in ("", "_hi", "_lo")]) / MDPS
+    x = np.clip(spreads * shift, _SPREADS_MDPS[0], _SPREADS_MDPS[-1])
+    saving, lo, hi = (
+        float(np.clip(row[f"time_saving_pct_{ALL}{end}"], *_SAVINGS_PCT))
+        for end in ("", "_lo", "_hi")
+    )
+    outside = {_SAVINGS_PCT[0]: "v", _SAVINGS_PCT[1]: "^"}
+    ax.errorbar(
+        x[0],
+        saving,
+        yerr=_reach([saving], [lo], [hi]),
+        xerr=_reach(x[:1], x[1:2], x[2:]),
+        fmt=outside.get(saving, marker),
+        color=colour,
+        capsize=2.5,
+        ms=9 if marker == "*" else 5,
+        clip_on=False,
+        label=label,
+    )
+
+
+def _reach(values: ArrayLike, lo: ArrayLike, hi: ArrayLike) -> NDArray[np.float64]:
+    """Lengths of error bars, shape (2, n); a bootstrap interval need not hold its value."""
+    given = np.asarray(values, np.float64)
+    lengths = [given - np.asarray(lo, np.float64), np.asarray(hi, np.float64) - given]
+    return np.maximum(lengths, 0.0)
+
+
+def _suffix(windows: str) -> str:
+    return "" if windows == FIRST else f"_{windows}"
 
 
 def _time_axis(ax: Axes, recording_s: float) -> None:

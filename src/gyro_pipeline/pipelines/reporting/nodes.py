@@ -1,41 +1,34 @@
-"""Nodes of the reporting stage: one function per table and figure."""
+"""Nodes of the reporting stage: tracked runs to results, and what a report lacks."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
-import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
-from gyro_pipeline.conventions import ALL, FIRST, MDPS, PAPER, InputError, Missing
-from gyro_pipeline.parameters import (
-    Evaluation,
-    Only,
-    Published,
-    Splits,
-    Study,
-    Training,
-    VirtualGyros,
-)
-from gyro_pipeline.pipelines.reporting.figures import draw_augmentation
+from gyro_pipeline.conventions import InputError, Missing
+from gyro_pipeline.parameters import Evaluation, Only, Splits, Study, Training, VirtualGyros
 from gyro_pipeline.pipelines.reporting.results import (
     ROW,
     find_runs,
-    mean_row,
-    network_row,
+    pool,
+    pooled_curve,
     rows_of,
+    why_unused,
 )
-from gyro_pipeline.protocol.scores import curve_errors
-from gyro_pipeline.studies import MEAN, Cell, study_cells
-from gyro_pipeline.tracking import CURVE, StoredRun
+from gyro_pipeline.studies import Cell, study_cells
+from gyro_pipeline.tracking import StoredRun
 
 logger = logging.getLogger(__name__)
 
 Reasons = tuple[str, ...]
 
+_CURVES = ["sensor", "windows", "time_s", "rmse_dps"]
+_UNUSED = ["run_id", *Cell.names(), "why"]
 
-def pool_results(  # noqa: PLR0913 - a node's arguments are its datasets
+
+def pool_results(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     study: Study,
     source: str,
     windows_s: list[float],
@@ -45,7 +38,7 @@ def pool_results(  # noqa: PLR0913 - a node's arguments are its datasets
     virtual_gyros: VirtualGyros,
     evaluation: Evaluation,
     *tracked: list[StoredRun],
-) -> tuple[pd.DataFrame, pd.DataFrame]:
+) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
     """Pool the study's tracked runs into one row per result.
 
     Args:
@@ -62,115 +55,93 @@ def pool_results(  # noqa: PLR0913 - a node's arguments are its datasets
 
     Returns:
         Results, a row per estimator, sensor, window and training set, ``missing`` holding the
-        command that makes what is missing (else none); and running-mean curves with columns
-        ``sensor, windows, time_s, rmse_dps``.
+        command that makes what is missing (else none); running-mean curves with columns
+        ``sensor, windows, time_s, rmse_dps``; and the finished runs that no result uses, with
+        columns ``run_id``, the fields of a cell, and ``why``.
     """
     runs = [run for sensor_runs in tracked for run in sensor_runs]
     settings = (training, splits, virtual_gyros)
-    rows: list[dict[str, Any]] = []
-    curves = []
-    for sensor in study.sensors:
-        cells = study_cells(study, sensor, source, windows_s, seeds, Only())
-        means: dict[float, StoredRun] = {}
-        for row_cells in rows_of(cells):
-            cell = row_cells[0]
-            found = find_runs(row_cells, runs, settings)
-            row = {name: getattr(cell, name) for name in ROW} | {"missing": None, "run_ids": None}
-            if not found or (cell.estimator != MEAN and cell.window_s not in means):
-                rows.append(row | {"missing": command_for(row_cells)})
-                continue
-            if cell.estimator == MEAN:
-                means[cell.window_s] = found[0]
-                if len(means) == 1:
-                    curves.append(_pooled_curve(found[0], sensor))
-                row |= mean_row(found[0])
-            else:
-                row |= network_row(found, means[cell.window_s], cell.window_s, evaluation)
-            row["simulated"] = found[0].tags["simulated"] == "1"
-            row["run_ids"] = " ".join(run.run_id for run in found)
-            rows.append(row)
-    columns = ["sensor", "windows", "time_s", "rmse_dps"]
-    none = pd.DataFrame(columns=columns)
-    return pd.DataFrame(rows), pd.concat(curves)[columns] if curves else none
+    cells = _cells(study, source, windows_s, seeds)
+    results, means = pool(rows_of(cells), runs, settings, evaluation)
+    used = {run_id for row in results for run_id in (row["run_ids"] or "").split()}
+    unused = [
+        {"run_id": run.run_id, "why": why_unused(run, cells, settings)} | dict(run.params)
+        for run in runs
+        if run.finished and run.run_id not in used
+    ]
+    if unused:
+        logger.info(
+            "%s: %d older runs with other settings or data are in the store and not used",
+            *(study.experiment, len(unused)),
+        )
+    curves = [pd.DataFrame(columns=_CURVES), *map(pooled_curve, means.values())]
+    return (
+        pd.DataFrame(results),
+        pd.concat(curves[1:] or curves),
+        pd.DataFrame(unused, columns=_UNUSED),
+    )
 
 
-def command_for(cells: Sequence[Cell]) -> str:
-    """The command that makes the runs of a row."""
-    cell = cells[0]
-    only = {"sensor": cell.sensor, "window_s": f"{cell.window_s:g}"}
-    if cell.estimator != MEAN:
-        only |= {"real_gyros": str(cell.real_gyros), "virtual_gyros": str(cell.virtual_gyros)}
-    if len(cells) == 1 and cell.estimator != MEAN:
-        only["seed"] = str(cell.seed)
-    params = ",".join(f"only.{key}={value}" for key, value in only.items())
-    return f"kedro run --pipeline={cell.study} --params={params}"
-
-
-def results_table(results: pd.DataFrame) -> tuple[pd.DataFrame | Missing, Reasons]:
-    """All results of a study that can be made, in mdps and percent; also printed.
+def pool_measured_elsewhere(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
+    study: Study,
+    source: str,
+    windows_s: list[float],
+    seeds: list[int],
+    training: Training,
+    splits: Splits,
+    virtual_gyros: VirtualGyros,
+    evaluation: Evaluation,
+    all_runs: list[StoredRun],
+) -> pd.DataFrame:
+    """Results on measured data of other sources, as far as they are there.
 
     Args:
-        results: From :func:`pool_results`, which keeps every figure and its interval.
+        study: Its grid.
+        source: The report's own, which is left out.
+        windows_s: Calibration times, seconds.
+        seeds: Those of them that were trained make up a row.
+        training: Hyper-parameters that a run must have been made with.
+        splits: Likewise.
+        virtual_gyros: Likewise.
+        evaluation: Resamples and seed of the intervals.
+        all_runs: The study's runs on logs from anywhere.
+
+    Returns:
+        Rows like those of :func:`pool_results`, none of them missing; often no row at all.
     """
-    reasons = tuple(results.missing.dropna())
-    made = results[results.missing.isna()]
-    if made.empty:
-        return Missing(reasons), reasons
-    table = made[
-        ["sensor", "estimator", "method", "real_gyros", "virtual_gyros", "window_s"]
-    ].copy()
-    for windows in (ALL, FIRST):
-        suffix = "" if windows == FIRST else f"_{windows}"
-        table[f"RMSE {windows} mdps"] = (made[f"test_rmse_dps{suffix}"] / MDPS).round(3)
-        for short, base in (("S", "time_saving_pct"), ("A", "accuracy_gain_pct")):
-            if base + suffix in made:
-                table[f"{short} {windows} %"] = made[base + suffix].round(0) + 0.0  # no "-0"
-    table["ceiling mdps"] = (made.ceiling_rmse_dps / MDPS).round(3)
-    logger.info("%s\n%s", _source(made.iloc[0]), table.to_string(index=False, na_rep="–"))
-    table.insert(1, "source", [_source(row) for _, row in made.iterrows()])
-    return table.assign(runs=made.run_ids.map(_short)), reasons
+    runs = [run for run in all_runs if run.tags["simulated"] == "0"]
+    settings = (training, splits, virtual_gyros)
+    results = []
+    for other in sorted({run.params["source"] for run in runs} - {source}):
+        rows = []
+        for row in rows_of(_cells(study, other, windows_s, seeds)):
+            trained = [cell for cell in row if find_runs([cell], runs, settings)]
+            rows += [trained] if find_runs(trained, runs, settings) else []
+        results += [row for row in pool(rows, runs, settings, evaluation)[0] if row["run_ids"]]
+    return pd.DataFrame(results, columns=None if results else [*ROW, "missing", "run_ids"])
 
 
-def three_gyroscopes(
-    results: pd.DataFrame, published: list[dict[str, Any]]
-) -> tuple[pd.DataFrame | Missing, Reasons]:
-    """The paper's summary with three real gyroscopes (section IV-G, table of three gyroscopes)."""
-    return _published_table(results, published, "three_gyroscopes")
+def or_missing(make: Callable[..., Any]) -> Callable[..., Any]:
+    """Make a table or figure a node: what it makes, and the commands that make what it lacks.
+
+    Args:
+        make: Returns the table or figure, or :class:`Missing` where it finds no run for a result.
+            It is not called if an input is Missing, a recording that is not there.
+    """
+
+    @wraps(make)
+    def node(*inputs: Any, **named: Any) -> tuple[Any, Reasons]:
+        given = [*inputs, *named.values()]
+        lacking = [reason for one in given if isinstance(one, Missing) for reason in one.reasons]
+        made = Missing(tuple(lacking)) if lacking else make(*inputs, **named)
+        return made, made.reasons if isinstance(made, Missing) else ()
+
+    return node
 
 
-def multiple_gyroscopes(
-    results: pd.DataFrame, published: list[dict[str, Any]]
-) -> tuple[pd.DataFrame | Missing, Reasons]:
-    """The paper's summary with twelve real gyroscopes (section IV-G, table of MG results)."""
-    return _published_table(results, published, "multiple_gyroscopes")
-
-
-def sparkfun_3_real(
-    results: pd.DataFrame, curves: pd.DataFrame, published: list[dict[str, Any]]
-) -> tuple[Figure | Missing, Reasons]:
-    """SparkFun, 3 real and virtual gyroscopes (paper, section IV-E, first figure)."""
-    return _augmentation_figure(results, curves, published, "sparkfun", 3)
-
-
-def sparkfun_12_real(
-    results: pd.DataFrame, curves: pd.DataFrame, published: list[dict[str, Any]]
-) -> tuple[Figure | Missing, Reasons]:
-    """SparkFun, 12 real and virtual gyroscopes (paper, section IV-E, second figure)."""
-    return _augmentation_figure(results, curves, published, "sparkfun", 12)
-
-
-def dot_3_real(
-    results: pd.DataFrame, curves: pd.DataFrame, published: list[dict[str, Any]]
-) -> tuple[Figure | Missing, Reasons]:
-    """Movella DOT, 3 real and virtual gyroscopes (paper, section IV-F, first figure)."""
-    return _augmentation_figure(results, curves, published, "dot", 3)
-
-
-def dot_12_real(
-    results: pd.DataFrame, curves: pd.DataFrame, published: list[dict[str, Any]]
-) -> tuple[Figure | Missing, Reasons]:
-    """Movella DOT, 12 real and virtual gyroscopes (paper, section IV-F, second figure)."""
-    return _augmentation_figure(results, curves, published, "dot", 12)
+def missing_results(results: pd.DataFrame) -> Reasons:
+    """Commands that make the results of a study that are not there."""
+    return tuple(results.missing.dropna())
 
 
 def refuse_gaps(only: Only, *reasons: Reasons) -> None:
@@ -178,121 +149,31 @@ def refuse_gaps(only: Only, *reasons: Reasons) -> None:
 
     Args:
         only: A run that was narrowed on purpose does not fail.
-        *reasons: Missing runs of each table and figure.
+        *reasons: What each table and figure lacks.
 
     Raises:
-        InputError: If a run is missing.
+        InputError: If a run or a recording is missing.
     """
     commands = dict.fromkeys(command for missing in reasons for command in missing)
     if not commands:
         return
     if only != Only():
         logger.info(
-            "narrowed by only: %d results of the whole studies have no runs yet; "
+            "narrowed by only: %d results or recordings are not there yet; "
             "`kedro run --pipeline=reporting` lists them",
             len(commands),
         )
         return
     raise InputError(
-        f"{len(commands)} results have no finished runs with the current settings; tables and "
-        "figures that need them were not made. Run (with this report's --env, if it has one)\n  "
-        + "\n  ".join(commands)
+        f"{len(commands)} results or recordings are not there, or were made with other settings; "
+        "tables and figures that need them were not made. Run (with this report's --env, if it has "
+        "one)\n  " + "\n  ".join(commands)
     )
 
 
-def _published_table(
-    results: pd.DataFrame, published: list[dict[str, Any]], table: str
-) -> tuple[pd.DataFrame | Missing, Reasons]:
-    wanted = [Published(**row) for row in published if row["table"] == table]
-    found = [_find(results, row) for row in wanted]
-    reasons = tuple(row.missing for row in found if pd.notna(row.missing))
-    if reasons:
-        return Missing(reasons), reasons
-    return pd.DataFrame([_published_row(p, row) for p, row in zip(wanted, found, strict=True)]), ()
-
-
-def _published_row(published: Published, row: pd.Series) -> dict[str, Any]:
-    virtual = f" + {published.virtual_gyros} virtual" if published.virtual_gyros else ""
-    seed_sd = row["accuracy_gain_pct_all_seed_sd"]
-    return {
-        "Approach": published.approach,
-        "Sensor": row.sensor,
-        "Source": _source(row),
-        "Gyroscopes": f"{published.real_gyros} real{virtual}",
-        "Published S/A %": f"{published.time_saving_pct:.0f}/{published.accuracy_gain_pct:.0f}",
-        "S %": _interval(row, "time_saving_pct", ALL),
-        "A %": _interval(row, "accuracy_gain_pct", ALL),
-        "Paper's way S %": _interval(row, "time_saving_pct", FIRST),
-        "Paper's way A %": _interval(row, "accuracy_gain_pct", FIRST),
-        "Ceiling S %": _interval(row, "ceiling_time_saving_pct", FIRST),
-        "Ceiling A %": _interval(row, "ceiling_accuracy_gain_pct", FIRST),
-        "Seeds": int(row.seeds),
-        "Spread of A over seeds": "–" if pd.isna(seed_sd) else f"{seed_sd:.1f}",
-        "Recordings": int(row.recordings),
-        "Runs": _short(row.run_ids),
-    }
-
-
-def _interval(row: pd.Series, base: str, windows: str) -> str:
-    suffix = "" if windows == FIRST else f"_{windows}"
-    value, lo, hi = (row[f"{base}{suffix}{end}"] for end in ("", "_lo", "_hi"))
-    ends = "" if pd.isna(lo) else f" [{_percent(lo)}, {_percent(hi)}]"
-    return f"{_percent(value)}{ends}"
-
-
-def _percent(value: float) -> str:
-    """A saving is unbounded off the ends of the running-mean curve."""
-    if np.isinf(value):
-        return "never reached" if value > 0 else "off the curve"
-    return f"{round(value)}"
-
-
-def _short(run_ids: str) -> str:
-    """The first digits of each run id are enough to find it."""
-    return " ".join(run_id[:8] for run_id in run_ids.split())
-
-
-def _source(row: pd.Series) -> str:
-    marked = "simulated" in row.source or not row.simulated
-    return row.source if marked else f"{row.source} (simulated)"
-
-
-def _find(results: pd.DataFrame, published: Published) -> pd.Series:
-    keys = ["sensor", "real_gyros", "virtual_gyros", "window_s"]
-    match = np.all([results[key] == getattr(published, key) for key in keys], axis=0)
-    if not match.any():
-        raise InputError(
-            f"published result {published.approach!r} of {published.sensor} is no cell of its "
-            "study; correct published or studies under conf/base/parameters"
-        )
-    return results[match].iloc[0]
-
-
-def _augmentation_figure(
-    results: pd.DataFrame,
-    curves: pd.DataFrame,
-    published: list[dict[str, Any]],
-    sensor: str,
-    real: int,
-) -> tuple[Figure | Missing, Reasons]:
-    of_sensor = results[results.sensor == sensor]
-    shown = of_sensor[of_sensor.real_gyros.isin([0, real])]  # 0: the running mean
-    reasons = tuple(shown.missing.dropna())
-    if reasons:
-        return Missing(reasons), reasons
-    claims = [Published(**row) for row in published]
-    claims = [p for p in claims if (p.sensor, p.real_gyros) == (sensor, real)]
-    claims = list({p.virtual_gyros: p for p in claims if p.table.endswith("gyroscopes")}.values())
-    return draw_augmentation(shown, curves[curves.sensor == sensor], claims), ()
-
-
-def _pooled_curve(mean: StoredRun, sensor: str) -> pd.DataFrame:
-    parts = []
-    table = mean.load(CURVE)
-    for windows in (FIRST, ALL):
-        curve = curve_errors(table, PAPER, windows)
-        mse = curve.squares.mean(np.ones((1, len(curve.squares.sums))))[0]
-        parts.append(
-            pd.DataFrame({"windows": windows, "time_s": curve.times_s, "rmse_dps": np.sqrt(mse)})
-        )
-    return pd.concat(parts).assign(sensor=sensor)
+def _cells(study: Study, source: str, windows_s: list[float], seeds: list[int]) -> list[Cell]:
+    return [
+        cell
+        for sensor in study.sensors
+        for cell in study_cells(study, sensor, source, windows_s, seeds, Only())
+    ]

@@ -5,69 +5,145 @@ from typing import Any
 
 from kedro.pipeline import Node, Pipeline
 
+from gyro_pipeline.pipelines.reporting import figures, signals, tables
 from gyro_pipeline.pipelines.reporting.nodes import (
-    dot_3_real,
-    dot_12_real,
-    multiple_gyroscopes,
+    missing_results,
+    or_missing,
+    pool_measured_elsewhere,
     pool_results,
     refuse_gaps,
-    results_table,
-    sparkfun_3_real,
-    sparkfun_12_real,
-    three_gyroscopes,
 )
 
-_Makers = Mapping[str, Sequence[Callable[..., Any]]]
+_Function = Callable[..., Any]
+_Makers = Mapping[str, Mapping[_Function, Sequence[str]]]
 
-TABLES: _Makers = {"augmentation": [three_gyroscopes, multiple_gyroscopes]}
-FIGURES: _Makers = {"augmentation": [sparkfun_3_real, sparkfun_12_real, dot_3_real, dot_12_real]}
-"""The paper's tables and figures that each study carries."""
+TABLES: _Makers = {
+    "augmentation": {
+        tables.three_gyroscopes: ["results", "published"],
+        tables.multiple_gyroscopes: ["results", "published"],
+    },
+    "real2real": {tables.generalization: ["results", "measured_elsewhere", "published"]},
+}
+FIGURES: _Makers = {
+    "augmentation": {
+        figures.sparkfun_3_real: ["results", "curves", "published"],
+        figures.sparkfun_12_real: ["results", "curves", "published"],
+        figures.dot_3_real: ["results", "curves", "published"],
+        figures.dot_12_real: ["results", "curves", "published"],
+    },
+    "real2real": {
+        figures.training_data: ["results", "curves", "published"],
+        figures.gyroscopes_10s: ["results", "published"],
+        figures.saving_against_turn_on_spread: ["results", "measured_elsewhere", "published"],
+    },
+    "input_channels": {figures.input_channels: ["results", "curves"]},
+}
+"""The paper's tables and figures that each study carries, and what they are made from."""
+
+_SHOWN = "sparkfun"
+"""Whose signals the figures of signals show."""
 
 
-def create_pipeline(studies: Mapping[str, Sequence[str]]) -> Pipeline:
-    """Tables and figures of some studies.
+def create_pipeline(
+    studies: Mapping[str, Sequence[str]],
+    sensors: Sequence[str] = (),
+    virtual: Sequence[str] = (),
+) -> Pipeline:
+    """Tables and figures of some studies, and of the recordings.
 
     Args:
         studies: All sensors of each study.
+        sensors: Those whose recordings the report describes; none in a single study's report.
+        virtual: Those that have virtual gyroscopes.
     """
-    nodes, gaps = [], []
-    for study, sensors in studies.items():
-        stage = f"{study}.reporting"
-        pooled = [f"{stage}.results", f"{stage}.curves"]
-        parts = "training splits virtual_gyros evaluation".split()
-        settings = [f"params:{name}" for name in ["source", "windows_s", "seeds", *parts]]
-        runs = [f"{study}.{sensor}.evaluation.runs" for sensor in sensors]
-        nodes.append(
-            Node(
-                pool_results,
-                [f"params:studies.{study}", *settings, *runs],
-                pooled,
-                name=f"pool_{study}",
-                namespace="reporting",
-            )
-        )
-        made: list[tuple[Callable[..., Any], str, list[str]]] = [
-            (results_table, f"{stage}.tables.results", pooled[:1])
-        ]
-        for table in TABLES.get(study, []):
-            made.append(
-                (table, f"{stage}.tables.{table.__name__}", [pooled[0], "params:published"])
-            )
-        for figure in FIGURES.get(study, []):
-            name = f"{stage}.figures.{figure.__name__}"
-            made.append((figure, name, [*pooled, "params:published"]))
-        for function, output, inputs in made:
-            gap = f"{stage}.gaps.{function.__name__}"
-            gaps.append(gap)
-            name = f"{function.__name__}_{study}"
-            nodes.append(Node(function, inputs, [output, gap], name=name, namespace="reporting"))
-    nodes.append(
-        Node(
-            refuse_gaps,
-            ["params:only", *gaps],
-            None,
-            name="refuse_gaps_in_" + "_".join(studies),
-            namespace="reporting",
-        )
+    nodes = []
+    for study, studied in studies.items():
+        nodes += _study_nodes(study, studied)
+    if sensors:
+        nodes += _recording_nodes(sensors, virtual)
+    gaps = [output for node in nodes for output in node.outputs if ".gaps." in f".{output}"]
+    scope = "all" if sensors else "_".join(studies)
+    end = Node(
+        refuse_gaps,
+        ["params:only", *gaps],
+        None,
+        name=f"refuse_gaps_in_{scope}",
+        namespace="reporting",
     )
-    return Pipeline(nodes)
+    return Pipeline([*nodes, end])
+
+
+def _study_nodes(study: str, sensors: Sequence[str]) -> list[Node]:
+    stage = f"{study}.reporting"
+    parts = "source windows_s seeds training splits virtual_gyros evaluation".split()
+    settings = [f"params:studies.{study}", *(f"params:{name}" for name in parts)]
+    runs = [f"{study}.{sensor}.evaluation.runs" for sensor in sensors]
+    pooled = [f"{stage}.{name}" for name in ("results", "curves", "unused")]
+    elsewhere = f"{stage}.measured_elsewhere"
+    nodes = [
+        Node(
+            pool_results,
+            [*settings, *runs],
+            pooled,
+            name=f"pool_{study}",
+            namespace="reporting",
+        ),
+        Node(
+            pool_measured_elsewhere,
+            [*settings, f"{stage}.all_runs"],
+            elsewhere,
+            name=f"pool_measured_elsewhere_{study}",
+            namespace="reporting",
+        ),
+        Node(
+            missing_results,
+            pooled[0],
+            f"{stage}.gaps.missing_results",
+            name=f"missing_results_{study}",
+            namespace="reporting",
+        ),
+        _made(tables.results_table, [pooled[0], elsewhere], f"{stage}.tables.results", study),
+    ]
+    for kind, makers in (("tables", TABLES), ("figures", FIGURES)):
+        for function, wanted in makers.get(study, {}).items():
+            inputs = ["params:published" if w == "published" else f"{stage}.{w}" for w in wanted]
+            nodes.append(_made(function, inputs, f"{stage}.{kind}.{function.__name__}", study))
+    return nodes
+
+
+def _recording_nodes(sensors: Sequence[str], virtual: Sequence[str]) -> list[Node]:
+    recordings = {f"{sensor}_recordings": f"{sensor}.raw_logs.recordings" for sensor in sensors}
+    noise = {f"{sensor}_noise": f"{sensor}.ground_truth.noise" for sensor in sensors}
+    allan = {f"{sensor}_allan": f"{sensor}.ground_truth.allan" for sensor in sensors}
+    roles = {f"{sensor}_roles": f"{sensor}.windowed_splits.roles" for sensor in sensors}
+    drawn = {f"{sensor}_virtual": f"{sensor}.virtual_gyros.recordings" for sensor in virtual}
+    published = {"published": "params:published"}
+    signal = {"recordings": f"{_SHOWN}.raw_logs.recordings", "bias": f"{_SHOWN}.ground_truth.bias"}
+    settled = signal | {"ground_truth": "params:ground_truth"}
+    made: list[tuple[str, _Function, dict[str, str]]] = [
+        ("tables", tables.sensor_specifications, published | recordings | noise),
+        ("tables", tables.dataset_hours, published | recordings | roles | drawn),
+        ("figures", signals.running_average, settled),
+        ("figures", signals.calibrated_signal, signal),
+        ("figures", signals.mg_convergence, settled),
+        ("figures", signals.allan_deviation, published | recordings | allan | noise),
+    ]
+    return [
+        _made(function, inputs, f"reporting.{kind}.{function.__name__}")
+        for kind, function, inputs in made
+    ]
+
+
+def _made(
+    function: _Function, inputs: list[str] | dict[str, str], output: str, study: str = ""
+) -> Node:
+    """A table or figure, and what it lacks."""
+    name = function.__name__
+    gap = output.rpartition(".")[0].replace(".tables", ".gaps").replace(".figures", ".gaps")
+    return Node(
+        or_missing(function),
+        inputs,
+        [output, f"{gap}.{name}"],
+        name=f"{name}_{study}" if study else name,
+        namespace="reporting",
+    )

@@ -1,6 +1,6 @@
 """From tracked runs to one row per result: folds and seeds pooled, with intervals."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 from typing import Any
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gyro_pipeline.conventions import ALL, FIRST, LAST, PAPER
+from gyro_pipeline.conventions import ALL, FIRST, HOLD_OUT, LAST, PAPER
 from gyro_pipeline.parameters import Evaluation
 from gyro_pipeline.protocol.scores import (
     Estimate,
@@ -24,6 +24,58 @@ ROW = ["sensor", "source", "estimator", "method", "real_gyros", "virtual_gyros",
 """What names a result."""
 
 CEILINGS = ["ceiling_rmse_dps", "ceiling_time_saving_pct", "ceiling_accuracy_gain_pct"]
+
+
+def pool(
+    rows: Iterable[Sequence[Cell]],
+    runs: Sequence[StoredRun],
+    settings: tuple[Any, ...],
+    evaluation: Evaluation,
+) -> tuple[list[dict[str, Any]], dict[str, StoredRun]]:
+    """Results of some rows.
+
+    Args:
+        rows: From :func:`rows_of`; the running mean of a window before its networks.
+        runs: Finished ones count, newest first.
+        settings: Training, splits and virtual-gyroscope parameters.
+        evaluation: Resamples and seed of the intervals.
+
+    Returns:
+        A result for each row, with ``missing``, the command that makes it where its runs are not
+        all there; and a run of the running mean by sensor.
+    """
+    results: list[dict[str, Any]] = []
+    means: dict[tuple[str, float], StoredRun] = {}
+    for cells in rows:
+        cell = cells[0]
+        key = cell.sensor, cell.window_s
+        found = find_runs(cells, runs, settings)
+        row = {name: getattr(cell, name) for name in ROW} | {"missing": None, "run_ids": None}
+        if not found or (cell.estimator != MEAN and key not in means):
+            results.append(row | {"missing": command_for(cells)})
+            continue
+        if cell.estimator == MEAN:
+            means[key] = found[0]
+            row |= mean_row(found[0])
+        else:
+            row |= network_row(found, means[key], cell.window_s, evaluation)
+        row["simulated"] = found[0].tags["simulated"] == "1"
+        row["folds"] = int(found[0].params["folds"])
+        row["run_ids"] = " ".join(run.run_id for run in found)
+        results.append(row)
+    return results, {sensor: mean for (sensor, _), mean in reversed(means.items())}
+
+
+def command_for(cells: Sequence[Cell]) -> str:
+    """The command that makes the runs of a row."""
+    cell = cells[0]
+    only = {"sensor": cell.sensor, "window_s": f"{cell.window_s:g}"}
+    if cell.estimator != MEAN:
+        only |= {"real_gyros": str(cell.real_gyros), "virtual_gyros": str(cell.virtual_gyros)}
+    if len(cells) == 1 and cell.estimator != MEAN:
+        only["seed"] = str(cell.seed)
+    params = ",".join(f"only.{key}={value}" for key, value in only.items())
+    return f"kedro run --pipeline={cell.study} --params={params}"
 
 
 def rows_of(cells: Sequence[Cell]) -> Iterator[list[Cell]]:
@@ -63,9 +115,31 @@ def find_runs(
     return found if len(found) == folds * len(cells) else []
 
 
+def why_unused(run: StoredRun, cells: Sequence[Cell], settings: tuple[Any, ...]) -> str:
+    """Why a finished run that no result uses is not used.
+
+    Args:
+        run: It.
+        cells: All of its study.
+        settings: The current ones, as in :func:`find_runs`.
+    """
+    cell = _cell(run.params)
+    expected = run_params(cell, int(run.params["folds"]), *settings)
+    changed = [
+        f"{key} {run.params.get(key)}, now {expected.get(key)}"
+        for key in sorted({*run.params, *expected})
+        if run.params.get(key) != (str(expected[key]) if key in expected else None)
+    ]
+    if changed:
+        return "other settings: " + "; ".join(changed)
+    if replace(cell, fold=HOLD_OUT) not in cells:
+        return "not in the study's grid"
+    return "a newer run, other data, or a result that is not complete"
+
+
 def mean_row(mean: StoredRun) -> dict[str, Any]:
     """The result of the running mean, from its own run."""
-    row: dict[str, Any] = {}
+    row: dict[str, Any] = {"recording_s": float(mean.load(CURVE).time_s.max())}
     for windows in (ALL, FIRST):
         for base in ["test_rmse_dps", *CEILINGS]:
             for bound in ("", "lo", "hi"):
@@ -86,8 +160,9 @@ def network_row(
         evaluation: Resamples and seed of the intervals.
 
     Returns:
-        Figures of merit for all and for first windows with intervals over recordings, the
-        ceiling, and the standard deviation over seeds (None for one seed).
+        Figures of merit for all and for first windows, each with its interval over recordings of
+        the squared errors averaged over seeds; the ceiling; T as ``recording_s``; and the standard
+        deviation over the seeds' own figures (None for one seed).
     """
     errors = {seed: _errors(group) for seed, group in _by_seed(runs)}
     mean_errors, curve = mean.load(ERRORS), mean.load(CURVE)
@@ -119,8 +194,41 @@ def network_row(
             row[metric_name(base, windows) + "_seed_sd"] = (
                 np.std(values, ddof=1) if several else None
             )
-    ceilings = mean_row(mean)
-    return row | {name: value for name, value in ceilings.items() if name.startswith("ceiling")}
+    limits = mean_row(mean)
+    return row | {k: v for k, v in limits.items() if k.startswith(("ceiling", "recording_s"))}
+
+
+def pooled_curve(mean: StoredRun) -> pd.DataFrame:
+    """RMSE of the running mean against its length, for first and for all windows.
+
+    Args:
+        mean: Its run.
+
+    Returns:
+        Columns ``sensor, windows, time_s, rmse_dps``.
+    """
+    parts = []
+    table = mean.load(CURVE)
+    for windows in (FIRST, ALL):
+        curve = curve_errors(table, PAPER, windows)
+        mse = curve.squares.mean(np.ones((1, len(curve.squares.sums))))[0]
+        parts.append(
+            pd.DataFrame({"windows": windows, "time_s": curve.times_s, "rmse_dps": np.sqrt(mse)})
+        )
+    pooled = pd.concat(parts)
+    pooled.insert(0, "sensor", mean.params["sensor"])
+    return pooled
+
+
+def _cell(params: Mapping[str, str]) -> Cell:
+    """The cell that a run is of; parameters of stored runs are texts."""
+    given: dict[str, Any] = {name: params[name] for name in Cell.names()}
+    whole = ("method", "real_gyros", "virtual_gyros", "seed", "fold")
+    return Cell(
+        **given
+        | {name: int(given[name]) for name in whole}
+        | {"window_s": float(given["window_s"])}
+    )
 
 
 def _errors(runs: Sequence[StoredRun]) -> pd.DataFrame:

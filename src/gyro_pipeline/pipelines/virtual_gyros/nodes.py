@@ -28,7 +28,8 @@ def synthesise(
         virtual_gyros: Counts, turn-on jitter and seed.
 
     Returns:
-        Recordings in the layout of the real ones, with ``recording_mean`` (imu, recording, axis).
+        Recordings in the layout of the real ones, with ``recording_mean`` (imu, recording, axis);
+        the attribute ``train_recordings`` says how many of each train.
 
     Raises:
         InputError: If the split is a k-fold: each fold would need gyroscopes of its own.
@@ -62,6 +63,7 @@ def synthesise(
             "source": recordings.attrs["source"],
             "simulated": 1,
             "rate_hz": recordings.attrs["rate_hz"],
+            "train_recordings": virtual_gyros.train_recordings,
             "data_hash": data_hash(samples, [sensor, "virtual"]),
         },
     )

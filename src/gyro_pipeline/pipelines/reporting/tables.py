@@ -1,0 +1,333 @@
+"""The paper's tables: one function each, results or stored data in, a table out."""
+
+import logging
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from gyro_pipeline.conventions import (
+    ALL,
+    FIRST,
+    MDPS,
+    TEST,
+    TEST_IMU,
+    TRAIN,
+    VALIDATION,
+    InputError,
+    Missing,
+)
+from gyro_pipeline.parameters import (
+    Published,
+    PublishedHours,
+    PublishedResult,
+    PublishedSpecification,
+)
+from gyro_pipeline.studies import CNN
+
+logger = logging.getLogger(__name__)
+
+_HOUR_S = 3600
+_AT_DATASHEET = "At the datasheet's rate h"
+_KEYS = ["sensor", "real_gyros", "virtual_gyros", "window_s"]
+
+
+# results
+
+
+def results_table(results: pd.DataFrame, elsewhere: pd.DataFrame) -> pd.DataFrame | Missing:
+    """All results of a study that can be made, in mdps and percent; also printed.
+
+    Args:
+        results: From ``pool_results``, which keeps every figure and its interval.
+        elsewhere: From ``pool_measured_elsewhere``.
+    """
+    own = results[results.missing.isna()]
+    if own.empty:
+        return Missing(tuple(results.missing))
+    made = pd.concat([part for part in (own, elsewhere) if len(part)], ignore_index=True)
+    columns = ["sensor", "estimator", "method", "real_gyros", "virtual_gyros", "window_s"]
+    table = made[columns].copy()
+    for windows in (ALL, FIRST):
+        suffix = "" if windows == FIRST else f"_{windows}"
+        table[f"RMSE {windows} mdps"] = (made[f"test_rmse_dps{suffix}"] / MDPS).round(3)
+        for short, base in (("S", "time_saving_pct"), ("A", "accuracy_gain_pct")):
+            if base + suffix in made:
+                table[f"{short} {windows} %"] = made[base + suffix].round(0) + 0.0  # no "-0"
+    table["ceiling mdps"] = (made.ceiling_rmse_dps / MDPS).round(3)
+    table.insert(1, "source", [source_of(row) for _, row in made.iterrows()])
+    logger.info("results\n%s", table.to_string(index=False, na_rep="–"))
+    return table.assign(split=made.folds.map(_split), runs=made.run_ids.map(_short))
+
+
+def three_gyroscopes(results: pd.DataFrame, published: Published) -> pd.DataFrame | Missing:
+    """The paper's summary with three real gyroscopes (section IV-G, table of three gyroscopes)."""
+    return _result_table(results, published.of_table("three_gyroscopes"))
+
+
+def multiple_gyroscopes(results: pd.DataFrame, published: Published) -> pd.DataFrame | Missing:
+    """The paper's summary with twelve real gyroscopes (section IV-G, table of MG results)."""
+    return _result_table(results, published.of_table("multiple_gyroscopes"))
+
+
+def generalization(
+    results: pd.DataFrame, elsewhere: pd.DataFrame, published: Published
+) -> pd.DataFrame | Missing:
+    """The four sensors (section IV-G, table of generalization), measured data of others below.
+
+    Args:
+        results: Of the report's own source.
+        elsewhere: On measured data of other sources; per source and sensor the row with the most
+            gyroscopes that the paper's row does not exceed.
+        published: The paper's.
+    """
+    return _result_table(results, published.of_table("generalization"), elsewhere)
+
+
+def find_result(results: pd.DataFrame, published: PublishedResult) -> pd.Series:
+    """Our result for a published one.
+
+    Raises:
+        InputError: If its study has none.
+    """
+    match = np.all([results[key] == getattr(published, key) for key in _KEYS], axis=0)
+    if not match.any():
+        raise InputError(
+            f"published result {published.approach!r} of {published.sensor} is no cell of its "
+            "study; correct published or studies under conf/base/parameters"
+        )
+    return results[match].iloc[0]
+
+
+def measured_elsewhere(elsewhere: pd.DataFrame, published: PublishedResult) -> list[pd.Series]:
+    """For each other source the result that comes closest to a published one in gyroscopes."""
+    alike = elsewhere[
+        (elsewhere.estimator == CNN)
+        & (elsewhere.sensor == published.sensor)
+        & (elsewhere.window_s == published.window_s)
+        & (elsewhere.virtual_gyros == published.virtual_gyros)
+        & (elsewhere.real_gyros <= published.real_gyros)
+    ].sort_values("real_gyros")
+    return [rows.iloc[-1] for _, rows in alike.groupby("source")]
+
+
+def source_of(row: pd.Series) -> str:
+    """Where a result's recordings come from, and whether they are simulated or measured."""
+    return source_name(row.source, bool(row.simulated))
+
+
+def source_name(source: str, simulated: bool) -> str:
+    """The same, where the name does not say it already."""
+    kind = "simulated" if simulated else "measured"
+    return source if kind in source else f"{source} ({kind})"
+
+
+def _result_table(
+    results: pd.DataFrame,
+    wanted: Sequence[PublishedResult],
+    elsewhere: pd.DataFrame | None = None,
+) -> pd.DataFrame | Missing:
+    ours = [find_result(results, published) for published in wanted]
+    lacking = tuple(row.missing for row in ours if pd.notna(row.missing))
+    if lacking:
+        return Missing(lacking)
+    rows = []
+    for published, own in zip(wanted, ours, strict=True):
+        others = [] if elsewhere is None else measured_elsewhere(elsewhere, published)
+        rows += [_result_row(published, row) for row in (own, *others)]
+    return pd.DataFrame(rows)
+
+
+def _result_row(published: PublishedResult, row: pd.Series) -> dict[str, Any]:
+    theirs, ours = _gyroscopes(published), _gyroscopes(row)
+    claim = f"{published.time_saving_pct:.0f}/{published.accuracy_gain_pct:.0f}"
+    return {
+        "Approach": published.approach,
+        "Sensor": row.sensor,
+        "Source": source_of(row),
+        "Split": _split(row.folds),
+        "Gyroscopes": ours,
+        "Published S/A %": claim if theirs == ours else f"{claim} ({theirs})",
+        "S %": _interval(row, "time_saving_pct", ALL),
+        "A %": _interval(row, "accuracy_gain_pct", ALL),
+        "Paper's way S %": _interval(row, "time_saving_pct", FIRST),
+        "Paper's way A %": _interval(row, "accuracy_gain_pct", FIRST),
+        "Ceiling S %": _interval(row, "ceiling_time_saving_pct", FIRST),
+        "Ceiling A %": _interval(row, "ceiling_accuracy_gain_pct", FIRST),
+        "Seeds": int(row.seeds),
+        "Spread of S over seeds": _spread(row, "time_saving_pct"),
+        "Spread of A over seeds": _spread(row, "accuracy_gain_pct"),
+        "Recordings": int(row.recordings),
+        "Section": published.section,
+        "Runs": _short(row.run_ids),
+    }
+
+
+def _gyroscopes(row: Any) -> str:
+    virtual = f" + {row.virtual_gyros:.0f} virtual" if row.virtual_gyros else ""
+    return f"{row.real_gyros:.0f} real{virtual}"
+
+
+def _split(folds: float) -> str:
+    return "hold-out" if folds == 1 else f"k-fold, {folds:.0f} folds"
+
+
+def _interval(row: pd.Series, base: str, windows: str) -> str:
+    suffix = "" if windows == FIRST else f"_{windows}"
+    value, lo, hi = (row[f"{base}{suffix}{end}"] for end in ("", "_lo", "_hi"))
+    ends = "" if pd.isna(lo) else f" [{_percent(lo)}, {_percent(hi)}]"
+    return f"{_percent(value)}{ends}"
+
+
+def _percent(value: float) -> str:
+    """A saving is unbounded off the ends of the running-mean curve."""
+    if np.isinf(value):
+        return "never reached" if value > 0 else "off the curve"
+    return f"{round(value)}"
+
+
+def _spread(row: pd.Series, base: str) -> str:
+    spread = row[f"{base}_{ALL}_seed_sd"]
+    return "–" if pd.isna(spread) else f"{spread:.1f}"
+
+
+def _short(run_ids: str) -> str:
+    """The first digits of each run id are enough to find it."""
+    return " ".join(run_id[:8] for run_id in run_ids.split())
+
+
+# stored data
+
+
+def sensor_specifications(published: Published, **stored: Any) -> pd.DataFrame:
+    """The datasheets beside what the recordings show (section IV-A, table of specifications).
+
+    Args:
+        published: What the manufacturers state, as the paper has it.
+        **stored: For each sensor its ``<sensor>_recordings``, for their rate and source, and
+            ``<sensor>_noise``, a row of N, sigma and B per gyroscope.
+    """
+    return pd.DataFrame(
+        _specification(row, stored[f"{row.sensor}_recordings"], stored[f"{row.sensor}_noise"])
+        for row in published.specifications
+    )
+
+
+def _specification(
+    sheet: PublishedSpecification, recordings: xr.Dataset, noise: pd.DataFrame
+) -> dict[str, Any]:
+    density, rate_hz = sheet.noise_density_mdps_rthz, recordings.attrs["rate_hz"]
+    stated = density is not None
+    return {
+        "Sensor": sheet.name,
+        "Source": source_name(recordings.attrs["source"], bool(recordings.attrs["simulated"])),
+        "Gyroscopes": len(noise),
+        "Datasheet rate Hz": "–".join(f"{rate:g}" for rate in dict.fromkeys(sheet.rate_hz)),
+        "Rate Hz": round(rate_hz, 1),
+        "Datasheet noise density mdps/√Hz": density,
+        # a one-sided density ND: N = ND / sqrt(2), sigma = ND sqrt(rate / 2)
+        "Datasheet N mdps√s": density / np.sqrt(2) if stated else None,
+        "N mdps√s": _rms(noise.white_dps_rts / MDPS),
+        "Datasheet σ mdps": density * np.sqrt(rate_hz / 2) if stated else None,
+        "σ mdps": _rms(noise.sample_sigma_dps / MDPS),
+        "Datasheet B deg/h": sheet.bias_stability_dph,
+        "B deg/h": _rms(noise.instability_dps * _HOUR_S),
+        "Section": sheet.section,
+    }
+
+
+def _rms(values: pd.Series) -> str:
+    """Root mean square over gyroscopes, with the smallest and the largest."""
+    return f"{np.sqrt((values**2).mean()):.3g} [{values.min():.3g}, {values.max():.3g}]"
+
+
+def dataset_hours(published: Published, **stored: Any) -> pd.DataFrame:
+    """Hours of all datasets, from counts (section IV-A, table of hours).
+
+    Training recordings count for every gyroscope, test recordings for the three of IMU 1, as the
+    paper's own hours do. In a k-fold each recording does both, and counts once in the total.
+
+    Args:
+        published: The paper's hours, and how they are read where it contradicts itself.
+        **stored: ``<sensor>_recordings`` and ``<sensor>_roles``, or ``<sensor>_virtual``.
+    """
+    rates = {sheet.sensor: sheet.rate_hz for sheet in published.specifications}
+    table = pd.DataFrame(_hours(row, rates[row.sensor], stored) for row in published.hours)
+    virtual = np.array([row.virtual for row in published.hours])
+    sums = [
+        _sum("real", table[~virtual], ""),
+        _sum("virtual", table[virtual], ""),
+        _sum("all", table, "the paper calls all of it recorded; the virtual part is not"),
+    ]
+    return pd.concat([table, pd.DataFrame(sums)], ignore_index=True).drop(columns=["_lo", "_hi"])
+
+
+def _hours(
+    published: PublishedHours, rate_hz: tuple[float, float], stored: dict[str, Any]
+) -> dict[str, Any]:
+    sensor = published.sensor
+    if published.virtual:
+        recordings = stored[f"{sensor}_virtual"]
+        train = _gyroscope_recordings(recordings) & (
+            recordings.recording <= recordings.attrs["train_recordings"]
+        )
+        test = xr.zeros_like(train)
+    else:
+        recordings = stored[f"{sensor}_recordings"]
+        train, test = _counted(recordings, stored[f"{sensor}_roles"])
+    samples, used_hz = recordings.sizes["sample"], recordings.attrs["rate_hz"]
+    source = source_name(recordings.attrs["source"], bool(recordings.attrs["simulated"]))
+    counts = [int(part.sum()) for part in (train, test, train | test)]
+    hours = [count * samples / used_hz / _HOUR_S for count in counts]
+    fast, slow = (counts[2] * samples / rate / _HOUR_S for rate in reversed(rate_hz))
+    return {
+        "Dataset": str(published.dataset),
+        "Sensor": sensor,
+        "Source": f"virtual, from {source}" if published.virtual else source,
+        "Gyroscopes": int(train.any("recording").sum()),
+        "Training recordings": counts[0],
+        "Test recordings": counts[1],
+        "T s": round(samples / used_hz, 2),
+        "Train h": round(hours[0], 2),
+        "Test h": round(hours[1], 2),
+        "Total h": round(hours[2], 2),
+        _AT_DATASHEET: _range(fast, slow),
+        "Paper's train h": published.train_h,
+        "Paper's test h": published.test_h,
+        "Paper's total h": published.total_h,
+        "Section": published.section,
+        "Note": published.note or None,
+        "_lo": fast,
+        "_hi": slow,
+    }
+
+
+def _gyroscope_recordings(recordings: xr.Dataset) -> xr.DataArray:
+    """Whether a gyroscope has a recording: (imu, recording, axis)."""
+    return recordings.angular_rate.isel(sample=0).notnull().load()
+
+
+def _counted(recordings: xr.Dataset, roles: pd.DataFrame) -> tuple[xr.DataArray, xr.DataArray]:
+    """Which recordings of which gyroscopes train (validation included), and which test."""
+    there = _gyroscope_recordings(recordings)
+    train, test = (
+        there & there.recording.isin(roles.recording[roles.role.isin(wanted)].unique())
+        for wanted in ([TRAIN, VALIDATION], [TEST])
+    )
+    return train, test & (there.imu == TEST_IMU)
+
+
+def _sum(name: str, rows: pd.DataFrame, note: str) -> dict[str, Any]:
+    total: dict[str, Any] = {
+        column: round(rows[column].sum(), 2)
+        for column in rows.select_dtypes("number").columns.astype(str)
+        if column != "T s"
+    }
+    total[_AT_DATASHEET] = _range(total["_lo"], total["_hi"])
+    return {"Dataset": name, "Note": note or None} | total
+
+
+def _range(low: float, high: float) -> str:
+    return f"{low:.2f}" if np.isclose(low, high) else f"{low:.2f} to {high:.2f}"
