@@ -47,6 +47,7 @@ ALLOWED = {
     },
     "hooks": {"conventions", "datasets", "parameters", "pipeline_registry", "studies"},
     "settings": {"hooks"},
+    "store": {"conventions"},
     "__init__": set(),
     "__main__": set(),
 }

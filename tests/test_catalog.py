@@ -28,6 +28,7 @@ PIPELINES = {
     "virtual_gyros",
 }
 MEMORY = "kedro.io.MemoryDataset"
+SHARED = {"mlflow.db", "data/08_reporting/report"}  # by all sources
 
 # The package says so itself, but pytest sets filters of its own.
 pytestmark = pytest.mark.filterwarnings("ignore:One or more dataset names contain")
@@ -137,6 +138,8 @@ def test_every_pattern_is_used(pipelines):
         ("dot.raw_logs.files", "simulated_logs.SimulatedLogs"),
         ("augmentation.reporting.tables.results", "reports.ReportTable"),
         ("augmentation.reporting.figures.dot_3_real", "reports.ReportFigure"),
+        ("reporting.folder", "report_page.ReportFolder"),
+        ("reporting.report", "report_page.ReportPage"),
         ("reporting.tables.dataset_hours", "reports.ReportTable"),
         ("reporting.figures.allan_deviation", "reports.ReportFigure"),
         ("real2real.reporting.measured_elsewhere", "tables.Table"),
@@ -147,12 +150,18 @@ def test_names_get_their_own_kind_of_dataset(name, kind):
     assert resolver("base").resolve_pattern(name)["type"] == f"gyro_pipeline.datasets.{kind}"
 
 
+def test_kedro_viz_shows_every_dataset_in_the_layer_of_its_stage(pipelines):
+    for name in datasets_of(pipelines()):
+        layer = resolver("base").resolve_pattern(name)["metadata"]["kedro-viz"]["layer"]
+        assert layer in name.split("."), name
+
+
 def test_data_that_a_report_may_lack_name_the_pipeline_that_makes_them(pipelines):
     registered = pipelines()
     stored = [
         name
         for name in registered["reporting"].inputs()
-        if not name.startswith("params:") and not name.endswith("runs")
+        if name != "reporting.folder" and not name.startswith("params:") and "runs" not in name
     ]
     assert "ng.ground_truth.allan" in stored
     for name in stored:
@@ -178,7 +187,7 @@ def test_a_studys_runs_are_narrowed_to_it_and_tracked_ones_are_not():
 def test_every_stored_path_has_the_source_and_a_name_of_its_own(pipelines, env):
     source = configuration(env)["globals"]["source"]
     stored = paths(env, datasets_of(pipelines(env)))
-    assert {path for path in stored.values() if source not in Path(path).parts} == {"mlflow.db"}
+    assert {path for path in stored.values() if source not in Path(path).parts} == SHARED
     files = [path for name, path in stored.items() if path != "mlflow.db" and "files" not in name]
     assert len(files) > 5
     assert len(files) == len(set(files))
@@ -193,7 +202,7 @@ def test_sources_never_share_a_path(pipelines):
     }
     assert set(by_source) == {"simulated", "simulated_smoke", "published"}
     base, smoke, real = by_source.values()
-    assert base & smoke == base & real == smoke & real == {"mlflow.db"}
+    assert base & smoke == base & real == smoke & real == SHARED
 
 
 @pytest.mark.parametrize("env", ["base", *ENVS])

@@ -16,6 +16,7 @@ from mlflow import MlflowClient
 SERIAL = {"executor": "serial"}  # where few trainings are not worth the start of processes
 REAL_FILE = "memsense_test_real.npy"
 REPORT = "data/08_reporting/simulated_smoke"
+PAGE = "data/08_reporting/report"
 CELL = ["sensor", "real_gyros", "virtual_gyros", "window_s"]
 PARAMS = {*CELL, "study", "method", "source", "seed", "fold", "estimator"}
 HYPER_PARAMETERS = {
@@ -79,12 +80,14 @@ class Step:
     augmentation: list
     real2real: list
     report: dict
+    page: str
 
 
 def step(project, done):
     studies = (project.runs(study) for study in ("augmentation", "real2real"))
     report = {path.removeprefix(f"{REPORT}/"): b for path, b in project.files(REPORT).items()}
-    return Step(done.code, done.output, *studies, report)
+    page = (project.folder / f"{PAGE}.html").read_text()
+    return Step(done.code, done.output, *studies, report, page)
 
 
 # Each of these does the next thing in the same project.
@@ -161,8 +164,8 @@ def without_recordings(smoke, without_a_run):
 
 def test_the_first_run_ends_well_and_says_where_to_look(smoke):
     assert smoke.done.code == 0, smoke.done.output
-    last = smoke.done.output.strip().splitlines()[-3:]
-    for line, words in zip(last, (REPORT, "mlflow ui", "kedro viz"), strict=True):
+    last = smoke.done.output.strip().splitlines()[-4:]
+    for line, words in zip(last, (REPORT, f"{PAGE}.html", "mlflow ui", "kedro viz"), strict=True):
         assert words in line
     assert "Traceback" not in smoke.done.output
 
@@ -255,6 +258,21 @@ def test_the_report_is_written(smoke):
     assert not [path for path in smoke.files if Path(path).name.startswith(".")]
 
 
+def test_the_page_says_what_was_run_and_links_every_run(smoke):
+    html, text = (smoke.files[f"{PAGE}.{suffix}"].decode() for suffix in ("html", "md"))
+    for page in (html, text):
+        assert "This is a smoke run, not a result." in page
+        assert "Three real gyroscopes" in page
+        assert "kedro run --pipeline=augmentation --env=smoke" in page
+    assert html.count("data:image/png") == len([n for n in REPORTED if n.endswith(".png")])
+    assert len(html) < 5e6
+    for run in smoke.runs:
+        assert f"#/experiments/{run.info.experiment_id}/runs/{run.info.run_id}" in html
+        assert f"`{run.info.experiment_id}/{run.info.run_id}`" in text
+    commit = smoke.runs[0].data.tags["mlflow.source.git.commit"]
+    assert f"commit <code>{commit[:12] or 'unknown'}" in html
+
+
 def test_tables_show_published_ours_and_the_ceiling_with_their_runs(smoke):
     ids = {run.info.run_id[:8] for run in smoke.runs}
     three, multiple = (
@@ -298,6 +316,7 @@ def test_a_second_run_trains_nothing_and_says_so(smoke, repeated):
     assert identities(repeated.augmentation) == identities(smoke.runs)
     before = {path.removeprefix(f"{REPORT}/"): b for path, b in smoke.files.items()}
     assert all(before[name] == content for name, content in repeated.report.items())
+    assert repeated.page == smoke.files[f"{PAGE}.html"].decode()
 
 
 def test_another_study_takes_the_cells_it_shares(smoke, shared):
@@ -339,6 +358,7 @@ def test_reporting_makes_what_it_can_and_names_what_is_missing(repeated, incompl
     assert "figures/running_average.png" in incomplete.report
     assert "tables/input_channels_results.csv" not in incomplete.report
     assert len(incomplete.augmentation) == 27  # nothing was trained
+    assert f"<code>{command} --env=smoke</code>" in incomplete.page
 
 
 def test_the_command_it_names_repairs_it(incomplete, repaired):

@@ -71,6 +71,9 @@ class Preflight:
         folders = {path.parent.parent for name in tables for path in _paths(catalog.get(name))}
         for folder in sorted(folders):
             logger.info("tables and figures: %s", _relative(folder, self._project))
+        for name in pipeline.all_outputs() & {"reporting.report"}:
+            for path in _paths(catalog.get(name)):
+                logger.info("report:             %s", _relative(path, self._project))
         logger.info("compare runs:       mlflow ui")
         logger.info("see the lineage:    kedro viz")
 

@@ -54,6 +54,7 @@ class StoredRun:
     """A trained run as the store has it; ``load(name)`` fetches one of its artifacts."""
 
     run_id: str
+    experiment_id: str
     study: str
     finished: bool
     started_ms: int

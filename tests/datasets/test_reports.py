@@ -9,7 +9,7 @@ import pytest
 from kedro.io import DatasetError
 
 from gyro_pipeline.conventions import Missing
-from gyro_pipeline.datasets.reports import ReportFigure, ReportTable, to_latex, to_markdown
+from gyro_pipeline.datasets.reports import ReportFigure, ReportTable, to_html, to_latex, to_markdown
 
 TABLE = pd.DataFrame(
     {
@@ -119,12 +119,27 @@ def test_a_missing_figure_removes_the_outdated_files(tmp_path):
     assert os.listdir(tmp_path) == []
 
 
-def test_a_figure_is_previewed_but_not_read_back(tmp_path):
+def test_a_figure_is_previewed_and_names_its_file(tmp_path):
     report = ReportFigure(str(tmp_path / "a"))
     report.save(drawn())
     assert base64.b64decode(report.preview()) == (tmp_path / "a.png").read_bytes()
-    with pytest.raises(DatasetError, match="only written"):
-        report.load()
+    assert report.load() == tmp_path / "a.png"
+
+
+def test_what_was_not_made_is_missing(report, tmp_path):
+    assert report.load() == ReportFigure(str(tmp_path / "a")).load() == Missing(())
+
+
+def test_html_escapes_what_would_be_read_as_markup():
+    text = to_html(pd.DataFrame({"<b>": ["a & b", "<script>"], "n": [1.5, np.nan]}))
+    assert text == (
+        "<table>\n"
+        '<thead><tr><th>&lt;b&gt;</th><th class="number">n</th></tr></thead>\n'
+        "<tbody>\n"
+        '<tr><td>a &amp; b</td><td class="number">1.5</td></tr>\n'
+        '<tr><td>&lt;script&gt;</td><td class="number">–</td></tr>\n'
+        "</tbody>\n</table>"
+    )
 
 
 def test_previews_are_announced_as_kedro_viz_looks_for_them():

@@ -113,6 +113,7 @@ def as_stored() -> Callable[..., StoredRun]:
         artifacts: Mapping[str, Any] = trained.artifacts
         given: dict[str, Any] = {
             "run_id": run_id,
+            "experiment_id": "1",
             "study": trained.study,
             "finished": False,
             "started_ms": trained.started_ms,

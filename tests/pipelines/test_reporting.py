@@ -106,6 +106,7 @@ def make_run(settings):
         metrics = {f"{n}{s}": v for n, v in CEILINGS.items() for s in ("", "_all")}
         return StoredRun(
             run_id=run_id,
+            experiment_id="1",
             study=made.study,
             finished=True,
             started_ms=started_ms,

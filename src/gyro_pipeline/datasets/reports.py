@@ -1,12 +1,13 @@
 """What people read: tables and figures, each in the formats they are used in."""
 
 import base64
+from html import escape
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 import pandas as pd
-from kedro.io import AbstractDataset, DatasetError
+from kedro.io import AbstractDataset
 from kedro_datasets._typing import ImagePreview, TablePreview
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
@@ -17,6 +18,7 @@ from gyro_pipeline.datasets.tables import Table, read_table
 
 _PNG_DPI = 160
 _WITHOUT_EXPONENT = 1e4
+_SENTENCE = 40  # characters
 
 _LONGEST = 35
 _BROKEN = r"p{4cm}"
@@ -51,7 +53,7 @@ _LATEX = str.maketrans(
 )
 
 
-class ReportTable(AbstractDataset[pd.DataFrame | Missing, pd.DataFrame]):
+class ReportTable(AbstractDataset[pd.DataFrame | Missing, pd.DataFrame | Missing]):
     """Writes a table as CSV with all digits, and as Markdown and LaTeX to be read.
 
     In the latter two, numbers have four significant digits and a missing value is a dash. LaTeX
@@ -66,9 +68,9 @@ class ReportTable(AbstractDataset[pd.DataFrame | Missing, pd.DataFrame]):
         self._csv, self._md, self._tex = _with_suffixes(filepath, ".csv", ".md", ".tex")
         self.metadata = metadata
 
-    def load(self) -> pd.DataFrame:
-        """Read the table, all digits of it."""
-        return read_table(self._csv)
+    def load(self) -> pd.DataFrame | Missing:
+        """Read the table, all digits of it; Missing where it was not made."""
+        return read_table(self._csv) if self._csv.is_file() else Missing(())
 
     def save(self, data: pd.DataFrame | Missing) -> None:
         """Write the three files, or remove those of a result that can no longer be made.
@@ -106,7 +108,7 @@ class ReportTable(AbstractDataset[pd.DataFrame | Missing, pd.DataFrame]):
         return {"filepath": str(self._csv.with_suffix(""))}
 
 
-class ReportFigure(AbstractDataset[Figure | Missing, None]):
+class ReportFigure(AbstractDataset[Figure | Missing, Path | Missing]):
     """Writes a figure as PNG and SVG; the same figure gives the same bytes.
 
     Args:
@@ -118,9 +120,9 @@ class ReportFigure(AbstractDataset[Figure | Missing, None]):
         self._png, self._svg = _with_suffixes(filepath, ".png", ".svg")
         self.metadata = metadata
 
-    def load(self) -> None:
-        """Refuse: a figure is not read back."""
-        raise DatasetError(f"{self._png}: figures are only written; open the file to see it")
+    def load(self) -> Path | Missing:
+        """Name the PNG file, to be shown elsewhere; Missing where it was not made."""
+        return self._png if self._png.is_file() else Missing(())
 
     def save(self, data: Figure | Missing) -> None:
         """Write both files and close the figure, or remove those that can no longer be made.
@@ -166,6 +168,35 @@ def to_markdown(table: pd.DataFrame) -> str:
     rows = [list(table.columns.map(str)), rules, *_texts(table)]
     cells = [[cell.replace("|", "\\|").replace("\n", " ") for cell in row] for row in rows]
     return "".join(f"| {' | '.join(row)} |\n" for row in cells)
+
+
+def to_html(table: pd.DataFrame) -> str:
+    """Write a table as HTML.
+
+    Args:
+        table: Its index is not written.
+
+    Returns:
+        A ``table`` with everything in it escaped. Cells of numeric columns have the class
+        ``number``, sentences the class ``long``.
+    """
+    numeric = _numeric(table)
+
+    def row(tag: str, texts: list[str]) -> str:
+        classes = [
+            "number" if right else "long" if len(text) > _SENTENCE else ""
+            for right, text in zip(numeric, texts, strict=True)
+        ]
+        return "".join(
+            f'<{tag} class="{kind}">{escape(text)}</{tag}>'
+            if kind
+            else f"<{tag}>{escape(text)}</{tag}>"
+            for kind, text in zip(classes, texts, strict=True)
+        )
+
+    head = row("th", list(table.columns.map(str)))
+    body = "\n".join(f"<tr>{row('td', texts)}</tr>" for texts in _texts(table))
+    return f"<table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody>\n</table>"
 
 
 def to_latex(table: pd.DataFrame) -> str:

@@ -17,6 +17,8 @@ import psutil
 from kedro.io import AbstractDataset
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Param, Run, RunStatus, RunTag, ViewType
+from mlflow.exceptions import MlflowException
+from mlflow.utils.file_utils import local_file_uri_to_path
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.atomic import check_writable, replacing
@@ -33,6 +35,8 @@ os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
 
 _BUSY_S = 20
 """How long to wait for another process that writes to the store."""
+
+_MOVED = "if the store was moved, `python -m gyro_pipeline.store --artifacts-in mlruns` tells it so"
 
 _CURVE_POINTS = 50
 _LOG_BATCH = 1000  # most metrics that one call takes
@@ -125,6 +129,7 @@ class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
     def _stored(self, run: Run, study: str) -> StoredRun:
         return StoredRun(
             run_id=run.info.run_id,
+            experiment_id=run.info.experiment_id,
             study=study,
             finished=run.info.status == RunStatus.to_string(RunStatus.FINISHED),
             started_ms=run.info.start_time,
@@ -136,7 +141,12 @@ class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
 
     def _load_artifact(self, run_id: str, name: str) -> Any:
         with tempfile.TemporaryDirectory() as folder:
-            path = Path(self._client.download_artifacts(run_id, name, folder))
+            try:
+                path = Path(self._client.download_artifacts(run_id, name, folder))
+            except MlflowException as error:
+                raise InputError(
+                    f"run {run_id}: its artifact {name} cannot be read ({error}); {_MOVED}"
+                ) from error
             return _READERS[path.suffix](path)
 
     def _save_trained(self, trained: TrainedRun) -> None:
@@ -174,6 +184,7 @@ class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
                 "good with `mlflow gc`"
             )
         if existing is not None:
+            _check_not_moved(existing.artifact_location)
             return str(existing.experiment_id)
         location = None
         if not os.environ.get("MLFLOW_TRACKING_URI"):
@@ -222,6 +233,14 @@ def _check_store(path: Path) -> None:
             f"{path}: expected an MLflow store, got an SQLite file with tables "
             f"{', '.join(sorted(tables)[:5])}; {advice}"
         )
+
+
+def _check_not_moved(location: str) -> None:
+    """Refuse to write artifacts where the store used to be."""
+    if location.startswith("file:"):
+        project = Path(local_file_uri_to_path(location)).parents[1]
+        if not project.is_dir():
+            raise InputError(f"{project}, where the store keeps artifacts, is not there; {_MOVED}")
 
 
 def _pages(search: Callable[..., Any]) -> Iterable[Any]:

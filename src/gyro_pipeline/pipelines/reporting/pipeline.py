@@ -13,6 +13,7 @@ from gyro_pipeline.pipelines.reporting.nodes import (
     pool_results,
     refuse_gaps,
 )
+from gyro_pipeline.pipelines.reporting.report import write_report
 
 _Function = Callable[..., Any]
 _Makers = Mapping[str, Mapping[_Function, Sequence[str]]]
@@ -61,16 +62,29 @@ def create_pipeline(
         nodes += _study_nodes(study, studied)
     if sensors:
         nodes += _recording_nodes(sensors, virtual)
-    gaps = [output for node in nodes for output in node.outputs if ".gaps." in f".{output}"]
+    made = [output for node in nodes for output in node.outputs]
+    parts = ("results", "measured_elsewhere", "tables.", "figures.", "gaps.")
+    shown = [name for name in made if name.partition("reporting.")[2].startswith(parts)]
+    shown += [f"{study}.reporting.all_runs" for study in studies]
+    given = {name: f"params:{name}" for name in ("source", "only", "sensors", "published")}
     scope = "all" if sensors else "_".join(studies)
-    end = Node(
-        refuse_gaps,
-        ["params:only", *gaps],
-        None,
-        name=f"refuse_gaps_in_{scope}",
-        namespace="reporting",
-    )
-    return Pipeline([*nodes, end])
+    end = [
+        Node(
+            write_report,
+            given | {"folder": "reporting.folder"} | {name: name for name in shown},
+            ["reporting.report", "reporting.gaps.all"],
+            name=f"write_report_of_{scope}",
+            namespace="reporting",
+        ),
+        Node(
+            refuse_gaps,
+            ["params:only", "reporting.gaps.all"],
+            None,
+            name=f"refuse_gaps_in_{scope}",
+            namespace="reporting",
+        ),
+    ]
+    return Pipeline([*nodes, *end])
 
 
 def _study_nodes(study: str, sensors: Sequence[str]) -> list[Node]:

@@ -1,0 +1,121 @@
+"""What the report says about the tables and figures that it knows."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Caption:
+    """Of one table or figure.
+
+    Attributes:
+        title: A few words.
+        text: What is to be seen, for a reader who has not read the paper.
+        pipeline: What ``kedro run --pipeline=`` makes it.
+    """
+
+    title: str
+    text: str
+    pipeline: str
+
+
+_SUMMARY = (
+    "Windows of 10 s; S and A in percent, with 95 % intervals over recordings. S and A are over "
+    "all windows, the main result; the paper's way is over the first window of each recording, "
+    "and scatters more. Paper, section IV-G."
+)
+_ON_CURVE = (
+    "Left: all windows, the main result. Right: the first window of each recording, the paper's "
+    "way. The line is the running mean against its length. Filled markers are the networks with "
+    "95 % intervals, hollow ones the error that a published gain would mean on these data, bars "
+    "the ceiling. Lower is better."
+)
+_ALIKE = "To be read like the figure of SparkFun with 3 real gyroscopes."
+_TOLERANCE = "The band is the tolerance around the mean of the recording, which counts as truth."
+
+CAPTIONS = {
+    "tables/augmentation_three_gyroscopes": Caption(
+        "Three real gyroscopes", _SUMMARY, "augmentation"
+    ),
+    "tables/augmentation_multiple_gyroscopes": Caption(
+        "Twelve real gyroscopes", _SUMMARY, "augmentation"
+    ),
+    "tables/real2real_generalization": Caption(
+        "The four sensors",
+        f"{_SUMMARY} Where runs on measured data of another source are in the store, they stand "
+        "below the row of the same sensor.",
+        "real2real",
+    ),
+    "tables/sensor_specifications": Caption(
+        "Sensors: datasheets and recordings",
+        "Datasheet values beside those found in the recordings: the root mean square over "
+        "gyroscopes, with the smallest and the largest. N is the white noise: the mean of t "
+        "seconds scatters by N/√t. B is the bias instability. Paper, section IV-A.",
+        "reporting",
+    ),
+    "tables/dataset_hours": Caption(
+        "Hours of the datasets",
+        "Training recordings count for every gyroscope, test recordings for the three of IMU 1. "
+        "Paper, section IV-A.",
+        "reporting",
+    ),
+    "figures/real2real_saving_against_turn_on_spread": Caption(
+        "What can be saved, against the turn-on spread",
+        "The turn-on spread τ is what the bias changes from one power-on to the next; it decides "
+        "how much can be gained. The line is the ceiling of a sensor with that spread, markers "
+        "are what the networks save, with 95 % intervals.",
+        "real2real",
+    ),
+    "figures/input_channels_input_channels": Caption(
+        "Method 1: more gyroscopes as input channels",
+        f"{_ON_CURVE} Paper, section IV-C.",
+        "input_channels",
+    ),
+    "figures/real2real_training_data": Caption(
+        "Method 2: more gyroscopes as training data",
+        f"{_ON_CURVE} Paper, section IV-D.",
+        "real2real",
+    ),
+    "figures/real2real_gyroscopes_10s": Caption(
+        "Method 2: error at 10 s against the number of gyroscopes",
+        "Left: all windows, the main result. Right: the paper's way. Lower is better. Paper, "
+        "section IV-D.",
+        "real2real",
+    ),
+    "figures/augmentation_sparkfun_3_real": Caption(
+        "SparkFun: 3 real gyroscopes and virtual ones",
+        f"{_ON_CURVE} Paper, section IV-E.",
+        "augmentation",
+    ),
+    "figures/augmentation_sparkfun_12_real": Caption(
+        "SparkFun: 12 real gyroscopes and virtual ones",
+        f"{_ALIKE} Paper, section IV-E.",
+        "augmentation",
+    ),
+    "figures/augmentation_dot_3_real": Caption(
+        "DOT: 3 real gyroscopes and virtual ones", f"{_ALIKE} Paper, section IV-F.", "augmentation"
+    ),
+    "figures/augmentation_dot_12_real": Caption(
+        "DOT: 12 real gyroscopes and virtual ones", f"{_ALIKE} Paper, section IV-F.", "augmentation"
+    ),
+    "figures/running_average": Caption(
+        "Running average of one gyroscope", f"{_TOLERANCE} Paper, section II.", "reporting"
+    ),
+    "figures/calibrated_signal": Caption(
+        "Raw and calibrated signal of the same gyroscope",
+        "Calibrated is the raw signal less the bias. Paper, section II.",
+        "reporting",
+    ),
+    "figures/mg_convergence": Caption(
+        "Running average of several gyroscopes",
+        f"Each gyroscope is centred by its own bias before they are averaged. {_TOLERANCE} Paper, "
+        "section III-A.",
+        "reporting",
+    ),
+    "figures/allan_deviation": Caption(
+        "Allan deviation of every gyroscope",
+        "How much averages of a length differ. White noise falls as 1/√t; flicker noise (B) and "
+        "random walk (K) bend the curve upwards. The dashed line is the fit.",
+        "reporting",
+    ),
+}
+"""By folder and file name, in the order of the report."""
