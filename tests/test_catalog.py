@@ -23,6 +23,7 @@ PIPELINES = {
     "augmentation",
     "ground_truth",
     "input_channels",
+    "leakage",
     "real2real",
     "reporting",
     "virtual_gyros",

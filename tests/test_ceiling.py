@@ -68,7 +68,7 @@ def roles_of(training, validating, testing):
 
 NUMBERS = np.arange(1, 1 + TRAINING + VALIDATING + TESTING)
 HONEST = roles_of(*np.split(NUMBERS, [TRAINING, TRAINING + VALIDATING]))
-LEAKY = roles_of(NUMBERS[TRAINING + VALIDATING :], NUMBERS[:VALIDATING], NUMBERS[:1])
+LEAKY = roles_of(NUMBERS[TRAINING + VALIDATING :], NUMBERS[1:VALIDATING], NUMBERS[:1])
 
 
 @pytest.fixture(scope="module")

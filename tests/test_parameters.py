@@ -106,6 +106,12 @@ def test_the_configuration_of_this_project_is_accepted(loaded, monkeypatch, tmp_
         ({"windows_s": []}, "windows_s:", "at least 1 item"),
         ({"windows_s": [0]}, "windows_s.0:", "greater than 0"),
         ({"seeds": []}, "seeds:", "at least 1 item"),
+        ({"leakage": {"sensors": ["bosch"]}}, "", "leakage.sensors: unknown sensor 'bosch'"),
+        ({"leakage": {"window_s": 53}}, "", "leakage.window_s: 53 s is longer than a recording of"),
+        ({"leakage": {"strides_s": [1, 0]}}, "leakage.strides_s.1:", "greater than 0"),
+        ({"leakage": {"strides_s": [1, 1]}}, "leakage:", "strides_s: [1.0, 1.0] names one of"),
+        ({"leakage": {"folds": 12}}, "leakage:", "folds: 12 parts of 11 recordings"),
+        ({"leakage": {"epochs": 9}}, "leakage.epochs:", "unknown key"),
         (
             {"sensors": {"ng": {"train_recordings": 100}}},
             "sensors.ng:",
@@ -141,3 +147,16 @@ def test_rates_are_those_that_the_counts_imply(parameters):
     assert rates == pytest.approx(
         {"sparkfun": 13000 / 87, "dot": 13000 / 120, "ng": 200, "memsense": 250}
     )
+
+
+@pytest.mark.parametrize(
+    ("windows", "epochs"), [(1, 3000), (44, 3000), (64, 3000), (65, 1500), (4629, 42), (10**6, 1)]
+)
+def test_the_leak_study_takes_the_same_steps_on_any_number_of_windows(parameters, windows, epochs):
+    p = parameters("base")
+    settings = p.leakage.training(p.training, windows)
+    assert settings.epochs == epochs
+    assert set(settings.learning_rates()) == {p.training.learning_rate}
+    assert settings.hop == 20
+    kept = {"batch_size", "centring", "precision"}
+    assert settings.model_dump(include=kept) == p.training.model_dump(include=kept)

@@ -3,13 +3,19 @@ from itertools import product
 
 import pytest
 
-from gyro_pipeline.conventions import HOLD_OUT, InputError
+from gyro_pipeline.conventions import HOLD_OUT, LEAKS, NO_LEAK, TEST_IN_TRAINING, InputError
 from gyro_pipeline.fingerprints import fingerprint
 from gyro_pipeline.parameters import Only
 from gyro_pipeline.studies import (
     CNN,
+    CNN_SHUFFLED,
+    LEAKAGE,
     MEAN,
     Cell,
+    LeakCell,
+    leak_cells,
+    leak_params,
+    leak_sensors,
     over_folds,
     run_params,
     study_cells,
@@ -226,3 +232,59 @@ def test_the_validation_count_is_that_of_the_split(base):
 def test_jitter_is_recorded_with_virtual_gyroscopes(base):
     assert params_of(base, CELL)["turn_on_jitter_mdps"] == base.virtual_gyros.turn_on_jitter_mdps
     assert "turn_on_jitter_mdps" not in params_of(base, replace(CELL, virtual_gyros=0))
+
+
+# the leak study
+
+
+def leak_grid(parameters):
+    return leak_cells(parameters.leakage, "memsense", "simulated", [0, 1])
+
+
+def test_every_stride_has_every_way_of_training_the_honest_split_first(base):
+    cells = leak_grid(base)
+    ways = [(NO_LEAK, CNN), (NO_LEAK, CNN_SHUFFLED), *((leak, CNN) for leak in LEAKS[1:])]
+    assert len(ways) == 5
+    for stride_s in base.leakage.strides_s:
+        there = [c for c in cells if c.window_stride_s == stride_s]
+        assert list(dict.fromkeys((c.leak, c.estimator) for c in there)) == ways
+        for way in ways:
+            folds = [c.fold for c in there if (c.leak, c.estimator) == way and c.seed == 1]
+            assert folds == ([HOLD_OUT] if way[0] == TEST_IN_TRAINING else list(range(5)))
+    assert len(distinct(cells)) == len(cells) == 7 * 2 * (4 * 5 + 1)
+
+
+def test_no_cell_of_another_study_is_one_of_the_leak_study(base):
+    others = [cell for study in base.studies for cell in cells_of(base, study)]
+    assert not distinct(leak_grid(base)) & distinct(others)
+    assert LEAKAGE not in base.studies
+
+
+def test_runs_of_the_leak_study_carry_the_leak_and_the_stride_and_no_others_do(base):
+    p = base
+    cell = leak_grid(p)[0]
+    params = leak_params(cell, p.training, p.leakage, p.splits)
+    assert (
+        params.items()
+        >= {
+            "study": "leakage",
+            "leak": "none",
+            "window_stride_s": 10,
+            "folds": 5,
+            "recordings": 11,
+            "fold": 0,
+            "split_seed": p.splits.split_seed,
+            "channels": p.training.channels,
+        }.items()
+    )
+    for other in (CELL, ALONE):
+        carried = run_params(other, 1, p.training, p.splits, p.virtual_gyros)
+        assert not {"leak", "window_stride_s"} & carried.keys()
+    assert {"leak", "window_stride_s"} == set(LeakCell.names()) - set(Cell.names())
+
+
+def test_only_narrows_the_leak_study_to_a_sensor(base):
+    wide = base.leakage.model_copy(update={"sensors": ["memsense", "dot"]})
+    assert leak_sensors(wide, Only()) == ["memsense", "dot"]
+    assert leak_sensors(wide, Only(sensor="dot")) == ["dot"]
+    assert leak_sensors(wide, Only(sensor="ng")) == []

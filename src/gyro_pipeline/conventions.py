@@ -47,6 +47,13 @@ FIRST, ALL = "first", "all"
 LAST, BEST = "last", "best"
 """Weights at the last epoch (the paper's way), or at the best validation epoch."""
 
+NO_LEAK = "none"
+WINDOW_SPLIT = "window_split"
+TEST_IN_TRAINING = "test_in_training"
+BEST_EPOCH_ON_TEST = "best_epoch_on_test"
+LEAKS = (NO_LEAK, WINDOW_SPLIT, TEST_IN_TRAINING, BEST_EPOCH_ON_TEST)
+"""How test information reaches a training of the leak study on purpose; no other study has any."""
+
 
 class InputError(ValueError):
     """Input that cannot be used; the message says what, where, and what to do."""

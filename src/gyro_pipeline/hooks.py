@@ -22,7 +22,7 @@ from gyro_pipeline.conventions import InputError, Missing
 from gyro_pipeline.datasets.atomic import check_writable
 from gyro_pipeline.datasets.tracked_runs import TrackedRuns
 from gyro_pipeline.parameters import Parameters
-from gyro_pipeline.studies import used_sensors
+from gyro_pipeline.studies import LEAKAGE, leak_sensors, used_sensors
 
 logger = logging.getLogger(__name__)
 
@@ -106,11 +106,14 @@ def _check_matches(parameters: Parameters, pipelines: Sequence[str]) -> None:
     """Refuse an ``only`` that leaves the studies to run without a single cell."""
     sensors = used_sensors(parameters)
     studies = [study for study in sensors if study in pipelines or "__default__" in pipelines]
+    if LEAKAGE in pipelines:
+        sensors[LEAKAGE] = leak_sensors(parameters.leakage, parameters.only)
+        studies.append(LEAKAGE)
     if studies and not any(sensors[study] for study in studies):
         only = parameters.only.model_dump(exclude_none=True)
         raise InputError(
-            f"only={only} matches nothing in {', '.join(studies)}; for what there is, see studies, "
-            "windows_s and seeds in conf/base/parameters/studies.yml"
+            f"only={only} matches nothing in {', '.join(studies)}; for what there is, see "
+            "studies.yml and leakage.yml in conf/base/parameters"
         )
 
 

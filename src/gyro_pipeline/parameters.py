@@ -84,17 +84,27 @@ class Splits(Parameter):
     split_seed: int
 
 
-class Training(Parameter):
-    """The network's sizes and its schedule (paper, sections III-D and IV)."""
+class NetworkSizes(Parameter):
+    """What the paper leaves open of the network (section III-D)."""
 
-    centring: Literal["per_device", "global"] = Field(
-        description="subtract each gyroscope's own training mean, or one mean for all"
-    )
     channels: int = Field(ge=1)
     kernel: int = Field(ge=1, description="samples")
     stride: int = Field(ge=1, description="samples")
     pool: int = Field(ge=1, description="convolution outputs")
     hidden: int = Field(ge=1)
+
+    @property
+    def hop(self) -> int:
+        """Samples from one pooled output to the next."""
+        return self.stride * self.pool
+
+
+class Training(NetworkSizes):
+    """The network's sizes and its schedule (paper, sections III-D and IV)."""
+
+    centring: Literal["per_device", "global"] = Field(
+        description="subtract each gyroscope's own training mean, or one mean for all"
+    )
     epochs: int = Field(ge=1)
     batch_size: int = Field(ge=1)
     learning_rate: float = Field(gt=0)
@@ -159,6 +169,34 @@ class Study(Parameter):
 
     experiment: str = Field(description="name of the MLflow experiment; the study's own name")
     sensors: dict[str, Grid]
+
+
+class Leakage(Parameter):
+    """The leak study: what it trains on, and with which network (docs/honest_protocol.md)."""
+
+    sensors: list[str] = Field(min_length=1)
+    recordings: int = Field(ge=2, description="of IMU 1; the first so many, or all if fewer")
+    window_s: float = Field(gt=0)
+    strides_s: list[Annotated[float, Field(gt=0)]] = Field(
+        min_length=1, description="from the start of one window to that of the next, seconds"
+    )
+    folds: int = Field(ge=2, description="parts to which recordings, or windows, are dealt")
+    steps: int = Field(ge=1, description="of the optimiser, at least, at a constant learning rate")
+    network: NetworkSizes
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        if len(set(self.strides_s)) < len(self.strides_s):
+            raise ValueError(f"strides_s: {self.strides_s} names one of them twice")
+        if self.folds > self.recordings:
+            raise ValueError(f"folds: {self.folds} parts of {self.recordings} recordings")
+        return self
+
+    def training(self, base: Training, windows: int) -> Training:
+        """Settings to train on so many windows: the base's, with this network and its steps."""
+        epochs = -(-self.steps // -(-windows // base.batch_size))
+        changes = {"epochs": epochs, "decay": 1.0, "stop_below": 0.0}
+        return base.model_copy(update=self.network.model_dump() | changes)
 
 
 class Only(Parameter):
@@ -244,6 +282,7 @@ class Parameters(Parameter):
     windows_s: list[Annotated[float, Field(gt=0)]] = Field(min_length=1)
     seeds: list[int] = Field(min_length=1)
     studies: dict[str, Study]
+    leakage: Leakage
     only: Only
     published: Published
 
@@ -257,6 +296,18 @@ class Parameters(Parameter):
         for sensor in (row.sensor for rows in (p.specifications, p.hours) for row in rows):
             if sensor not in self.sensors:
                 raise ValueError(f"published: unknown sensor {sensor!r}; {self._known}")
+        return self
+
+    @model_validator(mode="after")
+    def _the_leak_study_asks_for_what_sensors_give(self) -> Self:
+        for name in self.leakage.sensors:
+            if name not in self.sensors:
+                raise ValueError(f"leakage.sensors: unknown sensor {name!r}; {self._known}")
+            if self.leakage.window_s > self.sensors[name].recording_s:
+                raise ValueError(
+                    f"leakage.window_s: {self.leakage.window_s:g} s is longer than a recording of "
+                    f"{name}, {self.sensors[name].recording_s:g} s"
+                )
         return self
 
     @model_validator(mode="after")

@@ -16,7 +16,7 @@ from gyro_pipeline.pipelines import (
     virtual_gyros,
     windowed_splits,
 )
-from gyro_pipeline.studies import used_sensors
+from gyro_pipeline.studies import LEAKAGE, leak_sensors, used_sensors
 
 _selected: Parameters | None = None
 
@@ -53,6 +53,7 @@ def register_pipelines() -> dict[str, Pipeline]:
         sensors=[row.sensor for row in published.specifications],
         virtual=[row.sensor for row in published.hours if row.virtual],
     )
+    pipelines[LEAKAGE] = _leakage(parameters)
     pipelines["__default__"] = _runs(parameters, sensors) + pipelines["reporting"]
     return pipelines
 
@@ -67,6 +68,17 @@ def _runs(parameters: Parameters, studies: dict[str, list[str]]) -> Pipeline:
             whole += training.create_pipeline(study, sensor, virtual)
             whole += evaluation.create_pipeline(study, sensor)
     return whole
+
+
+def _leakage(parameters: Parameters) -> Pipeline:
+    """From raw logs to the leak study's table and figure; no other pipeline has any of it."""
+    sensors = leak_sensors(parameters.leakage, parameters.only)
+    whole = Pipeline([])
+    for sensor in sensors:
+        whole += _measured(sensor) + training.create_leakage_pipeline(sensor)
+        whole += evaluation.create_leakage_pipeline(sensor)
+    # never without nodes, which Kedro refuses before our check can say why
+    return whole + reporting.create_leakage_pipeline(sensors or parameters.leakage.sensors)
 
 
 def _measured(sensor: str) -> Pipeline:

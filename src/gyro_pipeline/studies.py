@@ -5,10 +5,30 @@ from dataclasses import asdict, dataclass, fields, replace
 from itertools import product
 from typing import Any
 
-from gyro_pipeline.conventions import AXES, HOLD_OUT, InputError
-from gyro_pipeline.parameters import Only, Parameters, Splits, Study, Training, VirtualGyros
+from gyro_pipeline.conventions import (
+    AXES,
+    HOLD_OUT,
+    LEAKS,
+    NO_LEAK,
+    TEST_IN_TRAINING,
+    InputError,
+)
+from gyro_pipeline.parameters import (
+    Leakage,
+    Only,
+    Parameters,
+    Splits,
+    Study,
+    Training,
+    VirtualGyros,
+)
 
-CNN, MEAN = "cnn", "mean"
+CNN, CNN_SHUFFLED, MEAN = "cnn", "cnn_shuffled", "mean"
+NETWORKS = (CNN, CNN_SHUFFLED)
+"""Estimators that are the paper's network: as it is, and with shuffled labels, a leak detector."""
+
+LEAKAGE = "leakage"
+"""The leak study: its pipeline, MLflow experiment and parameters."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +65,7 @@ class Cell:
         """What the training depends on: not the study, and one IMU is the same in both methods."""
         content = asdict(self)
         del content["study"]
-        if self.estimator == CNN and self.real_imus == 1:
+        if self.estimator in NETWORKS and self.real_imus == 1:
             content["method"] = 2
         return content
 
@@ -53,6 +73,30 @@ class Cell:
     def names(cls) -> list[str]:
         """Names of the fields, in order."""
         return [field.name for field in fields(cls)]
+
+
+@dataclass(frozen=True)
+class LeakCell(Cell):
+    """A training of the leak study; no run of another study has these parameters."""
+
+    leak: str
+    window_stride_s: float
+
+
+def leak_cells(leakage: Leakage, sensor: str, source: str, seeds: Sequence[int]) -> list[LeakCell]:
+    """Cells of the leak study on a sensor: for each stride the honest split, then the leaks."""
+    ways = [(NO_LEAK, CNN), (NO_LEAK, CNN_SHUFFLED), *((leak, CNN) for leak in LEAKS[1:])]
+    imu = (2, sensor, source, len(AXES), 0)
+    return [
+        LeakCell(LEAKAGE, *imu, leakage.window_s, seed, fold, estimator, leak, stride_s)
+        for stride_s, (leak, estimator), seed in product(leakage.strides_s, ways, seeds)
+        for fold in ([HOLD_OUT] if leak == TEST_IN_TRAINING else range(leakage.folds))
+    ]
+
+
+def leak_sensors(leakage: Leakage, only: Only) -> list[str]:
+    """Sensors of the leak study that ``only`` leaves."""
+    return [sensor for sensor in leakage.sensors if only.sensor in (None, sensor)]
 
 
 def study_cells(  # noqa: PLR0913 - what a grid is made of
@@ -112,8 +156,24 @@ def over_folds(cells: Sequence[Cell], folds: Sequence[int], only: Only) -> list[
     return [
         replace(cell, fold=fold)
         for cell in cells
-        for fold in (wanted if cell.estimator == CNN else [HOLD_OUT])
+        for fold in (wanted if cell.estimator in NETWORKS else [HOLD_OUT])
     ]
+
+
+def leak_params(
+    cell: LeakCell, settings: Training, leakage: Leakage, splits: Splits
+) -> dict[str, Any]:
+    """Parameters that a run of the leak study carries; see :func:`run_params`.
+
+    Args:
+        cell: Which run.
+        settings: What the network was trained with.
+        leakage: How many recordings it uses, and into how many folds they or their windows go.
+        splits: The seed of the deal.
+    """
+    folds = 1 if cell.fold == HOLD_OUT else leakage.folds
+    used = {"folds": folds, "recordings": leakage.recordings, "split_seed": splits.split_seed}
+    return asdict(cell) | used | settings.model_dump()
 
 
 def run_params(
@@ -129,7 +189,7 @@ def run_params(
         virtual_gyros: Their turn-on jitter is recorded where the cell has some.
     """
     params: dict[str, Any] = asdict(cell) | {"folds": folds}
-    if cell.estimator != CNN:
+    if cell.estimator not in NETWORKS:
         return params
     validation = splits.validation_recordings if folds == 1 else splits.fold_validation_recordings
     params |= training.model_dump()

@@ -1,4 +1,5 @@
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from gyro_pipeline.learning.examples import (
     device_centres,
     scaled_examples,
     training_examples,
+    with_shuffled_labels,
 )
 from gyro_pipeline.learning.network import Architecture
 from gyro_pipeline.protocol.windows import cut_windows
@@ -199,3 +201,57 @@ def test_making_examples_changes_no_recording_and_needs_one_packed_copy_of_them(
     tracemalloc.stop()
     assert 0.9 * rates.nbytes < peak < 1.2 * rates.nbytes  # beside the recordings themselves
     np.testing.assert_array_equal(rates, original)
+
+
+def test_windows_to_use_may_be_named_by_their_starts():
+    rates, bias = drawn(samples=50)
+    usual = device(rates, bias)
+    starts = (np.array([0, 3, 30]), np.array([7]), np.array([5, 5]))
+    chosen = replace(usual, starts=starts)
+    assert (usual.windows(WINDOW), chosen.windows(WINDOW)) == ([2, 2, 2], [3, 1, 2])
+    examples, scaling = training_examples([chosen], ONE_IMU, "per_device")
+    places = [(number, start) for number in range(3) for start in starts[number]]
+    windows = np.array([rates[0, number, :, start : start + WINDOW] for number, start in places])
+    got = unpacked(examples, 3) * scaling.input_scale + scaling.centres[0][:, None]
+    np.testing.assert_allclose(got, windows, atol=2e-6 * np.abs(rates).max())
+    targets = examples.targets * scaling.target_scale + scaling.centres[0]
+    np.testing.assert_allclose(targets, [bias[0, number] for number, _ in places], atol=2e-6 * 10)
+
+
+def test_starts_a_window_apart_give_the_usual_examples():
+    rates, bias = drawn(samples=50)
+    usual = device(rates, bias)
+    named = replace(usual, starts=(np.array([0, 20]),) * 3)
+    (one, scaling), (other, same) = (
+        training_examples([d], ONE_IMU, "per_device") for d in (usual, named)
+    )
+    np.testing.assert_array_equal(one.inputs, other.inputs)
+    np.testing.assert_array_equal(one.targets, other.targets)
+    assert scaling.input_scale == same.input_scale
+
+
+def test_overlapping_windows_need_one_packed_copy_of_them():
+    """A copy of one recording's windows at a time, never of all of them."""
+    rates, bias = drawn(imus=1, recordings=20, samples=2_000)
+    starts = (np.arange(0, 1_500, 5),) * 20
+    dense = replace(device(rates, bias, (1,), tuple(range(1, 21))), starts=starts)
+    sizes = Architecture(3, 500, 8, 10, 10, 8, 32)
+    tracemalloc.start()
+    examples, _ = training_examples([dense], sizes, "per_device")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 1.15 * examples.inputs.nbytes
+
+
+def test_shuffled_labels_are_permuted_for_each_gyroscope_on_its_own():
+    rates, bias = drawn(imus=2, recordings=9)
+    numbers = (1, 2, 3, 5, 6, 7, 8, 9)
+    both = device(rates, bias, (2, 1), numbers)
+    shuffled = with_shuffled_labels(both, np.random.default_rng(0))
+    before, after = both.biases(), shuffled.biases()
+    np.testing.assert_array_equal(np.sort(before, axis=0), np.sort(after, axis=0))
+    orders = [tuple(np.argsort(np.argsort(column))) for column in after.T]
+    assert len(set(orders)) == 6
+    # neither the recording that is not used, nor what was given, is changed
+    np.testing.assert_array_equal(shuffled.bias.sel(recording=4), bias[:, 3])
+    np.testing.assert_array_equal(both.bias, bias)

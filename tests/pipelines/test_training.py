@@ -11,7 +11,7 @@ from gyro_pipeline.conventions import InputError
 from gyro_pipeline.parameters import Execution, Only
 from gyro_pipeline.pipelines.training import nodes
 from gyro_pipeline.pipelines.training.nodes import Devices
-from gyro_pipeline.studies import CNN, HOLD_OUT, MEAN, Cell
+from gyro_pipeline.studies import CNN, CNN_SHUFFLED, HOLD_OUT, MEAN, Cell
 from gyro_pipeline.tracking import FINGERPRINT, HISTORY, TRAINED_IN, WEIGHTS
 
 KEYS = ["estimator", "method", "real_gyros", "virtual_gyros", "window_s", "seed", "fold"]
@@ -45,7 +45,7 @@ def cell(**changes):
 
 def devices(world, **changes):
     w = replace(world, **changes)
-    labelled = nodes._labelled(w.bias)
+    labelled = nodes.labelled_bias(w.bias)
     return Devices(w.recordings, labelled, w.roles, w.virtual, w.virtual_gyros)
 
 
@@ -201,6 +201,58 @@ def test_validation_and_test_recordings_are_withheld_for_every_imu(world):
     job = devices(world).job("", cell(real_gyros=6), world.training)
     assert {number for device in job.devices for number in device.numbers} == set(range(1, 9))
     assert (job.validation.imus, job.validation.numbers) == ((1,), (9, 10))
+
+
+@pytest.mark.parametrize(
+    ("number", "role", "message"),
+    [
+        (3, "test", r"sparkfun fold -1: recording 3 .*: train \(IMU 1, 2\), test \(IMU 1\); .*"),
+        (3, "validation", r"recording 3 .*: train \(IMU 1, 2\), validation \(IMU 1\); .* together"),
+        (12, "validation", r"recording 12 .*: validation \(IMU 1\), test \(IMU 1\)"),
+    ],
+)
+def test_a_training_that_would_use_a_recording_twice_is_refused(world, number, role, message):
+    """Here the roles themselves are bad; the plan would refuse them, and so does each training."""
+    second = pd.DataFrame({"fold": HOLD_OUT, "recording": [number], "role": role})
+    leaky = devices(world, roles=pd.concat([world.roles, second]))
+    with pytest.raises(InputError, match=message):
+        leaky.job("", cell(real_gyros=6), world.training)
+
+
+def test_imus_recorded_together_cannot_get_a_role_each(world, monkeypatch):
+    """IMU 2 is made to train on what IMU 1 is tested on."""
+    honest = Devices._real
+
+    def leaky(self, imus, fold, role):
+        return honest(self, imus, fold, "test" if imus == (2,) and role == "train" else role)
+
+    monkeypatch.setattr(Devices, "_real", leaky)
+    message = r"recording 11 .*: train \(IMU 2\), test \(IMU 1\); .* for all IMUs recorded together"
+    with pytest.raises(InputError, match=message):
+        devices(world).job("", cell(real_gyros=6), world.training)
+
+
+def test_shuffled_labels_are_those_of_other_recordings_of_the_same_gyroscope(world):
+    honest = devices(world).job("", cell(real_gyros=6), world.training)
+    shuffled = devices(world).job("", cell(real_gyros=6, estimator=CNN_SHUFFLED), world.training)
+    for one, other in zip(honest.devices, shuffled.devices, strict=True):
+        assert one.numbers == other.numbers
+        assert not np.array_equal(one.biases(), other.biases())
+        np.testing.assert_array_equal(
+            np.sort(one.biases(), axis=0), np.sort(other.biases(), axis=0)
+        )
+    np.testing.assert_array_equal(honest.validation.biases(), shuffled.validation.biases())
+
+
+def test_seeds_have_shuffled_labels_of_their_own_and_share_no_examples(world):
+    made = devices(world)
+    jobs = [
+        made.job("", cell(estimator=CNN_SHUFFLED, seed=seed), world.training) for seed in (0, 0, 1)
+    ]
+    first, again, other = (job.devices[0].biases() for job in jobs)
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+    assert jobs[0].cell == jobs[1].cell != jobs[2].cell
 
 
 def test_targets_are_the_ground_truth(world):

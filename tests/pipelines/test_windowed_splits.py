@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from gyro_pipeline.conventions import HOLD_OUT, TEST, TRAIN, VALIDATION
+from gyro_pipeline.conventions import HOLD_OUT, TEST, TRAIN, VALIDATION, InputError
 from gyro_pipeline.pipelines.windowed_splits.nodes import split_recordings
 
 
@@ -59,3 +59,21 @@ def test_few_recordings_make_a_k_fold_that_tests_each_once(recordings, parameter
     tested = [number for fold in range(folds) for number in numbers(roles, TEST, fold)]
     assert sorted(tested) == list(range(1, 1 + count))
     assert {len(numbers(roles, VALIDATION, fold)) for fold in range(folds)} == {2}
+
+
+def test_a_recording_that_is_in_both_of_a_sources_files_is_refused(recordings, parameters):
+    made, splits = recordings(30, given_test=(1, 5, 7)), parameters("base").splits
+    twice = made.copy(deep=True)
+    twice.angular_rate.loc[{"recording": 7}] = made.angular_rate.sel(recording=9)
+    with pytest.raises(InputError, match=r"recording 9 .* IMU 1 recording 7 \(test\)"):
+        split_recordings(twice, splits)
+
+
+def test_a_copy_under_another_imu_is_refused_and_absent_ones_are_no_copies(recordings, parameters):
+    made, splits = recordings(30, given_test=(1, 5, 7)), parameters("base").splits
+    absent = made.copy(deep=True)
+    absent.angular_rate.loc[{"imu": 2, "recording": [5, 9]}] = np.nan
+    split_recordings(absent, splits)
+    absent.angular_rate.loc[{"imu": 2, "recording": 12}] = made.angular_rate.sel(imu=1, recording=7)
+    with pytest.raises(InputError, match=r"IMU 2 recording 12 .* IMU 1 recording 7"):
+        split_recordings(absent, splits)

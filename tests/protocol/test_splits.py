@@ -3,7 +3,14 @@ import pandas as pd
 import pytest
 
 from gyro_pipeline.conventions import HOLD_OUT, TEST, TRAIN, VALIDATION, InputError
-from gyro_pipeline.protocol.splits import assign_roles, check_roles, with_role
+from gyro_pipeline.protocol.splits import (
+    assign_roles,
+    check_roles,
+    deal,
+    refuse_copies,
+    refuse_two_roles,
+    with_role,
+)
 
 HUNDRED = range(1, 101)
 
@@ -128,3 +135,57 @@ def test_honest_roles_pass_the_guard():
 def test_the_guard_refuses(rows, message):
     with pytest.raises(InputError, match=message):
         check_roles(frame(*rows))
+
+
+def test_a_role_of_its_own_for_each_imu_is_refused():
+    # IMU 2 would train on the recording that IMU 1 is tested on.
+    roles = frame((0, 1, TRAIN), (0, 2, TEST), (0, 2, TRAIN)).assign(imu=[1, 1, 2])
+    with pytest.raises(InputError, match="recordings 2 have .* for all IMUs recorded together"):
+        check_roles(roles)
+
+
+def test_recordings_used_in_one_role_pass_whatever_their_imus():
+    refuse_two_roles(
+        {TRAIN: [(1, 1), (2, 1), (2, 3)], VALIDATION: [(1, 4)], TEST: [(1, 2)]}, "dot fold 0"
+    )
+
+
+@pytest.mark.parametrize(
+    ("used", "message"),
+    [
+        (
+            {TRAIN: [(1, 5)], TEST: [(1, 5)]},
+            r"dot fold 3: recording 5 .* train \(IMU 1\), test \(IMU 1\)",
+        ),
+        (
+            {TRAIN: [(1, 1), (2, 7), (3, 7)], TEST: [(1, 7)]},
+            r"recording 7 .* train \(IMU 2, 3\), test \(IMU 1\); .* all IMUs recorded together",
+        ),
+        (
+            {TRAIN: [(2, 7)], VALIDATION: [(1, 7)], TEST: [(1, 8)]},
+            r"recording 7 .* train \(IMU 2\), validation \(IMU 1\)",
+        ),
+    ],
+)
+def test_a_recording_used_in_two_roles_is_refused_also_by_different_imus(used, message):
+    with pytest.raises(InputError, match=message):
+        refuse_two_roles(used, "dot fold 3")
+
+
+def test_one_recording_under_two_numbers_is_refused_where_their_roles_differ():
+    roles = frame((0, 1, TRAIN), (0, 2, TRAIN), (0, 3, TEST), (1, 1, TEST), (1, 2, TRAIN))
+    refuse_copies({(1, 1): "a", (1, 2): "b", (2, 1): "c", (2, 2): "d"}, roles)
+    refuse_copies({(1, 1): "a", (1, 2): "a"}, frame((0, 1, TRAIN), (0, 2, TRAIN), (0, 3, TEST)))
+    with pytest.raises(InputError, match=r"fold 1: IMU 1 recording 2 \(train\) .* 1 \(test\)"):
+        refuse_copies({(1, 1): "a", (1, 2): "a"}, roles)
+    with pytest.raises(InputError, match=r"fold 0: IMU 2 recording 3 \(test\) .* IMU 1 record"):
+        refuse_copies({(1, 1): "a", (2, 3): "a"}, roles)
+
+
+def test_dealing_gives_every_position_once_and_knows_its_seed():
+    parts = deal(11, 5, seed=3)
+    assert sorted(map(len, parts)) == [2, 2, 2, 2, 3]
+    assert sorted(np.concatenate(parts).tolist()) == list(range(11))
+    again, other = deal(11, 5, seed=3), deal(11, 5, seed=4)
+    assert all(np.array_equal(a, b) for a, b in zip(parts, again, strict=True))
+    assert not all(np.array_equal(a, b) for a, b in zip(parts, other, strict=True))

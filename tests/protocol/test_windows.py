@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.protocol.windows import cut_windows, window_size
+from gyro_pipeline.protocol.windows import cut_windows, window_size, window_starts
 
 
 @pytest.mark.parametrize(
@@ -41,6 +41,23 @@ def test_windows_are_views():
     assert recordings[1, 2, 0, 7] == 7.0
     # Also where an axis before the samples is strided, as three IMUs' windows side by side are.
     assert np.shares_memory(cut_windows(recordings[:, 0], 5), recordings)
+
+
+def test_windows_that_overlap_are_named_by_their_starts():
+    samples = np.arange(2 * 23).reshape(2, 23)
+    starts = window_starts(23, size=5, stride=3)
+    assert starts.tolist() == [0, 3, 6, 9, 12, 15, 18]
+    windows = cut_windows(samples, 5, starts)
+    assert windows.shape == (2, 7, 5)
+    for k, start in enumerate(starts):
+        np.testing.assert_array_equal(windows[:, k], samples[:, start : start + 5])
+    assert cut_windows(samples, 5, starts[:0]).shape == (2, 0, 5)
+
+
+def test_starts_a_window_apart_are_the_non_overlapping_windows():
+    samples = np.random.default_rng(0).normal(size=(3, 23))
+    starts = window_starts(23, size=5, stride=5)
+    np.testing.assert_array_equal(cut_windows(samples, 5, starts), cut_windows(samples, 5))
 
 
 def test_a_window_may_be_the_whole_recording():

@@ -269,6 +269,12 @@ def _run_name(params: Mapping[str, Any]) -> str:
     if params["estimator"] == "mean":
         return f"{params['sensor']} mean {params['window_s']:g} s"
     fold = f" fold {params['fold']}" if params["fold"] >= 0 else ""
+    if "leak" in params:
+        shuffled = " shuffled labels" if params["estimator"] == "cnn_shuffled" else ""
+        return (
+            f"{params['sensor']} leak {params['leak']}{shuffled} {params['window_s']:g} s every "
+            f"{params['window_stride_s']:g} s seed {params['seed']}{fold}"
+        )
     return (
         f"{params['sensor']} {params['real_gyros']}+{params['virtual_gyros']} "
         f"{params['window_s']:g} s seed {params['seed']}{fold}"

@@ -1,7 +1,7 @@
 """From recordings to scaled training examples, few recordings in memory at a time."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -25,12 +25,21 @@ class Device:
         bias: Bias of each recording, (imu, recording, axis), deg/s.
         imus: The IMUs side by side, one for Method 2.
         numbers: Recording numbers to use.
+        starts: First samples of the windows to use of each recording, which may overlap; None for
+            all non-overlapping ones.
     """
 
     recordings: xr.DataArray
     bias: xr.DataArray
     imus: tuple[int, ...]
     numbers: tuple[int, ...]
+    starts: tuple[np.ndarray, ...] | None = None
+
+    def windows(self, size: int) -> list[int]:
+        """How many windows of ``size`` samples each recording gives."""
+        if self.starts is not None:
+            return [len(starts) for starts in self.starts]
+        return [self.recordings.sizes["sample"] // size] * len(self.numbers)
 
     def biases(self) -> np.ndarray:
         """Biases of the recordings, shape (recordings, gyroscopes), deg/s."""
@@ -50,6 +59,20 @@ class Device:
             read = part.transpose("recording", "imu", "axis", "sample").to_numpy()
             for row in wanted - wanted.min():
                 yield read[row, imus - imus.min()].reshape(-1, read.shape[-1])
+
+
+def with_shuffled_labels(device: Device, generator: np.random.Generator) -> Device:
+    """The device with its biases permuted between the recordings used: a leak detector.
+
+    Each gyroscope is permuted on its own. What a window says about its bias is then lost, and all
+    that is left to learn is the device's constant. A network that does better on test recordings
+    has seen something of them.
+    """
+    used = {"imu": list(device.imus), "recording": list(device.numbers)}
+    bias = device.bias.copy(deep=True)
+    labels = bias.loc[used].transpose("imu", "axis", "recording")
+    bias.loc[used] = labels.copy(data=generator.permuted(labels.to_numpy(), axis=-1))
+    return replace(device, bias=bias)
 
 
 @dataclass(frozen=True)
@@ -130,16 +153,19 @@ def scaled_examples(device: Device, architecture: Architecture, scaling: Scaling
 def _centred(
     devices: Sequence[Device], centres: Sequence[np.ndarray], architecture: Architecture
 ) -> Examples:
-    per_recording = devices[0].recordings.sizes["sample"] // architecture.window
-    n = per_recording * sum(len(device.numbers) for device in devices)
+    n = sum(sum(device.windows(architecture.window)) for device in devices)
     inputs = aligned_zeros((n, *packed_shape(architecture)))
     targets = np.empty((n, architecture.gyroscopes), np.float32)
     start = 0
     for device, centre in zip(devices, centres, strict=True):
-        for samples, bias in zip(device.samples(), device.biases(), strict=True):
-            rows = slice(start, start + per_recording)
+        counts = device.windows(architecture.window)
+        starts = device.starts or [None] * len(counts)
+        used = zip(device.samples(), device.biases(), counts, starts, strict=True)
+        for samples, bias, count, chosen in used:
+            rows = slice(start, start + count)
             centred = samples - centre[:, None].astype(np.float32)
-            pack(cut_windows(centred, architecture.window), architecture, out=inputs[rows])
+            windows = cut_windows(centred, architecture.window, chosen)
+            pack(windows, architecture, out=inputs[rows])
             targets[rows] = bias - centre
             start = rows.stop
     return Examples(inputs, targets)

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -66,8 +66,7 @@ class TrainingJob:
     @property
     def windows(self) -> int:
         """Training examples."""
-        per_recording = self.devices[0].recordings.sizes["sample"] // self.window
-        return per_recording * sum(len(device.numbers) for device in self.devices)
+        return sum(sum(device.windows(self.window)) for device in self.devices)
 
     @property
     def recordings(self) -> int:
@@ -132,7 +131,7 @@ def run_training(job: TrainingJob, report: Callable[[float], None]) -> TrainedNe
 class _Watched(Device):
     """A device that tells when one of its recordings has been used."""
 
-    after_each: Callable[[], None]
+    after_each: Callable[[], None] = field(kw_only=True)
 
     def samples(self) -> Iterator[np.ndarray]:
         """See :class:`Device`."""
@@ -152,7 +151,7 @@ def prepared(
     """
 
     def watched(device: Device) -> Device:
-        return _Watched(device.recordings, device.bias, device.imus, device.numbers, after_each)
+        return _Watched(**vars(device), after_each=after_each)
 
     devices, a = [watched(device) for device in job.devices], job.architecture
     examples, scaling = training_examples(devices, a, job.settings.centring)

@@ -170,9 +170,7 @@ def estimated_bytes(jobs: Sequence[TrainingJob]) -> float:
 
 def _examples(job: TrainingJob) -> int:
     """Training and validation windows."""
-    per_recording = job.devices[0].recordings.sizes["sample"] // job.window
-    validation = len(job.validation.numbers) if job.validation else 0
-    return job.windows + per_recording * validation
+    return job.windows + (sum(job.validation.windows(job.window)) if job.validation else 0)
 
 
 def _sizes(job: TrainingJob) -> str:

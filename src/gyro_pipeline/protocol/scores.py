@@ -15,7 +15,6 @@ from scipy import stats
 from gyro_pipeline.conventions import FIRST
 
 CONFIDENCE_PCT = 95
-_TAILS = np.array([0.5 - CONFIDENCE_PCT / 200, 0.5 + CONFIDENCE_PCT / 200])
 
 
 @dataclass(frozen=True)
@@ -111,16 +110,18 @@ def resampled_weights(recordings: int, resamples: int, seed: int) -> np.ndarray:
     return np.concatenate([plain, draws])
 
 
-def with_interval(values: np.ndarray) -> Estimate:
+def with_interval(values: np.ndarray, confidence_pct: float = CONFIDENCE_PCT) -> Estimate:
     """The first value, with the central 95 % of the others as its interval.
 
     Args:
         values: Shape (1 + resamples,), may hold infinities.
+        confidence_pct: Another confidence than 95 %.
     """
     if len(values) == 1:
         return Estimate(float(values[0]))
+    tails = 0.5 + np.array([-confidence_pct, confidence_pct]) / 200
     # "inverted_cdf" never interpolates, so that infinities stay what they are.
-    lo, hi = np.quantile(values[1:], _TAILS, method="inverted_cdf")
+    lo, hi = np.quantile(values[1:], tails, method="inverted_cdf")
     return Estimate(float(values[0]), float(lo), float(hi))
 
 
@@ -188,6 +189,26 @@ def score(
     ratio = np.divide(rmse, mean_rmse, out=np.full_like(rmse, np.inf), where=mean_rmse > 0)
     scores["accuracy_gain_pct"] = with_interval(100 * (1 - ratio))
     return scores
+
+
+def paired_difference(
+    errors: SquaredErrors,
+    reference: SquaredErrors,
+    weights: np.ndarray,
+    confidence_pct: float = CONFIDENCE_PCT,
+) -> Estimate:
+    """Mean square of an estimator less that of a reference on the same windows, (deg/s)^2.
+
+    Args:
+        errors: Of the estimator.
+        reference: Of what it is compared with, for the same recordings.
+        weights: From :func:`resampled_weights`; recordings are drawn for both together.
+        confidence_pct: Of the interval.
+
+    Returns:
+        Negative where the estimator is better, significantly so if the upper end is below 0.
+    """
+    return with_interval(errors.mean(weights) - reference.mean(weights), confidence_pct)
 
 
 def beats_oracle(errors: SquaredErrors, oracle: SquaredErrors) -> float:

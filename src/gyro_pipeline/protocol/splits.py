@@ -1,6 +1,6 @@
 """Which recordings train, validate and test; always by recording, never by window."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -61,6 +61,59 @@ def check_roles(roles: pd.DataFrame) -> None:
                 )
 
 
+def refuse_two_roles(used: Mapping[str, Iterable[tuple[int, int]]], where: str) -> None:
+    """Refuse recordings used in two roles, be it by different IMUs: they were recorded together.
+
+    Args:
+        used: For each role the IMU and the number of every recording used in it.
+        where: What an error message calls the training.
+
+    Raises:
+        InputError: Naming the recording, its roles and the IMUs.
+    """
+    imus_of: dict[int, dict[str, set[int]]] = {}
+    for role, recordings in used.items():
+        for imu, number in recordings:
+            imus_of.setdefault(number, {}).setdefault(role, set()).add(imu)
+    for number, roles in sorted(imus_of.items()):
+        if len(roles) > 1:
+            uses = ", ".join(
+                f"{role} (IMU {', '.join(map(str, sorted(imus)))})" for role, imus in roles.items()
+            )
+            raise InputError(
+                f"{where}: recording {number} is used in more than one role: {uses}; a recording "
+                "trains, validates or tests, for all IMUs recorded together"
+            )
+
+
+def refuse_copies(contents: Mapping[tuple[int, int], str], roles: pd.DataFrame) -> None:
+    """Refuse one recording under two numbers with different roles.
+
+    Args:
+        contents: A hash of the samples, by IMU and recording number.
+        roles: From :func:`assign_roles`.
+
+    Raises:
+        InputError: Naming both recordings and the fold.
+    """
+    first: dict[str, tuple[int, int]] = {}
+    for (imu, number), content in contents.items():
+        twin_imu, twin = first.setdefault(content, (imu, number))
+        for fold, group in roles.groupby("fold"):
+            role = group.set_index("recording").role
+            if role[twin] != role[number]:
+                raise InputError(
+                    f"fold {fold}: IMU {imu} recording {number} ({role[number]}) holds the same "
+                    f"samples as IMU {twin_imu} recording {twin} ({role[twin]}); leave one of "
+                    "them out, or give both the same role"
+                )
+
+
+def deal(count: int, folds: int, seed: int) -> list[np.ndarray]:
+    """Deal positions 0 to ``count`` - 1 at random to ``folds`` parts of nearly equal size."""
+    return np.array_split(np.random.default_rng(seed).permutation(count), folds)
+
+
 def with_role(roles: pd.DataFrame, fold: int, role: str) -> list[int]:
     """Recording numbers that have ``role`` in ``fold``."""
     return roles.recording[(roles.fold == fold) & (roles.role == role)].tolist()
@@ -70,9 +123,8 @@ def _k_folds(recordings: Sequence[int], splits: Splits) -> dict[int, list[int]]:
     leave_one_out = len(recordings) <= splits.leave_one_out_up_to
     if leave_one_out:
         return {fold: [recording] for fold, recording in enumerate(recordings)}
-    shuffled = np.random.default_rng(splits.split_seed).permutation(recordings)
-    parts = np.array_split(shuffled, splits.folds)
-    return {fold: sorted(map(int, part)) for fold, part in enumerate(parts)}
+    parts = deal(len(recordings), splits.folds, splits.split_seed)
+    return {fold: sorted(recordings[i] for i in part) for fold, part in enumerate(parts)}
 
 
 def _fold_roles(

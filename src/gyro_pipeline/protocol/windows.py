@@ -1,6 +1,7 @@
 """Windows: what an estimator sees of a recording."""
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from gyro_pipeline.conventions import InputError
 
@@ -27,15 +28,24 @@ def window_size(window_s: float, rate_hz: float, recording_samples: int, where: 
     return size
 
 
-def cut_windows(samples: np.ndarray, size: int) -> np.ndarray:
-    """All non-overlapping windows from the start of a recording, as a view.
+def window_starts(samples: int, size: int, stride: int) -> np.ndarray:
+    """First samples of all windows that fit into a recording, ``stride`` samples apart."""
+    return np.arange(0, samples - size + 1, stride)
+
+
+def cut_windows(samples: np.ndarray, size: int, starts: np.ndarray | None = None) -> np.ndarray:
+    """Windows of a recording; all non-overlapping ones from its start unless others are named.
 
     Args:
         samples: Shape (..., n).
         size: Samples per window.
+        starts: First samples of the windows, which may overlap.
 
     Returns:
-        Shape (..., n // size, size); the last n % size samples are in no window.
+        Shape (..., windows, size). Without ``starts`` a view, n // size windows, where the last
+        n % size samples are in none; with them a copy.
     """
+    if starts is not None:
+        return sliding_window_view(samples, size, axis=-1)[..., starts, :]
     count = samples.shape[-1] // size
     return samples[..., : count * size].reshape(*samples.shape[:-1], count, size)

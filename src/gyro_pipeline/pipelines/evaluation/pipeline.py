@@ -2,7 +2,9 @@
 
 from kedro.pipeline import Node, Pipeline
 
+from gyro_pipeline.pipelines.evaluation.leakage import evaluate_leakage
 from gyro_pipeline.pipelines.evaluation.nodes import evaluate
+from gyro_pipeline.studies import LEAKAGE
 
 
 def create_pipeline(study: str, sensor: str) -> Pipeline:
@@ -22,6 +24,29 @@ def create_pipeline(study: str, sensor: str) -> Pipeline:
                 },
                 f"{study}.{sensor}.evaluation.runs",
                 name=f"evaluate_{study}_{sensor}",
+                namespace="evaluation",
+            )
+        ]
+    )
+
+
+def create_leakage_pipeline(sensor: str) -> Pipeline:
+    """Evaluation of the leak study's runs on one sensor."""
+    settings = {name: f"params:{name}" for name in ("leakage", "splits", "evaluation")}
+    return Pipeline(
+        [
+            Node(
+                evaluate_leakage,
+                settings
+                | {
+                    "cells": f"{LEAKAGE}.{sensor}.training.cells",
+                    "runs": f"{LEAKAGE}.{sensor}.training.runs",
+                    "recordings": f"{sensor}.raw_logs.recordings",
+                    "bias": f"{sensor}.ground_truth.bias",
+                    "allan": f"{sensor}.ground_truth.allan",
+                },
+                f"{LEAKAGE}.{sensor}.evaluation.runs",
+                name=f"evaluate_{LEAKAGE}_{sensor}",
                 namespace="evaluation",
             )
         ]

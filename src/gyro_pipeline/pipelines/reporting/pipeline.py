@@ -5,7 +5,7 @@ from typing import Any
 
 from kedro.pipeline import Node, Pipeline
 
-from gyro_pipeline.pipelines.reporting import figures, signals, tables
+from gyro_pipeline.pipelines.reporting import figures, leakage, signals, tables
 from gyro_pipeline.pipelines.reporting.nodes import (
     missing_results,
     or_missing,
@@ -14,6 +14,7 @@ from gyro_pipeline.pipelines.reporting.nodes import (
     refuse_gaps,
 )
 from gyro_pipeline.pipelines.reporting.report import write_report
+from gyro_pipeline.studies import LEAKAGE
 
 _Function = Callable[..., Any]
 _Makers = Mapping[str, Mapping[_Function, Sequence[str]]]
@@ -85,6 +86,31 @@ def create_pipeline(
         ),
     ]
     return Pipeline([*nodes, *end])
+
+
+def create_leakage_pipeline(sensors: Sequence[str]) -> Pipeline:
+    """Table and figure of the leak study, which no other report shows."""
+    stage, pooled = f"{LEAKAGE}.reporting", f"{LEAKAGE}.reporting.results"
+    stored = {f"{sensor}_cells": f"{LEAKAGE}.{sensor}.training.cells" for sensor in sensors}
+    stored |= {f"{sensor}_runs": f"{LEAKAGE}.{sensor}.evaluation.runs" for sensor in sensors}
+    given = {name: f"params:{name}" for name in ("published", "leakage", "sensors")}
+    makers: dict[_Function, tuple[dict[str, str], str]] = {
+        leakage.pool_leakage: (stored | {"evaluation": "params:evaluation"}, pooled),
+        leakage.results_table: (
+            {"results": pooled, "published": given["published"]},
+            f"{stage}.tables.results",
+        ),
+        leakage.accuracy_against_stride: (
+            {"results": pooled} | given,
+            f"{stage}.figures.accuracy_against_stride",
+        ),
+    }
+    return Pipeline(
+        [
+            Node(function, *wired, name=f"{function.__name__}_{LEAKAGE}", namespace="reporting")
+            for function, wired in makers.items()
+        ]
+    )
 
 
 def _study_nodes(study: str, sensors: Sequence[str]) -> list[Node]:

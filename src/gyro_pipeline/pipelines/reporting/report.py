@@ -9,7 +9,7 @@ import pandas as pd
 
 from gyro_pipeline.conventions import AXES, Missing
 from gyro_pipeline.parameters import Only, Published, Sensor
-from gyro_pipeline.pipelines.reporting.captions import CAPTIONS, Caption
+from gyro_pipeline.pipelines.reporting.captions import CAPTIONS, FURTHER, Caption
 from gyro_pipeline.pipelines.reporting.findings import compare, find
 from gyro_pipeline.studies import CNN, MEAN
 from gyro_pipeline.tracking import FINGERPRINT, StoredRun
@@ -192,7 +192,7 @@ def _code(runs: Sequence[StoredRun]) -> str:
 
 def _item(place: str, shown: Mapping[str, Part], env: str) -> dict[str, Any]:
     """A table or figure with its title, caption and the commands that make it."""
-    caption = CAPTIONS.get(place) or _plain_caption(place)
+    caption = CAPTIONS.get(place) or FURTHER.get(place) or _plain_caption(place)
     part, gap = shown.get(place), shown.get(f"gaps/{place.split('/', maxsplit=1)[1]}")
     command = f"kedro run --pipeline={caption.pipeline}" if caption.pipeline else ""
     missing = gap if isinstance(gap, tuple) and 0 < len(gap) <= _FEW else (command,)

@@ -177,11 +177,11 @@ def _split(folds: float) -> str:
 def _interval(row: pd.Series, base: str, windows: str) -> str:
     suffix = "" if windows == FIRST else f"_{windows}"
     value, lo, hi = (row[f"{base}{suffix}{end}"] for end in ("", "_lo", "_hi"))
-    ends = "" if pd.isna(lo) else f" [{_percent(lo)}, {_percent(hi)}]"
-    return f"{_percent(value)}{ends}"
+    ends = "" if pd.isna(lo) else f" [{percent(lo)}, {percent(hi)}]"
+    return f"{percent(value)}{ends}"
 
 
-def _percent(value: float) -> str:
+def percent(value: float) -> str:
     """A saving is unbounded off the ends of the running-mean curve."""
     if np.isinf(value):
         return "never reached" if value > 0 else "off the curve"

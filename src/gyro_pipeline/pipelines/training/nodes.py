@@ -2,14 +2,15 @@
 
 import logging
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
+import numpy as np
 import pandas as pd
 import xarray as xr
 
-from gyro_pipeline.conventions import AXES, TEST_IMU, TRAIN, VALIDATION, InputError
+from gyro_pipeline.conventions import AXES, TEST, TEST_IMU, TRAIN, VALIDATION, InputError
 from gyro_pipeline.fingerprints import code_hash, fingerprint
 from gyro_pipeline.learning import (
     batched,
@@ -21,13 +22,13 @@ from gyro_pipeline.learning import (
     trainer,
     trainings,
 )
-from gyro_pipeline.learning.examples import Device
+from gyro_pipeline.learning.examples import Device, with_shuffled_labels
 from gyro_pipeline.learning.jobs import TrainingJob
 from gyro_pipeline.learning.trainings import run_trainings
 from gyro_pipeline.parameters import Execution, Only, Splits, Study, Training, VirtualGyros
-from gyro_pipeline.protocol.splits import check_roles, with_role
+from gyro_pipeline.protocol.splits import check_roles, refuse_two_roles, with_role
 from gyro_pipeline.protocol.windows import window_size
-from gyro_pipeline.studies import CNN, Cell, over_folds, run_params, study_cells
+from gyro_pipeline.studies import CNN_SHUFFLED, NETWORKS, Cell, over_folds, run_params, study_cells
 from gyro_pipeline.tracking import FINGERPRINT, HISTORY, TRAINED_IN, WEIGHTS, StoredRun, TrainedRun
 
 logger = logging.getLogger(__name__)
@@ -68,13 +69,12 @@ def plan(
     cells = study_cells(study, sensor, source, windows_s, seeds, only)
     cells = over_folds(cells, folds, only)
     for cell in cells:
-        _check(cell, recordings, training)
-    modules = [batched, examples, fused, jobs, network, packing, trainer, trainings]
-    code = [code_hash(modules), *(path.read_text() for path in fused.SOURCES)]
+        check_cell(cell, recordings, training)
+    code = training_code()
     rows = []
     for cell in cells:
         content = cell.content | {"recordings": recordings.attrs["data_hash"]}
-        if cell.estimator == CNN:
+        if cell.estimator in NETWORKS:
             content |= {"training": training.model_dump(), "code": code}
             content |= {"roles": roles[roles.fold == cell.fold].role.tolist()}
         if cell.virtual_gyros and virtual is not None:
@@ -115,23 +115,62 @@ def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     """
     planned = {row[FINGERPRINT]: _cell(row) for row in cells.to_dict("records")}
     folds = int(cells.folds.iloc[0])
-    data = {
-        "data_hash": recordings.attrs["data_hash"],
-        "simulated": str(recordings.attrs["simulated"]),
-    }
+    devices = Devices(recordings, labelled_bias(bias), roles, virtual, virtual_gyros)
+    yield from train_missing(
+        planned,
+        tracked,
+        recordings.attrs,
+        execution,
+        params=lambda cell: run_params(cell, folds, training, splits, virtual_gyros),
+        job=lambda name, cell: devices.job(name, cell, training),
+    )
+
+
+def training_code() -> list[str]:
+    """What the results of a training depend on beside its settings and data."""
+    modules = [batched, examples, fused, jobs, network, packing, trainer, trainings]
+    return [code_hash(modules), *(path.read_text() for path in fused.SOURCES)]
+
+
+C = TypeVar("C", bound=Cell)
+
+
+def train_missing(
+    planned: Mapping[str, C],
+    tracked: Sequence[StoredRun],
+    data: Mapping[str, Any],
+    execution: Execution,
+    params: Callable[[C], dict[str, Any]],
+    job: Callable[[str, C], TrainingJob],
+) -> Iterator[TrainedRun]:
+    """Train the cells of one study and sensor that are not trained yet.
+
+    Args:
+        planned: All of them by fingerprint.
+        tracked: All trained runs on these logs, of any study.
+        data: Attributes of the recordings.
+        execution: How trainings are run.
+        params: What the run of a cell carries.
+        job: The training of a cell, by its fingerprint.
+
+    Yields:
+        Runs that wait for their evaluation.
+    """
+    tagged = {"data_hash": data["data_hash"], "simulated": str(data["simulated"])}
 
     def run(fp: str, started: float, tags: dict[str, str], **left: Any) -> TrainedRun:
-        params = run_params(planned[fp], folds, training, splits, virtual_gyros)
-        tags = data | {FINGERPRINT: fp} | tags
-        return TrainedRun(planned[fp].study, params, tags, _ms(started), _ms(time.time()), **left)
+        tags = tagged | {FINGERPRINT: fp} | tags
+        carried = params(planned[fp])
+        return TrainedRun(planned[fp].study, carried, tags, _ms(started), _ms(time.time()), **left)
 
     study = next(iter(planned.values())).study
     here = {run.fingerprint for run in tracked if run.study == study}
     elsewhere = {run.fingerprint: run for run in tracked}
     missing = [fp for fp in planned if fp not in here]
     shared = [fp for fp in missing if fp in elsewhere]
-    to_train = [fp for fp in missing if fp not in elsewhere and planned[fp].estimator == CNN]
-    label = f"{study} {recordings.attrs['sensor']}"
+    networks = [fp for fp in missing if planned[fp].estimator in NETWORKS]
+    to_train = [fp for fp in networks if fp not in elsewhere]
+    label = f"{study} {data['sensor']}"
     logger.info(
         "%s: %d runs planned, %d skipped (trained before), %d shared with another study, "
         "%d to train",
@@ -140,20 +179,19 @@ def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     for fp in missing:
         if fp in shared:
             twin = elsewhere[fp]
-            left = _copied(twin) if planned[fp].estimator == CNN else {}
+            left = _copied(twin) if fp in networks else {}
             yield run(fp, time.time(), {TRAINED_IN: twin.tags.get(TRAINED_IN, twin.study)}, **left)
         elif fp not in to_train:
             yield run(fp, time.time(), {})
-    devices = Devices(recordings, _labelled(bias), roles, virtual, virtual_gyros)
-    todo = [devices.job(fp, planned[fp], training) for fp in to_train]
-    for job, trained in run_trainings(todo, execution, label):
+    todo = [job(fp, planned[fp]) for fp in to_train]
+    for done, trained in run_trainings(todo, execution, label):
         artifacts = {WEIGHTS: trained.artifact, HISTORY: trained.history}
         ended = {
             "best_epoch": str(trained.artifact["best_epoch"]),
             "last_epoch": str(trained.history.epoch.iloc[-1]),
             "engine": trained.engine,
         }
-        yield run(job.name, trained.started, ended, history=trained.history, artifacts=artifacts)
+        yield run(done.name, trained.started, ended, history=trained.history, artifacts=artifacts)
 
 
 class Devices:
@@ -171,13 +209,24 @@ class Devices:
         self._virtual, self._virtual_gyros = virtual, virtual_gyros
 
     def job(self, name: str, cell: Cell, training: Training) -> TrainingJob:
-        """The training of a cell, under a name of the caller's choice."""
+        """The training of a cell, under a name of the caller's choice.
+
+        Raises:
+            InputError: If a recording would be used in two roles, be it by different IMUs.
+        """
         samples, rate_hz = self._recordings.sizes["sample"], self._recordings.attrs["rate_hz"]
         imus = tuple(range(TEST_IMU, TEST_IMU + cell.real_imus))
         inputs = [imus] if cell.method == 1 else [(imu,) for imu in imus]
         devices = [self._real(side_by_side, cell.fold, TRAIN) for side_by_side in inputs]
-        devices += [self._virtual_imu(imu) for imu in range(1, 1 + cell.virtual_imus)]
         validation = self._real(inputs[0], cell.fold, VALIDATION)
+        tested = [(TEST_IMU, number) for number in with_role(self._roles, cell.fold, TEST)]
+        used = {TRAIN: _used(devices), VALIDATION: _used([validation]), TEST: tested}
+        refuse_two_roles(used, f"{cell.sensor} fold {cell.fold}")
+        devices += [self._virtual_imu(imu) for imu in range(1, 1 + cell.virtual_imus)]
+        shuffled = cell.estimator == CNN_SHUFFLED
+        if shuffled:
+            generator = np.random.default_rng(cell.seed)
+            devices = [with_shuffled_labels(device, generator) for device in devices]
         return TrainingJob(
             name=name,
             devices=devices,
@@ -185,7 +234,7 @@ class Devices:
             window=window_size(cell.window_s, rate_hz, samples, cell.sensor),
             settings=training,
             seed=cell.seed,
-            cell=replace(cell, seed=0),
+            cell=cell if shuffled else replace(cell, seed=0),  # a seed has labels of its own
         )
 
     def _real(self, imus: tuple[int, ...], fold: int, role: str) -> Device:
@@ -203,10 +252,20 @@ class Devices:
         )
 
 
-def _check(cell: Cell, recordings: xr.Dataset, training: Training) -> None:
+def _used(devices: Sequence[Device]) -> list[tuple[int, int]]:
+    """IMU and number of every recording."""
+    return [(imu, n) for device in devices for imu in device.imus for n in device.numbers]
+
+
+def check_cell(cell: Cell, recordings: xr.Dataset, training: Training) -> None:
+    """Refuse a cell that the recordings cannot give.
+
+    Raises:
+        InputError: A window that does not fit, or IMUs that are not there.
+    """
     samples, rate_hz = recordings.sizes["sample"], recordings.attrs["rate_hz"]
     size = window_size(cell.window_s, rate_hz, samples, cell.sensor)
-    if cell.estimator == CNN:
+    if cell.estimator in NETWORKS:
         jobs.sized(training, cell.real_gyros if cell.method == 1 else len(AXES), size)
     if cell.real_imus > recordings.sizes["imu"]:
         available = len(AXES) * recordings.sizes["imu"]
@@ -227,7 +286,8 @@ def _cell(row: Mapping[Any, Any]) -> Cell:
     return Cell(**{name: row[name] for name in Cell.names()})
 
 
-def _labelled(bias: pd.DataFrame) -> xr.DataArray:
+def labelled_bias(bias: pd.DataFrame) -> xr.DataArray:
+    """The bias table as an array (imu, recording, axis), deg/s."""
     return bias.set_index(["imu", "recording", "axis"]).bias_dps.to_xarray()
 
 

@@ -2,7 +2,9 @@
 
 from kedro.pipeline import Node, Pipeline
 
+from gyro_pipeline.pipelines.training.leakage import plan_leakage, train_leakage
 from gyro_pipeline.pipelines.training.nodes import plan, train
+from gyro_pipeline.studies import LEAKAGE
 
 
 def create_pipeline(study: str, sensor: str, virtual: bool) -> Pipeline:
@@ -49,6 +51,37 @@ def create_pipeline(study: str, sensor: str, virtual: bool) -> Pipeline:
                 },
                 f"{stage}.runs",
                 name=f"train_{study}_{sensor}",
+                namespace="training",
+            ),
+        ]
+    )
+
+
+def create_leakage_pipeline(sensor: str) -> Pipeline:
+    """Trainings of the leak study on one sensor."""
+    stage = f"{LEAKAGE}.{sensor}.training"
+    settings = {name: f"params:{name}" for name in ("leakage", "training", "splits")}
+    data = {"recordings": f"{sensor}.raw_logs.recordings"} | settings
+    return Pipeline(
+        [
+            Node(
+                plan_leakage,
+                data | {"seeds": "params:seeds", "only": "params:only"},
+                f"{stage}.cells",
+                name=f"plan_{LEAKAGE}_{sensor}",
+                namespace="training",
+            ),
+            Node(
+                train_leakage,
+                data
+                | {
+                    "cells": f"{stage}.cells",
+                    "tracked": f"{sensor}.training.tracked",
+                    "bias": f"{sensor}.ground_truth.bias",
+                    "execution": "params:execution",
+                },
+                f"{stage}.runs",
+                name=f"train_{LEAKAGE}_{sensor}",
                 namespace="training",
             ),
         ]

@@ -1,10 +1,12 @@
 """Nodes of the windowed-splits stage. Windows are cut as views where they are used."""
 
+import numpy as np
 import pandas as pd
 import xarray as xr
 
+from gyro_pipeline.fingerprints import data_hash
 from gyro_pipeline.parameters import Splits
-from gyro_pipeline.protocol.splits import assign_roles
+from gyro_pipeline.protocol.splits import assign_roles, refuse_copies
 
 
 def split_recordings(recordings: xr.Dataset, splits: Splits) -> pd.DataFrame:
@@ -16,9 +18,26 @@ def split_recordings(recordings: xr.Dataset, splits: Splits) -> pd.DataFrame:
 
     Returns:
         Columns ``fold, recording, role``.
+
+    Raises:
+        InputError: If no recording is left for a role, or one is there twice, with two roles.
     """
     numbers = recordings.recording.to_numpy().tolist()
     given = None
     if "given_split" in recordings:
         given = dict(zip(numbers, recordings.given_split.to_numpy().tolist(), strict=True))
-    return assign_roles(numbers, splits, given)
+    roles = assign_roles(numbers, splits, given)
+    refuse_copies(_contents(recordings), roles)
+    return roles
+
+
+def _contents(recordings: xr.Dataset) -> dict[tuple[int, int], str]:
+    """A hash of each recording of each IMU, without those that an IMU lacks."""
+    contents = {}
+    for number in recordings.recording.to_numpy().tolist():
+        rates = recordings.angular_rate.sel(recording=number).load()
+        for imu in recordings.imu.to_numpy().tolist():
+            samples = rates.sel(imu=imu).to_numpy()
+            if not np.isnan(samples[0, 0]):
+                contents[imu, number] = data_hash(samples, None)
+    return contents

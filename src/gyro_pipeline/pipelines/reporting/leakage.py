@@ -1,0 +1,242 @@
+"""The leak study's table and figure, from its own runs alone."""
+
+import logging
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from gyro_pipeline.conventions import (
+    BEST_EPOCH_ON_TEST,
+    NO_LEAK,
+    TEST_IN_TRAINING,
+    WINDOW_SPLIT,
+)
+from gyro_pipeline.parameters import Evaluation, Leakage, Published, PublishedResult, Sensor
+from gyro_pipeline.pipelines.reporting.style import CEILING, COLOURS, LOOK, MARKERS, share_legend
+from gyro_pipeline.pipelines.reporting.tables import percent, source_of
+from gyro_pipeline.protocol.leaks import strided_errors, strided_scores
+from gyro_pipeline.protocol.scores import (
+    beats_oracle,
+    holm,
+    paired_difference,
+    resampled_weights,
+)
+from gyro_pipeline.studies import CNN, CNN_SHUFFLED
+from gyro_pipeline.tracking import CURVE, ERRORS, FINGERPRINT, StoredRun
+
+logger = logging.getLogger(__name__)
+
+WAYS = {
+    (NO_LEAK, CNN): "Honest split",
+    (NO_LEAK, CNN_SHUFFLED): "Honest, labels shuffled",
+    (WINDOW_SPLIT, CNN): "Windows split at random",
+    (TEST_IN_TRAINING, CNN): "Test windows in training",
+    (BEST_EPOCH_ON_TEST, CNN): "Honest split, epoch chosen on test",
+}
+"""What tables and figures call each way of training, in their order."""
+
+DETECTOR_PCT = 99
+"""Confidence at which a network with shuffled labels must not beat the constant."""
+
+ONE_SIDED = 0.001
+"""A p value against the oracle below this, corrected for the number of checks, is a leak."""
+
+_SHIFT = 0.09
+"""Between the points of one stride."""
+
+_WHOLE = 0.01
+"""So near to a whole number of hops, a stride is one."""
+
+_CEILINGS = ("ceiling_time_saving_pct", "ceiling_accuracy_gain_pct")
+
+
+def pool_leakage(evaluation: Evaluation, **stored: Any) -> pd.DataFrame:
+    """Pool the leak study's runs into one row per sensor, stride and way of training.
+
+    Args:
+        evaluation: Resamples and seed of the intervals.
+        **stored: For each sensor its plan, ``<sensor>_cells``, and its runs, ``<sensor>_runs``.
+
+    Returns:
+        What names a row; its counts; its figures of merit over all test windows of all folds and
+        seeds, with intervals over recordings; A of the constant; by how much the network's mean
+        square exceeds the constant's, with the upper end of its 99 % interval; the p value against
+        the oracle, corrected over all rows, on simulated white noise; the ceiling; and run ids.
+    """
+    keys = ["sensor", "source", "window_s", "window_stride_s", "leak", "estimator"]
+    rows = []
+    for sensor in [name.removesuffix("_cells") for name in stored if name.endswith("_cells")]:
+        cells, tracked = stored[f"{sensor}_cells"], stored[f"{sensor}_runs"]
+        runs = {run.fingerprint: run for run in reversed(tracked)}
+        for key, group in cells.groupby(keys, sort=False):
+            row = _pooled([runs[fp] for fp in group[FINGERPRINT]], evaluation)
+            rows.append(dict(zip(keys, key, strict=True)) | row)
+    results = pd.DataFrame(rows)
+    checked = results.beats_oracle_p.notna()
+    results.loc[checked, "beats_oracle_p"] = holm(results.beats_oracle_p[checked].tolist())
+    return results
+
+
+def _pooled(runs: Sequence[StoredRun], evaluation: Evaluation) -> dict[str, Any]:
+    """All folds and seeds of one way of training at one stride."""
+    errors = pd.concat([run.load(ERRORS) for run in runs], ignore_index=True)
+    curve = pd.concat([run.load(CURVE) for run in runs]).drop_duplicates(["recording", "time_s"])
+    recordings, first = errors.recording.nunique(), runs[0]
+    weights = resampled_weights(recordings, evaluation.resamples, evaluation.bootstrap_seed)
+    seeds = {run.params["seed"] for run in runs}
+    row: dict[str, Any] = {
+        "simulated": first.tags["simulated"] == "1",
+        "windows": len(errors.groupby(["recording", "start"])),
+        "recordings": recordings,
+        "seeds": len(seeds),
+        "epochs": max(int(run.params["epochs"]) for run in runs),
+    }
+    for base, estimate in strided_scores(
+        errors, curve, float(first.params["window_s"]), weights
+    ).items():
+        row |= {base: estimate.value, f"{base}_lo": estimate.lo, f"{base}_hi": estimate.hi}
+    ours, mean, constant = (strided_errors(errors, of) for of in ("", "mean", "constant"))
+    plain = weights[:1]
+    ratio = np.sqrt(constant.mean(plain) / mean.mean(plain))[0]
+    row["constant_accuracy_gain_pct"] = 100 * (1 - ratio)
+    difference = paired_difference(ours, constant, weights, DETECTOR_PCT)
+    row |= {"over_constant_dps2": difference.value, "over_constant_dps2_hi": difference.hi}
+    known = "oracle_error_dps" in errors
+    row["beats_oracle_p"] = beats_oracle(ours, strided_errors(errors, "oracle")) if known else None
+    for base in _CEILINGS:
+        row |= {base + end: first.metrics.get(base + end) for end in ("", "_lo", "_hi")}
+    return row | {"run_ids": " ".join(run.run_id for run in runs)}
+
+
+def results_table(results: pd.DataFrame, published: Published) -> pd.DataFrame:
+    """The leak study: S and A of each way of training, side by side for each stride.
+
+    Args:
+        results: From :func:`pool_leakage`.
+        published: The paper's claim for the sensor, beside them.
+    """
+    rows = [
+        _table_row(group.set_index(["leak", "estimator"]), published)
+        for _, group in results.groupby(["sensor", "window_stride_s"], sort=False)
+    ]
+    table = pd.DataFrame(rows)
+    logger.info("leak study, S/A %%\n%s", table.to_string(index=False, na_rep="–"))
+    return table
+
+
+def _table_row(ways: pd.DataFrame, published: Published) -> dict[str, Any]:
+    first = ways.iloc[0]
+    row: dict[str, Any] = {
+        "Sensor": first.sensor,
+        "Source": source_of(first),
+        "Window stride s": first.window_stride_s,
+        "Windows": first.windows,
+        "Recordings": first.recordings,
+    }
+    for way, name in WAYS.items():
+        row[f"{name} S/A %"] = _saving_and_gain(ways, way)
+    shuffled = ways[ways.index.get_level_values("estimator") == CNN_SHUFFLED]
+    better = bool((shuffled.over_constant_dps2_hi < 0).any())
+    caught = ways.beats_oracle_p.dropna()
+    beating = [WAYS[way] for way in caught.index[caught < ONE_SIDED]]
+    return row | {
+        "Constant A %": percent(first.constant_accuracy_gain_pct),
+        "Ceiling S/A %": _pair(first, *_CEILINGS),
+        "Published S/A %": _claim(first, published),
+        "Shuffled beats the constant": "yes" if better else "no",
+        "Beats the oracle": "; ".join(beating) or ("none" if len(caught) else "not known"),
+    }
+
+
+def accuracy_against_stride(
+    results: pd.DataFrame, published: Published, leakage: Leakage, sensors: dict[str, Any]
+) -> Figure:
+    """A against the window stride, for the honest split and for each leak.
+
+    Args:
+        results: From :func:`pool_leakage`.
+        published: The paper's gain.
+        leakage: Its network's hop.
+        sensors: Their rates, by which the hop is a time.
+    """
+    names = list(dict.fromkeys(results.sensor))
+    with LOOK():
+        figure = Figure(figsize=(9.5, 1.2 + 4.4 * len(names)), layout="constrained")
+        axes = figure.subplots(len(names), 1, squeeze=False)[:, 0]
+        for ax, sensor in zip(axes, names, strict=True):
+            hop_s = leakage.network.hop / Sensor(**sensors[sensor]).rate_hz
+            _draw(ax, results[results.sensor == sensor], published, hop_s)
+        share_legend(figure, axes, columns=3)
+    return figure
+
+
+def _draw(ax: Axes, results: pd.DataFrame, published: Published, hop_s: float) -> None:
+    first, strides = results.iloc[0], np.sort(results.window_stride_s.unique())
+    styles = [*zip(COLOURS, MARKERS, strict=True), ("grey", "x")]
+    ways = sorted(WAYS.items(), key=lambda way: way[0][1] == CNN_SHUFFLED)  # it comes last
+    for i, ((leak, estimator), name) in enumerate(ways):
+        rows = results[(results.leak == leak) & (results.estimator == estimator)]
+        rows = rows.sort_values("window_stride_s")
+        gain, lo, hi = (rows[f"accuracy_gain_pct{end}"] for end in ("", "_lo", "_hi"))
+        ax.errorbar(
+            np.searchsorted(strides, rows.window_stride_s) + _SHIFT * (i - len(ways) // 2),
+            gain,
+            yerr=np.maximum([gain - lo, hi - gain], 0),
+            color=styles[i][0],
+            marker=styles[i][1],
+            ls=":" if estimator == CNN_SHUFFLED else "-",
+            lw=1,
+            ms=5,
+            capsize=2.5,
+            label=name,
+        )
+    limit, claim = first.ceiling_accuracy_gain_pct, _claimed(first, published)
+    ax.axhline(limit, color=CEILING, ls="--", label="ceiling: expected of the best possible")
+    ax.axhline(0, color="black", lw=1, label="running mean")
+    if claim is not None:
+        label = f"published, {claim.real_gyros} gyroscopes"
+        ax.axhline(claim.accuracy_gain_pct, color="black", ls=":", label=label)
+    ax.set_xticks(np.arange(len(strides)), [_stride_label(s, hop_s) for s in strides])
+    ax.grid(False, axis="x")
+    ax.set(
+        xlabel="window stride [s], ways of one stride side by side",
+        ylabel="accuracy gain A in the test windows [%]",
+        title=f"{first.sensor}, {first.window_s:g} s windows of {first.recordings} recordings; "
+        f"{source_of(first)}; 95 % intervals",
+    )
+
+
+def _stride_label(stride_s: float, hop_s: float) -> str:
+    hops = stride_s / hop_s
+    whole = abs(hops - round(hops)) < _WHOLE
+    return f"{stride_s:g}\n{'= ' if whole else ''}{hops:.3g} hop{'s' if hops > 1 + _WHOLE else ''}"
+
+
+def _saving_and_gain(ways: pd.DataFrame, way: tuple[str, str]) -> str | None:
+    if way not in ways.index:
+        return None
+    return _pair(ways.loc[[way]].iloc[0], "time_saving_pct", "accuracy_gain_pct")
+
+
+def _pair(row: pd.Series, saving: str, gain: str) -> str:
+    """S/A, with the interval of A where there is one."""
+    lo, hi = row[f"{gain}_lo"], row[f"{gain}_hi"]
+    ends = "" if pd.isna(lo) else f" [{percent(lo)}, {percent(hi)}]"
+    return f"{percent(row[saving])}/{percent(row[gain])}{ends}"
+
+
+def _claimed(row: pd.Series, published: Published) -> PublishedResult | None:
+    """The paper's result on real gyroscopes of this sensor."""
+    claims = published.of_networks(row.sensor, virtual_gyros=0)
+    return next((claim for claim in claims if claim.window_s == row.window_s), None)
+
+
+def _claim(row: pd.Series, published: Published) -> str | None:
+    claim = _claimed(row, published)
+    if claim is None:
+        return None
+    return f"{claim.time_saving_pct:.0f}/{claim.accuracy_gain_pct:.0f}"
