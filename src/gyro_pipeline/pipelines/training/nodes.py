@@ -9,7 +9,8 @@ from typing import Any
 import pandas as pd
 import xarray as xr
 
-from gyro_pipeline.conventions import AXES, TEST_IMU, TRAIN, VALIDATION, InputError
+from gyro_pipeline.conventions import AXES, TEST, TEST_IMU, TRAIN, VALIDATION, InputError
+from gyro_pipeline.estimators import ESTIMATORS
 from gyro_pipeline.fingerprints import code_hash, fingerprint
 from gyro_pipeline.learning import (
     batched,
@@ -77,6 +78,8 @@ def plan(
         if cell.estimator == CNN:
             content |= {"training": training.model_dump(), "code": code}
             content |= {"roles": roles[roles.fold == cell.fold].role.tolist()}
+        else:
+            content |= {"tested": {fold: with_role(roles, fold, TEST) for fold in folds}}
         if cell.virtual_gyros and virtual is not None:
             content |= {"virtual": virtual.attrs["data_hash"]}
         hashed = fingerprint(content)
@@ -204,6 +207,11 @@ class Devices:
 
 
 def _check(cell: Cell, recordings: xr.Dataset, training: Training) -> None:
+    if cell.estimator not in (CNN, *ESTIMATORS):
+        raise InputError(
+            f"{cell.study}: unknown estimator {cell.estimator!r}; there are {CNN}, "
+            f"{', '.join(ESTIMATORS)}"
+        )
     samples, rate_hz = recordings.sizes["sample"], recordings.attrs["rate_hz"]
     size = window_size(cell.window_s, rate_hz, samples, cell.sensor)
     if cell.estimator == CNN:
