@@ -159,7 +159,9 @@ class Study(Parameter):
 
     experiment: str = Field(description="name of the MLflow experiment; the study's own name")
     estimators: list[str] = Field(
-        ["cnn"], min_length=1, description="beside the running mean; names of gyro_pipeline.estimators"
+        ["cnn"],
+        min_length=1,
+        description="beside the running mean; names of gyro_pipeline.estimators",
     )
     windows_s: list[Annotated[float, Field(gt=0)]] | None = Field(
         None, min_length=1, description="its own; null: those of all studies"

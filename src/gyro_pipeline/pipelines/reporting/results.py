@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from itertools import groupby
 from typing import Any
 
@@ -55,9 +56,10 @@ def pool(
     for cells, found in found_rows:
         if found and cells[0].estimator == DEFAULT:
             defaults[cells[0].sensor, cells[0].window_s] = _errors(found)
-    for cells, found in found_rows:
+    for cells, stored in found_rows:
         cell = cells[0]
         key = cell.sensor, cell.window_s
+        found = [replace(run, load=cache(run.load)) for run in stored]
         row = {name: getattr(cell, name) for name in ROW} | {"missing": None, "run_ids": None}
         if not found or (cell.estimator != MEAN and key not in means):
             results.append(row | {"missing": command_for(cells)})
