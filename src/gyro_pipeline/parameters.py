@@ -166,6 +166,7 @@ class Study(Parameter):
     windows_s: list[Annotated[float, Field(gt=0)]] | None = Field(
         None, min_length=1, description="its own; null: those of all studies"
     )
+    default: bool = Field(True, description="part of `kedro run` and `--pipeline=reporting`")
     sensors: dict[str, Grid]
 
 

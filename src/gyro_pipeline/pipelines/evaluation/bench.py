@@ -176,8 +176,12 @@ class Bench:
         seen = self.recordings.angular_rate.sel(imu=slice(TEST_IMU, TEST_IMU + imus - 1))
         tables = []
         for recording in self.tested:
-            samples = seen.sel(recording=recording.number).to_numpy()
-            windows = cut_windows(samples.reshape(-1, samples.shape[-1]), self.size)
+            samples = (
+                recording.samples
+                if imus == 1
+                else np.concatenate(seen.sel(recording=recording.number).to_numpy())
+            )
+            windows = cut_windows(samples, self.size)
             windows = windows.transpose(1, 0, 2)
             start_s = np.arange(len(windows)) * self.size / self.recordings.attrs["rate_hz"]
             for target in (RECORDING_MEAN, BIAS):

@@ -209,7 +209,7 @@ def _draw_estimators(left: Axes, right: Axes, rows: pd.DataFrame) -> None:
             ax.plot(values.index * shift, values, **estimator_look(str(name)))
     limit = means.ceiling_rmse_dps_all
     for ax, values in ((left, limit / MDPS), (right, limit / means.test_rmse_dps_all)):
-        ax.plot(values.index, values, color=CEILING, lw=2, ls="--", label="ceiling: best possible")
+        ax.plot(values.index, values, color=CEILING, lw=2, ls="--", label="ceiling")
         ax.set(xscale="log", yscale="log", xlabel="window length [s], points side by side")
         ax.set_xticks(means.index.tolist(), minor=False)
         ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))

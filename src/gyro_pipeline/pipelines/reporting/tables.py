@@ -102,12 +102,16 @@ def _compared(row: pd.Series, group: pd.DataFrame) -> dict[str, Any]:
         "Less running mean mdps": _difference(row, MEAN),
         f"Less {DEFAULT} mdps": _difference(row, DEFAULT),
         "Ceiling mdps": round(row.ceiling_rmse_dps_all / MDPS, 3),
-        "Within ±1σ %": round(100 * row.coverage_1sigma_all, 1),
-        "Within ±2σ %": round(100 * row.coverage_2sigma_all, 1),
-        "Recordings": row.recordings,
+        "Within ±1σ %": _covered(row.coverage_1sigma_all),
+        "Within ±2σ %": _covered(row.coverage_2sigma_all),
+        "Recordings": int(group.recordings.max()),
         "Split": _split(row.folds),
         "Runs": _short(row.run_ids),
     }
+
+
+def _covered(fraction: float | None) -> float | None:
+    return None if fraction is None else round(100 * fraction, 1)
 
 
 def _difference(row: pd.Series, name: str) -> str:
