@@ -78,7 +78,8 @@ def test_some_are_recommended_and_the_default_is_one_of_them(fitted):
     recommended = {name for name, estimator in fitted.items() if estimator.recommended}
     assert DEFAULT in recommended
     assert {"empirical_bayes", "best_linear", "best_linear_warm_up"} <= recommended
-    assert not recommended & {"mean", "training_mean", "ridge", "empirical_bayes_pooled"}
+    others = {"mean", "training_mean", "ridge", "empirical_bayes_pooled", "best_linear_allan"}
+    assert not recommended & others
 
 
 def test_every_one_that_uses_a_stored_prior_says_so(fitted):

@@ -58,12 +58,12 @@ class BestLinear:
             one recording to the next.
     """
 
-    recommended: ClassVar[bool] = True
     uses_prior: ClassVar[bool] = True
 
     def __init__(self, warm_up: bool = False, noise: str = "reml", history: bool = False) -> None:
         if noise not in ("reml", "allan"):
             raise InputError(f"noise: expected 'reml' or 'allan', got {noise!r}")
+        self.recommended = noise == "reml"  # the Allan fit knows nothing of warm-up
         self._warm_up, self._noise, self._history = warm_up, noise, history
 
     def fit(self, recordings: xr.Dataset, imu: int = TEST_IMU) -> Self:

@@ -35,8 +35,8 @@ _ALIKE = "To be read like the figure of SparkFun with 3 real gyroscopes."
 _ESTIMATORS = (
     "Left: error over all windows. Right: the same relative to the running mean. Relatives share a "
     "colour, filled markers are the recommended estimators. The dashed line is the ceiling, on "
-    "measured data an estimate for white noise. Lower is better. Estimators of the black family "
-    f"need no training recordings; each of the others {ORIENTATION_NOTE}."
+    "measured data an estimate for white noise. Lower is better. Estimators in black need no "
+    f"training recordings; each of the others {ORIENTATION_NOTE}."
 )
 _TOLERANCE = "The band is the tolerance around the mean of the recording, which counts as truth."
 
