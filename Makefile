@@ -11,8 +11,8 @@ ARGS ?=
 run: .venv/.package  ## train and evaluate the augmentation grid, write its tables and figures
 	.venv/bin/kedro run --pipeline=augmentation $(ARGS)
 
-test: .venv/.package  ## run the tests
-	.venv/bin/python -m pytest $(ARGS)
+test: .venv/.package  ## run the tests, a file per core
+	.venv/bin/python -m pytest --numprocesses=auto --dist=loadfile $(ARGS)
 
 check: .venv/.package  ## lint, formatting and types
 	.venv/bin/ruff check .

@@ -20,7 +20,7 @@ ALLOWED = {
     "studies": {"conventions", "parameters"},
     "tracking": {"conventions"},
     "physics": {"conventions"},
-    "estimators": {"conventions"},
+    "estimators": {"conventions", "physics"},
     "protocol": {"conventions", "parameters"},
     "learning": {"conventions", "parameters", "protocol"},
     "datasets": {"conventions", "parameters", "fingerprints", "tracking", "physics"},

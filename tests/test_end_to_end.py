@@ -21,7 +21,8 @@ CELL = ["sensor", "real_gyros", "virtual_gyros", "window_s"]
 PARAMS = {*CELL, "study", "method", "source", "seed", "fold", "estimator"}
 HYPER_PARAMETERS = {
     "centring", "channels", "kernel", "stride", "pool", "hidden", "epochs", "batch_size",
-    "learning_rate", "decay", "decay_every", "stop_below", "validation_recordings", "split_seed",
+    "learning_rate", "decay", "decay_every", "stop_below", "precision",
+    "validation_recordings", "split_seed",
 }  # fmt: skip
 BASES = {
     "test_rmse_dps", "mean_rmse_dps", "equivalent_time_s", "time_saving_pct", "accuracy_gain_pct",

@@ -50,7 +50,7 @@ def against_the_constant(parameters):
                     recordings.angular_rate.sel(imu=1, recording=number).to_numpy(), job.window
                 )
                 truth = bias.sel(imu=1, recording=number).to_numpy()
-                errors = network.estimate(windows.transpose(1, 0, 2)) - truth
+                errors = network.estimate(windows.transpose(1, 0, 2))[0] - truth
                 of = {"recording": number, "error_dps": errors.ravel()}
                 constants = np.tile(constant.to_numpy() - truth, len(errors))
                 tables.append(pd.DataFrame(of | {"constant_error_dps": constants}))

@@ -34,6 +34,12 @@ PAPER, DISJOINT, TRUE = "paper", "disjoint", "true"
 """The truths an estimate is judged against: (a) mean of the whole recording, (b) mean of the
 samples outside the window, (c) the drawn bias of simulated data."""
 
+RECORDING_MEAN, BIAS = "recording_mean", "bias"
+"""Targets an estimator can be asked for: the mean of the whole recording, which truth (a) is, or
+the bias itself, which truths (b) and (c) are about and what a user deploys."""
+
+TARGET_OF = {PAPER: RECORDING_MEAN, DISJOINT: BIAS, TRUE: BIAS}
+"""What an estimator is asked for, by the truth that judges it."""
 
 FIRST, ALL = "first", "all"
 """Test windows: the first of each recording (the paper's way), or all non-overlapping ones."""

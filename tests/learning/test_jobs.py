@@ -153,7 +153,9 @@ def test_a_stored_network_estimates_its_outputs_scaled_back(tmp_path, imus, cent
     stored = torch.load(tmp_path / "weights.pt", weights_only=True)
     assert stored["best_epoch"] < 40
     windows = windows_of(rates, imus[0], 11)
-    estimates = NetworkEstimator(stored, which).estimate(windows)
+    estimates, sigma = NetworkEstimator(stored, which).estimate(windows)
+    assert np.isnan(sigma).all()
+    assert sigma.shape == estimates.shape
 
     _, scaling = training_examples(a_job.devices, a_job.architecture, centring)
     network = initial_network(a_job.architecture, seed=99)
@@ -180,7 +182,7 @@ def test_a_network_learns_what_is_easy_to_learn(imus):
     constant = truth[:, :80].mean(axis=1)
     errors = []
     for number in tested:
-        estimates = estimator.estimate(windows_of(rates, imus[0], number))
+        estimates, _ = estimator.estimate(windows_of(rates, imus[0], number))
         errors.append(estimates - truth[:, number - 1].ravel())
     rmse = np.sqrt(np.mean(np.square(errors)))
     constants_rmse = np.sqrt(np.mean((truth[:, 80:] - constant[:, None]) ** 2))

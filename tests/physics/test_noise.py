@@ -5,7 +5,7 @@ import pytest
 
 from gyro_pipeline.conventions import MDPS, InputError
 from gyro_pipeline.physics.allan import FLICKER_FLOOR, allan_variance, averaging_times_s
-from gyro_pipeline.physics.noise import simulate_noise
+from gyro_pipeline.physics.noise import simulate_noise, warm_up
 
 RATE = 100.0
 N = 5 * MDPS
@@ -103,3 +103,24 @@ def test_memory_is_about_that_of_the_result():
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 1.3 * noise.nbytes
+
+
+def test_a_random_walk_starts_at_power_on_and_widens_as_k_root_t():
+    k, count = 2 * MDPS, 4000
+    generator = np.random.default_rng(12)
+    walk = simulate_noise(generator, (count, 1000), RATE, 0.0, random_walk_dps_rts=k)
+    for sample in (0, 99, 999):
+        expected = k * np.sqrt((sample + 1) / RATE)
+        assert walk[:, sample].std() == pytest.approx(expected, rel=0.05)
+    steps = np.diff(walk.astype(np.float64), axis=1)
+    assert steps.std() == pytest.approx(k / np.sqrt(RATE), rel=0.01)
+
+
+def test_a_warm_up_decays_from_its_amplitude():
+    amplitudes = np.array([[10.0, -5.0]])
+    settling = warm_up(amplitudes, 30.0, 9000, RATE)
+    assert settling.shape == (1, 2, 9000)
+    time_s = (np.arange(9000) + 0.5) / RATE
+    np.testing.assert_allclose(settling[0, 1], -5 * np.exp(-time_s / 30))
+    each = warm_up(amplitudes, np.array([[15.0, 60.0]]), 9000, RATE)
+    np.testing.assert_allclose(each[0, 1], warm_up(-5.0, 60.0, 9000, RATE))

@@ -1,27 +1,52 @@
-"""Estimators: a window in, a bias out."""
+"""Estimators: a window in, a bias and its standard deviation out."""
 
-from typing import Protocol
+from collections.abc import Callable, Mapping
 
-import numpy as np
+from gyro_pipeline.estimators.averages import Median, RunningMean, TrimmedMean
+from gyro_pipeline.estimators.base import (
+    ORIENTATION_NOTE,
+    Estimates,
+    Estimator,
+    FittedEstimator,
+    duration_s,
+)
+from gyro_pipeline.estimators.linear import BestLinear, Ridge
+from gyro_pipeline.estimators.shrinkage import EmpiricalBayes, LastCalibration, TrainingMean
 
+__all__ = [
+    "DEFAULT",
+    "ESTIMATORS",
+    "ORIENTATION_NOTE",
+    "BestLinear",
+    "EmpiricalBayes",
+    "Estimates",
+    "Estimator",
+    "FittedEstimator",
+    "LastCalibration",
+    "Median",
+    "Ridge",
+    "RunningMean",
+    "TrainingMean",
+    "TrimmedMean",
+    "duration_s",
+]
 
-class Estimator(Protocol):
-    """Anything that estimates biases from windows."""
+ESTIMATORS: Mapping[str, Callable[[], FittedEstimator]] = {
+    "mean": RunningMean,
+    "median": Median,
+    "trimmed_mean": TrimmedMean,
+    "training_mean": TrainingMean,
+    "last_calibration": LastCalibration,
+    "empirical_bayes": EmpiricalBayes,
+    "empirical_bayes_pooled": lambda: EmpiricalBayes(pooled=True),
+    "best_linear": BestLinear,
+    "best_linear_allan": lambda: BestLinear(noise="allan"),
+    "best_linear_warm_up": lambda: BestLinear(warm_up=True),
+    "best_linear_history": lambda: BestLinear(history=True),
+    "ridge": Ridge,
+    "ridge_same_time": lambda: Ridge(same_time=True),
+}
+"""All estimators without a network, by the name that runs and tables give them."""
 
-    def estimate(self, windows: np.ndarray) -> np.ndarray:
-        """Biases of the gyroscopes seen side by side.
-
-        Args:
-            windows: Shape (n, gyroscopes, samples), deg/s.
-
-        Returns:
-            Shape (n, gyroscopes), deg/s.
-        """
-
-
-class RunningMean:
-    """Zero-order calibration: the mean of the window (paper, section II)."""
-
-    def estimate(self, windows: np.ndarray) -> np.ndarray:
-        """See :class:`Estimator`; sums are in float64."""
-        return windows.mean(axis=-1, dtype=np.float64)
+DEFAULT = "best_linear"
+"""What to use where nothing else is known: its sigma holds on coloured noise as well."""

@@ -3,12 +3,14 @@
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
 import torch
+from numpy.typing import ArrayLike
 
+from gyro_pipeline.conventions import BIAS
 from gyro_pipeline.learning import fused
 from gyro_pipeline.learning.examples import (
     Device,
@@ -192,7 +194,10 @@ def shuffling(seed: int) -> torch.Generator:
 
 
 class NetworkEstimator:
-    """A stored network as an estimator: windows in, biases out."""
+    """A stored network as an estimator: windows in, biases out. It has no sigma."""
+
+    recommended: ClassVar[bool] = False
+    uses_prior: ClassVar[bool] = True  # the centres, and what it learned of the biases' spread
 
     def __init__(self, artifact: Mapping[str, Any], weights: str) -> None:
         """Restore a network.
@@ -208,17 +213,27 @@ class NetworkEstimator:
         self._network = CalibrationNetwork(Architecture(**artifact["architecture"]))
         self._network.load_state_dict(artifact[weights])
 
-    def estimate(self, windows: np.ndarray) -> np.ndarray:
-        """Biases of all gyroscopes the network sees.
+    def estimate(
+        self,
+        windows: np.ndarray,
+        target: str = BIAS,
+        start_s: ArrayLike = 0.0,
+        recording: int | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Biases of all gyroscopes the network sees, the same for every target and place.
 
         Args:
             windows: Shape (n, gyroscopes, window), deg/s.
+            target: Not used: the network was trained on means of whole recordings.
+            start_s: Not used.
+            recording: Not used.
 
         Returns:
-            Shape (n, gyroscopes), deg/s.
+            Biases, shape (n, gyroscopes), deg/s, and NaN in place of their sigma.
         """
         centre = self._scaling.centres[0]
         scaled = (windows - centre[:, None].astype(np.float32)) / self._scaling.input_scale
         packed = pack(scaled.transpose(1, 0, 2), self._network.architecture)
         outputs = predict(self._network, torch.from_numpy(packed)).double().numpy()
-        return centre + self._scaling.target_scale * outputs
+        biases = centre + self._scaling.target_scale * outputs
+        return biases, np.full(biases.shape, np.nan)

@@ -1,4 +1,4 @@
-"""Simulated gyroscope noise: white, correlated from sample to sample, and flicker."""
+"""Simulated gyroscope noise: white (also correlated over one sample), flicker, random walk."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +16,7 @@ def simulate_noise(
     white_dps_rts: ArrayLike,
     lag1_correlation: float = 0.0,
     flicker_dps: float = 0.0,
+    random_walk_dps_rts: float = 0.0,
 ) -> NDArray[np.float32]:
     """Zero-mean noise of stationary gyroscopes, every recording independent of the others.
 
@@ -30,6 +31,8 @@ def simulate_noise(
         white_dps_rts: N, deg/s * sqrt(s), broadcast against ``shape[:-1]``.
         lag1_correlation: Of successive samples of the white part, between -0.5 and 0.5.
         flicker_dps: Bias instability B, deg/s: the Allan deviation has its floor at 0.664 B.
+        random_walk_dps_rts: K, deg/s / sqrt(s): a walk that starts at 0 at power-on and whose
+            variance after t seconds is K^2 t.
 
     Returns:
         (..., n), deg/s.
@@ -50,7 +53,28 @@ def simulate_noise(
     noise *= scale[..., None].astype(np.float32)
     if flicker_dps:
         _add_flicker(generator, noise, flicker_dps)
+    if random_walk_dps_rts:
+        _add_random_walk(generator, noise, random_walk_dps_rts / np.sqrt(rate_hz))
     return noise
+
+
+def warm_up(
+    amplitude_dps: ArrayLike, time_constant_s: ArrayLike, samples: int, rate_hz: float
+) -> NDArray[np.float64]:
+    """The bias settling after power-on: amplitude times exp(-t / time constant).
+
+    Args:
+        amplitude_dps: (...), deg/s, at power-on.
+        time_constant_s: (...), s, broadcast against the amplitudes.
+        samples: n; sample i is taken at (i + 1/2) sample periods.
+        rate_hz: Samples per second.
+
+    Returns:
+        (..., n), deg/s, to be added to noise and bias.
+    """
+    time_s = (np.arange(samples) + 0.5) / rate_hz
+    decay = np.exp(-time_s / np.asarray(time_constant_s, np.float64)[..., None])
+    return np.asarray(amplitude_dps, np.float64)[..., None] * decay
 
 
 def _correlate(generator: np.random.Generator, noise: NDArray[np.float32], theta: float) -> None:
@@ -81,3 +105,11 @@ def _add_flicker(
         parts = generator.standard_normal((k.size, 2), dtype=np.float32)
         spectrum[1:] = amplitude * parts.view(np.complex64)[:, 0]
         row[:] += fft.irfft(spectrum, length, norm="forward")[: row.size]
+
+
+def _add_random_walk(
+    generator: np.random.Generator, noise: NDArray[np.float32], step_dps: float
+) -> None:
+    """Add the running sum of independent steps, the first before the first sample, in place."""
+    for row in noise.reshape(-1, noise.shape[-1]):
+        row[:] += step_dps * np.cumsum(generator.standard_normal(row.size))

@@ -12,11 +12,14 @@ import xarray as xr
 from gyro_pipeline.conventions import (
     ALL,
     BEST,
+    BIAS,
     DISJOINT,
     FIRST,
     HOLD_OUT,
     LAST,
     PAPER,
+    RECORDING_MEAN,
+    TARGET_OF,
     TEST,
     TEST_IMU,
     TRUE,
@@ -158,6 +161,8 @@ class Bench:
     def errors(self, estimator: Estimator, imus: int = 1) -> pd.DataFrame:
         """Errors of an estimator on IMU 1, in all windows against all truths.
 
+        It is asked for the target that each truth is about.
+
         Args:
             estimator: Sees ``imus`` IMUs side by side, the test IMU first.
             imus: How many.
@@ -167,8 +172,12 @@ class Bench:
         for recording in self.tested:
             samples = seen.sel(recording=recording.number).to_numpy()
             windows = cut_windows(samples.reshape(-1, samples.shape[-1]), self.size)
-            estimates = estimator.estimate(windows.transpose(1, 0, 2))
-            tables.append(error_table(recording, self.size, estimates[:, : samples.shape[1]]))
+            windows = windows.transpose(1, 0, 2)
+            start_s = np.arange(len(windows)) * self.size / self.recordings.attrs["rate_hz"]
+            for target in (RECORDING_MEAN, BIAS):
+                biases, _ = estimator.estimate(windows, target, start_s, recording.number)
+                table = error_table(recording, self.size, biases[:, : samples.shape[1]])
+                tables.append(table[table.truth.map(TARGET_OF) == target])
         return pd.concat(tables, ignore_index=True)
 
     @cached_property

@@ -7,7 +7,15 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from gyro_pipeline.conventions import ALL, AXES, BEST, BEST_EPOCH_ON_TEST, LAST, PAPER
+from gyro_pipeline.conventions import (
+    ALL,
+    AXES,
+    BEST,
+    BEST_EPOCH_ON_TEST,
+    LAST,
+    PAPER,
+    RECORDING_MEAN,
+)
 from gyro_pipeline.estimators import Estimator
 from gyro_pipeline.fingerprints import code_hash, fingerprint
 from gyro_pipeline.learning.jobs import NetworkEstimator
@@ -133,7 +141,8 @@ def strided_error_table(estimator: Estimator, bench: Bench, divided: Division) -
         sums = one.running_sums[:, starts + bench.size] - one.running_sums[:, starts]
         means = sums.T / bench.size
         seen = cut_windows(one.samples, bench.size, starts).transpose(1, 0, 2)
-        estimates = {"": estimator.estimate(seen), "mean_": means, "constant_": constant}
+        network, _ = estimator.estimate(seen, RECORDING_MEAN)
+        estimates = {"": network, "mean_": means, "constant_": constant}
         if device.unit_bias is not None and device.white:
             known = (device.unit_bias, device.spread[0], device.noise[0])
             estimates["oracle_"] = oracle(means, *known, bench.window_s, bench.recording_s, PAPER)

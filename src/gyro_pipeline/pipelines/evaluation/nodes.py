@@ -6,14 +6,21 @@ from collections.abc import Iterator
 import pandas as pd
 import xarray as xr
 
-from gyro_pipeline import estimators
 from gyro_pipeline.conventions import ALL, BEST, FIRST, LAST
-from gyro_pipeline.estimators import Estimator, RunningMean
+from gyro_pipeline.estimators import (
+    Estimator,
+    RunningMean,
+    averages,
+    base,
+    linear,
+    noise,
+    shrinkage,
+)
 from gyro_pipeline.fingerprints import code_hash, fingerprint
 from gyro_pipeline.learning.jobs import NetworkEstimator
 from gyro_pipeline.parameters import Evaluation
 from gyro_pipeline.physics import allan as allan_module
-from gyro_pipeline.physics import ceiling
+from gyro_pipeline.physics import ceiling, history, recording_model, reml
 from gyro_pipeline.pipelines.evaluation import bench as bench_module
 from gyro_pipeline.pipelines.evaluation.bench import (
     Bench,
@@ -37,7 +44,11 @@ from gyro_pipeline.tracking import (
 
 logger = logging.getLogger(__name__)
 
-_CODE = (allan_module, ceiling, bench_module, estimators, scores, truths, windows)
+_CODE = (
+    *(allan_module, ceiling, recording_model, reml, history),
+    *(averages, base, linear, noise, shrinkage),
+    *(bench_module, scores, truths, windows),
+)
 
 
 def evaluate(

@@ -1,0 +1,316 @@
+"""How good the estimators are, against what is possible and against the running mean.
+
+    python benchmarks/estimators.py                    # everything
+    python benchmarks/estimators.py --part white       # one part: white, warm_up, memsense, few,
+                                                       # coverage, history
+    python benchmarks/estimators.py --quick            # a fraction of the seeds
+
+Simulated recordings are SparkFun's: N = 3.3 mdps sqrt(s), turn-on spread 0.31 mdps, 13000 samples
+in 87 s. The real ones are read from the folder that GYRO_PIPELINE_REAL_DATA names; without it those
+parts are left out. Figures are ratios of RMSE against truth (a), the mean of the recording, over
+all non-overlapping windows. What each part shows, and its last results: benchmarks/README.md.
+"""
+
+import argparse
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from gyro_pipeline.conventions import AXES, DIMENSIONS, MDPS, PAPER, RECORDING_MEAN
+from gyro_pipeline.estimators import ESTIMATORS, FittedEstimator
+from gyro_pipeline.physics.allan import NoiseFigures
+from gyro_pipeline.physics.noise import simulate_noise, warm_up
+from gyro_pipeline.physics.recording_model import RecordingModel, best_linear
+from gyro_pipeline.protocol.windows import cut_windows
+
+SAMPLES, RECORDING_S = 13_000, 87.0
+RATE_HZ = SAMPLES / RECORDING_S
+N, SPREAD = 3.3 * MDPS, 0.31 * MDPS
+FLICKER, RANDOM_WALK = 3 * MDPS, 0.1 * MDPS
+WARM_UP = (20 * MDPS, 5 * MDPS, 30.0)
+TESTED = 40
+WINDOWS_S = (1, 2, 5, 10, 30)
+MEMSENSE_RATE_HZ = 250.0
+PUBLISHED_CONSTANT_DPS = 0.0014536
+
+MODELS = {
+    "white": RecordingModel(
+        SAMPLES, RATE_HZ, NoiseFigures(N, 0, 0), np.zeros(1), np.array([[SPREAD**2]])
+    ),
+    "coloured": RecordingModel(
+        SAMPLES, RATE_HZ, NoiseFigures(N, FLICKER, 0), np.zeros(1), np.array([[SPREAD**2]])
+    ),
+    "warm_up": RecordingModel(
+        SAMPLES,
+        RATE_HZ,
+        NoiseFigures(N, FLICKER, RANDOM_WALK),
+        np.array([0, WARM_UP[0]]),
+        np.diag([SPREAD**2, WARM_UP[1] ** 2]),
+        WARM_UP[2],
+    ),
+}
+
+
+def simulate(generator: np.random.Generator, model: RecordingModel, count: int) -> xr.Dataset:
+    """Recordings of one IMU whose three axes follow the model, about biases of +- 0.5 deg/s."""
+    noise = model.noise
+    rates = simulate_noise(
+        generator,
+        (1, count, len(AXES), model.samples),
+        model.rate_hz,
+        noise.white,
+        flicker_dps=noise.instability,
+        random_walk_dps_rts=noise.random_walk,
+    )
+    drawn = generator.multivariate_normal(model.mean, model.covariance, (1, count, len(AXES)))
+    bias = generator.uniform(-0.5, 0.5, len(AXES)) + drawn[..., 0]
+    rates += bias[..., None].astype(np.float32)
+    if model.mean.size > 1:
+        decay = warm_up(drawn[..., 1], model.time_constant_s, model.samples, model.rate_hz)
+        rates += decay.astype(np.float32)
+    unit = bias - drawn[..., 0]
+    data = {"angular_rate": (DIMENSIONS, rates), "unit_bias": (("axis",), unit[0, 0])}
+    return labelled(data, count, model.rate_hz)
+
+
+def labelled(data: dict[str, tuple], count: int, rate_hz: float) -> xr.Dataset:
+    """Recordings of IMU 1 in the layout of the conventions."""
+    coords = {"imu": [1], "recording": np.arange(1, 1 + count), "axis": list(AXES)}
+    return xr.Dataset(data, coords, {"rate_hz": rate_hz, "sensor": "benchmark"})
+
+
+def memsense() -> xr.Dataset | None:
+    """The public Memsense recordings, if they are at hand."""
+    folder = os.environ.get("GYRO_PIPELINE_REAL_DATA")
+    if folder is None:
+        return None
+    rates = np.load(Path(folder) / "memsense_test_real.npy")
+    return labelled({"angular_rate": (DIMENSIONS, rates[None])}, len(rates), MEMSENSE_RATE_HZ)
+
+
+def windows_of(recordings: xr.Dataset, window_s: float) -> Iterator[tuple]:
+    """Number, windows, their starts and the mean of each recording."""
+    rate_hz = recordings.attrs["rate_hz"]
+    size = round(window_s * rate_hz)
+    for number in recordings.recording.to_numpy():
+        samples = recordings.angular_rate.sel(imu=1, recording=number).to_numpy()
+        windows = cut_windows(samples, size).transpose(1, 0, 2)
+        starts = np.arange(len(windows)) * size / rate_hz
+        yield int(number), windows, starts, samples.mean(axis=-1, dtype=np.float64)
+
+
+def judged(
+    estimator: FittedEstimator, tested: xr.Dataset, window_s: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Errors against the mean of the recording, and sigmas, both (windows, axes)."""
+    errors, sigmas = [], []
+    for number, windows, starts, truth in windows_of(tested, window_s):
+        bias, sigma = estimator.estimate(windows, RECORDING_MEAN, starts, number)
+        errors.append(bias - truth)
+        sigmas.append(sigma)
+    return np.concatenate(errors), np.concatenate(sigmas)
+
+
+def rms(errors: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+class Oracle:
+    """The best estimate by one who knows the model."""
+
+    def __init__(self, model: RecordingModel, unit_bias: np.ndarray) -> None:
+        self._model, self._unit = model, unit_bias
+        self._lines: dict = {}
+
+    def estimate(self, windows, target, start_s, recording=None):
+        biases = np.empty(windows.shape[:2])
+        for i, start in enumerate(np.rint(start_s * self._model.rate_hz).astype(int)):
+            key = int(start), windows.shape[-1]
+            if key not in self._lines:
+                self._lines[key] = best_linear(self._model, *key, PAPER)
+            line = self._lines[key]
+            # its weights were made for a unit bias of 0
+            biases[i] = line(windows[i] - self._unit[:, None]) + self._unit
+        return biases, np.full(biases.shape, np.nan)
+
+
+def split(recordings: xr.Dataset, training: int) -> tuple[xr.Dataset, xr.Dataset]:
+    """The first recordings, and the last TESTED ones."""
+    return recordings.isel(recording=slice(training)), recordings.isel(
+        recording=slice(-TESTED, None)
+    )
+
+
+def to_the_oracle(model: str, names: list[str], counts: list[int], seeds: int) -> None:
+    """Mean and largest ratio to the oracle on the same windows, 10 s, over data seeds."""
+    ratios: dict[tuple[str, int], list[float]] = {}
+    for seed in range(seeds):
+        made = simulate(np.random.default_rng([7, seed]), MODELS[model], max(counts) + TESTED)
+        _, tested = split(made, 0)
+        oracle = rms(judged(Oracle(MODELS[model], made.unit_bias.to_numpy()), tested, 10)[0])
+        for count in counts:
+            for name in names:
+                estimator = ESTIMATORS[name]().fit(split(made, count)[0])
+                error = rms(judged(estimator, tested, 10)[0])
+                ratios.setdefault((name, count), []).append(error / oracle)
+    for (name, count), values in ratios.items():
+        mean, largest = np.mean(values), np.max(values)
+        print(f"  {name:24} {count:3} recordings: {mean:6.3f} (largest {largest:.3f}, n={seeds})")
+
+
+def white(quick: bool) -> None:
+    print("\nSimulated white noise, 10 s: RMSE over that of the oracle")
+    names = [
+        *("empirical_bayes", "empirical_bayes_pooled", "best_linear", "best_linear_allan"),
+        *("ridge", "training_mean", "mean"),
+    ]
+    to_the_oracle("white", names, [80, 10], 4 if quick else 20)
+
+
+def warming(quick: bool) -> None:
+    print(
+        f"\nFlicker {FLICKER / MDPS:g} mdps, random walk {RANDOM_WALK / MDPS:g} mdps/sqrt(s), "
+        f"warm-up 20 +- 5 mdps with 30 s; 10 s: RMSE over that of the exact oracle"
+    )
+    names = [
+        *("best_linear_warm_up", "ridge_same_time", "best_linear", "ridge"),
+        *("empirical_bayes", "mean"),
+    ]
+    to_the_oracle("warm_up", names, [80, 10], 2 if quick else 10)
+
+
+def leave_one_out(recordings: xr.Dataset, make: Callable[[], FittedEstimator]) -> dict:
+    """Errors and sigmas by window length, every recording judged by what the others taught."""
+    found: dict[float, list] = {window_s: [] for window_s in WINDOWS_S}
+    for i in range(recordings.sizes["recording"]):
+        others = np.delete(np.arange(recordings.sizes["recording"]), i)
+        estimator = make().fit(recordings.isel(recording=others))
+        for window_s in WINDOWS_S:
+            found[window_s].append(judged(estimator, recordings.isel(recording=[i]), window_s))
+    return {
+        w: [np.concatenate(part) for part in zip(*all_, strict=True)] for w, all_ in found.items()
+    }
+
+
+def real(quick: bool) -> None:
+    recordings = memsense()
+    if recordings is None:
+        print("\nMemsense: left out, GYRO_PIPELINE_REAL_DATA is not set")
+        return
+    print(
+        "\nMemsense, leave-one-recording-out: RMSE over that of the running mean at 1 2 5 10 30 s;"
+    )
+    print("share of errors within 1 and 2 sigma, over all of these windows' lengths from to")
+    results = {name: leave_one_out(recordings, make) for name, make in ESTIMATORS.items()}
+    for name, found in results.items():
+        ratios = [rms(found[w][0]) / rms(results["mean"][w][0]) for w in WINDOWS_S]
+        shares = [
+            [np.mean(np.abs(errors) < k * sigma) for errors, sigma in found.values()]
+            for k in (1, 2)
+        ]
+        text = " ".join(f"{ratio:.3f}" for ratio in ratios)
+        covered = " ".join(f"{min(s):.2f}-{max(s):.2f}" for s in shares)
+        print(f"  {name:24} {text}   {covered if max(shares[1]) > 0 else '-'}")
+    constant = rms(results["training_mean"][10][0])
+    print(f"  constant: {constant:.7f} deg/s, published {PUBLISHED_CONSTANT_DPS}")
+
+
+def few(quick: bool) -> None:
+    names = ["empirical_bayes", "empirical_bayes_pooled", "best_linear"]
+    resamples = 8 if quick else 50
+    print(
+        "\nFive training recordings: RMSE over that of the running mean at 1 2 5 10 30 s, "
+        f"mean of {resamples} resamples"
+    )
+    sources = {
+        name: simulate(np.random.default_rng([9, i]), MODELS[name], 300)
+        for i, name in enumerate(("white", "coloured", "warm_up"))
+    }
+    real_ones = memsense()
+    if real_ones is not None:
+        sources["memsense"] = real_ones
+    for source, recordings in sources.items():
+        warming_up = ["best_linear_warm_up"] if source == "warm_up" else []
+        ratios: dict[str, list] = {name: [] for name in names + warming_up}
+        for resample in range(resamples):
+            order = np.random.default_rng([11, resample]).permutation(recordings.sizes["recording"])
+            training = recordings.isel(recording=np.sort(order[:5]))
+            tested = recordings.isel(recording=np.sort(order[5 : 5 + TESTED]))
+            mean = [rms(judged(ESTIMATORS["mean"](), tested, w)[0]) for w in WINDOWS_S]
+            for name, values in ratios.items():
+                estimator = ESTIMATORS[name]().fit(training)
+                own = [rms(judged(estimator, tested, w)[0]) for w in WINDOWS_S]
+                values.append(np.divide(own, mean))
+        for name, values in ratios.items():
+            text = " ".join(f"{value:.3f}" for value in np.mean(values, axis=0))
+            print(f"  {source:9} {name:24} {text}   largest of one {np.max(values):.2f}")
+
+
+def coverage(quick: bool) -> None:
+    tested = 200 if quick else 1000
+    print(f"\nShare of errors within 1 and 2 sigma, {tested} test recordings, at 1 2 5 10 30 s")
+    cases = [
+        *(("white", name) for name in ("mean", "empirical_bayes", "best_linear")),
+        *(("coloured", name) for name in ("mean", "empirical_bayes", "best_linear")),
+        *(("warm_up", name) for name in ("best_linear_warm_up",)),
+    ]
+    for source in ("white", "coloured", "warm_up"):
+        generator = np.random.default_rng([13, len(source)])
+        made = simulate(generator, MODELS[source], 80 + tested)
+        for name in (name for which, name in cases if which == source):
+            estimator = ESTIMATORS[name]().fit(made.isel(recording=slice(80)))
+            rest = made.isel(recording=slice(80, None))
+            found = [judged(estimator, rest, window_s) for window_s in WINDOWS_S]
+            shares = [[np.mean(np.abs(e) < k * s) for e, s in found] for k in (1, 2)]
+            text = "   ".join(" ".join(f"{x:.3f}" for x in share) for share in shares)
+            print(f"  {source:9} {name:24} {text}")
+
+
+def history(quick: bool) -> None:
+    print("\nA bias that walks by 1 mdps from recording to recording, white noise, 10 s, 40 stored")
+    print("calibrations, the next one tested: RMSE over that of the running mean")
+    seeds = 10 if quick else 60
+    names = ["mean", "training_mean", "last_calibration", "empirical_bayes", "best_linear_history"]
+    errors: dict[str, list] = {name: [] for name in names}
+    for seed in range(seeds):
+        generator = np.random.default_rng([15, seed])
+        made = simulate(generator, MODELS["white"], 41)
+        walk = np.cumsum(generator.normal(0, 1 * MDPS, (1, 41, len(AXES))), axis=1)
+        made["angular_rate"] = made.angular_rate + walk[..., None].astype(np.float32)
+        for name in names:
+            estimator = ESTIMATORS[name]().fit(made.isel(recording=slice(40)))
+            errors[name].append(judged(estimator, made.isel(recording=[40]), 10)[0])
+    for name in names:
+        print(f"  {name:24} {rms(errors[name]) / rms(errors['mean']):.3f}")
+
+
+PARTS = {
+    "white": white,
+    "warm_up": warming,
+    "memsense": real,
+    "few": few,
+    "coverage": coverage,
+    "history": history,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--part", choices=PARTS, help="only this one")
+    parser.add_argument("--quick", action="store_true", help="a fraction of the seeds")
+    arguments = parser.parse_args()
+    for name, part in PARTS.items():
+        if arguments.part in (None, name):
+            started = time.perf_counter()
+            part(arguments.quick)
+            print(f"  ({time.perf_counter() - started:.0f} s)", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+"""The one interface of all estimators, and what they share."""
+
+from typing import Protocol, Self
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from gyro_pipeline.conventions import BIAS, RECORDING_MEAN, TEST_IMU, InputError
+
+Estimates = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Biases (n, 3) and their standard deviations (n, 3), deg/s; NaN where a method has none."""
+
+
+class Estimator(Protocol):
+    """Anything that estimates biases from windows.
+
+    A stored prior contains the Earth's rate, 4.2 mdps, as the sensing axes saw it. So an estimator
+    with ``uses_prior`` holds only at the latitude and in the orientation of its training
+    recordings. Whoever shows one of its estimates says so: ``ORIENTATION_NOTE``.
+    """
+
+    @property
+    def recommended(self) -> bool:
+        """Whether it is one to use; the others are there to be compared with."""
+
+    @property
+    def uses_prior(self) -> bool:
+        """Whether what it learned about the bias enters its estimates."""
+
+    def estimate(
+        self,
+        windows: NDArray[np.floating],
+        target: str = BIAS,
+        start_s: ArrayLike = 0.0,
+        recording: int | None = None,
+    ) -> Estimates:
+        """Biases of the gyroscopes seen side by side.
+
+        Args:
+            windows: (n, gyroscopes, samples), deg/s.
+            target: BIAS, or RECORDING_MEAN: the mean of the whole recording that the window is
+                part of, whose length is that of the training recordings.
+            start_s: (n,) or one for all: when each window begins, seconds after power-on. Matters
+                to estimators that know a warm-up or a random walk.
+            recording: Number of the recording that the windows are from; None for one after all
+                training recordings. Matters to estimators that use past calibrations in order.
+
+        Returns:
+            Two arrays (n, gyroscopes), deg/s: estimates, and the standard deviation of each
+            about the target; NaN where the method has none.
+        """
+
+
+class FittedEstimator(Estimator, Protocol):
+    """An estimator that learns from training recordings."""
+
+    def fit(self, recordings: xr.Dataset, imu: int = TEST_IMU) -> Self:
+        """Learn from training recordings, and from nothing else.
+
+        Args:
+            recordings: As in :mod:`gyro_pipeline.conventions`.
+            imu: Whose windows will be seen. A device that is not among the recordings is an unseen
+                one: its prior is the spread from unit to unit.
+
+        Returns:
+            Itself.
+        """
+
+
+ORIENTATION_NOTE = (
+    "uses a stored prior, which holds only in the orientation and at the latitude it was learned in"
+)
+
+
+def check_target(target: str) -> None:
+    """Refuse an unknown target."""
+    if target not in (RECORDING_MEAN, BIAS):
+        raise InputError(f"target: expected {RECORDING_MEAN!r} or {BIAS!r}, got {target!r}")
+
+
+def samples_of(recordings: xr.Dataset, imu: int) -> NDArray[np.floating]:
+    """Recordings of one IMU that it has, (recordings, axes, samples), deg/s."""
+    rates = recordings.angular_rate.sel(imu=imu).transpose("recording", "axis", "sample").to_numpy()
+    return rates[np.isfinite(rates[..., 0]).all(axis=-1)]
+
+
+def labels_of(recordings: xr.Dataset, imu: int) -> tuple[NDArray[np.integer], NDArray[np.float64]]:
+    """Numbers (n,) and means (n, axes), deg/s, of the recordings that an IMU has, in order."""
+    chosen = recordings.angular_rate.sel(imu=imu).transpose("recording", "axis", "sample")
+    means = chosen.mean("sample", dtype=np.float64, skipna=False).to_numpy()
+    present = np.isfinite(means).all(axis=1)
+    numbers = chosen.recording.to_numpy()[present]
+    order = np.argsort(numbers)
+    return numbers[order], means[present][order]
+
+
+def known_imus(recordings: xr.Dataset, imu: int) -> list[int]:
+    """Where to learn about a device: from itself, or from all others if it is an unseen one."""
+    numbers = [int(number) for number in recordings.imu]
+    return [imu] if imu in numbers else numbers
+
+
+def duration_s(recordings: xr.Dataset) -> float:
+    """T, seconds."""
+    return float(recordings.sizes["sample"] / recordings.attrs["rate_hz"])

@@ -1,0 +1,174 @@
+"""Estimators that know the device's past: a constant, the last calibration, empirical Bayes."""
+
+from typing import ClassVar, Self
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from gyro_pipeline.conventions import BIAS, RECORDING_MEAN, TEST_IMU
+from gyro_pipeline.estimators.base import (
+    Estimates,
+    check_target,
+    duration_s,
+    known_imus,
+    labels_of,
+)
+from gyro_pipeline.estimators.noise import white_noise
+from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, guarded_spread
+
+
+class TrainingMean:
+    """The mean of the training recordings' means: a constant that ignores the window.
+
+    For an unseen device it is the mean of the others, which is worth nothing; that is the point.
+    """
+
+    recommended: ClassVar[bool] = False
+    uses_prior: ClassVar[bool] = True
+
+    def fit(self, recordings: xr.Dataset, imu: int = TEST_IMU) -> Self:
+        """See :class:`~gyro_pipeline.estimators.FittedEstimator`."""
+        self._learn(recordings, imu)
+        self._noise = white_noise(recordings, imu)
+        self._recording_s = duration_s(recordings)
+        return self
+
+    def _learn(self, recordings: xr.Dataset, imu: int) -> None:
+        known = [labels_of(recordings, one) for one in known_imus(recordings, imu)]
+        self._numbers = np.concatenate([numbers for numbers, _ in known])
+        self._labels = np.concatenate([means for _, means in known])
+
+    def estimate(
+        self,
+        windows: NDArray[np.floating],
+        target: str = BIAS,
+        start_s: ArrayLike = 0.0,
+        recording: int | None = None,
+    ) -> Estimates:
+        """See :class:`~gyro_pipeline.estimators.Estimator`."""
+        check_target(target)
+        biases, of_estimate = self.constant(recording)
+        scatter = self._labels.var(axis=0, ddof=1) if len(self._labels) > 1 else np.nan
+        own = self._noise**2 / self._recording_s if target == BIAS else 0.0
+        sigma = np.sqrt(np.maximum(scatter - own, 0.0) + of_estimate * scatter)
+        shape = len(windows), self._labels.shape[1]
+        return np.broadcast_to(biases, shape), np.broadcast_to(sigma, shape)
+
+    def constant(self, recording: int | None) -> tuple[NDArray[np.float64], float]:
+        """The estimate (3,), and its own variance in units of the scatter of the labels."""
+        return self._labels.mean(axis=0), 1 / len(self._labels)
+
+
+class LastCalibration(TrainingMean):
+    """The mean of the device's preceding training recording: the calibration it has stored.
+
+    Before the first training recording nothing is stored, and it is the training mean. Sigma
+    assumes that power-ons are independent. A device that was never seen has no calibration: the
+    training mean of the others.
+    """
+
+    def _learn(self, recordings: xr.Dataset, imu: int) -> None:
+        super()._learn(recordings, imu)
+        if known_imus(recordings, imu) != [imu]:
+            self._numbers = np.full(self._numbers.shape, np.inf)
+
+    def constant(self, recording: int | None) -> tuple[NDArray[np.float64], float]:
+        """See :meth:`TrainingMean.constant`."""
+        past = self._numbers < (np.inf if recording is None else recording)
+        if not past.any():
+            return super().constant(recording)
+        return self._labels[past][-1], 1.0
+
+
+class EmpiricalBayes:
+    """The posterior mean of the bias under a prior learned from training recordings.
+
+    The bias of a power-on is Normal(mu, tau^2) and the noise white. With N from the Allan fit, mu
+    the mean of the n training labels and P = tau^2 + (tau^2 + N^2 / T) / n, the prior variance of
+    the next bias including what is not known of mu,
+
+        bias = mu + beta (m - mu),    beta = P / (P + N^2 / T0)
+
+    and the mean of the recording is r m + (1 - r) times that, r = T0 / T (Efron & Morris 1973; see
+    :mod:`gyro_pipeline.physics.ceiling`). Few recordings can show a tau of 0 by chance, and
+    everything would be pulled to mu: tau has a weak prior (:mod:`gyro_pipeline.physics.reml`).
+    Sigma is too small where noise is not white.
+
+    An unseen device has the mean and spread of the known devices' means as its prior. Where fewer
+    than three labels are known, it is flat and the estimate is the running mean.
+
+    Args:
+        pooled: One tau for all axes and IMUs; mu is always the axis' own. Better where they are
+            alike, worse where they are not, as on the public Memsense recordings.
+    """
+
+    uses_prior: ClassVar[bool] = True
+
+    def __init__(self, pooled: bool = False) -> None:
+        self.recommended = not pooled
+        self._pooled = pooled
+
+    def fit(self, recordings: xr.Dataset, imu: int = TEST_IMU) -> Self:
+        """See :class:`~gyro_pipeline.estimators.FittedEstimator`."""
+        self._noise = white_noise(recordings, imu)
+        self._rate_hz = float(recordings.attrs["rate_hz"])
+        self._recording_s = duration_s(recordings)
+        labels, averaging = self._labels(recordings, imu)
+        self._mean = labels.mean(axis=0)
+        scatter = self._spread(recordings, labels, averaging) ** 2
+        self._prior = scatter + (scatter + averaging) / len(labels)
+        return self
+
+    def _labels(
+        self, recordings: xr.Dataset, imu: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Labels (n, 3) of the prior and their averaging noise (3,): recordings or devices."""
+        known = known_imus(recordings, imu)
+        if known == [imu]:
+            return labels_of(recordings, imu)[1], self._noise**2 / self._recording_s
+        means = [labels_of(recordings, one)[1].mean(axis=0) for one in known]
+        return np.stack(means), np.zeros(len(self._noise))
+
+    def _spread(
+        self, recordings: xr.Dataset, labels: NDArray[np.float64], averaging: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """The tau of each axis, (3,)."""
+        if self._pooled and averaging.any():
+            return np.full(averaging.shape, self._pooled_spread(recordings))
+        if len(labels) < FEWEST_RECORDINGS:
+            return np.full(averaging.shape, np.inf)
+        scatter, freedom = labels.var(axis=0) * len(labels), len(labels) - 1
+        groups = zip(scatter, averaging, strict=True)
+        return np.array([guarded_spread(square, freedom, v) for square, v in groups])
+
+    def _pooled_spread(self, recordings: xr.Dataset) -> float:
+        scatter, freedom, averaging = [], [], []
+        for imu in recordings.imu.to_numpy():
+            labels = labels_of(recordings, imu)[1]
+            scatter.append(labels.var(axis=0) * len(labels))
+            freedom.append(np.full(labels.shape[1], len(labels) - 1))
+            averaging.append(white_noise(recordings, imu) ** 2 / self._recording_s)
+        if np.sum(freedom) < FEWEST_RECORDINGS - 1:
+            return np.inf
+        return guarded_spread(*map(np.concatenate, (scatter, freedom, averaging)))
+
+    def estimate(
+        self,
+        windows: NDArray[np.floating],
+        target: str = BIAS,
+        start_s: ArrayLike = 0.0,
+        recording: int | None = None,
+    ) -> Estimates:
+        """See :class:`~gyro_pipeline.estimators.Estimator`."""
+        check_target(target)
+        means = windows.mean(axis=-1, dtype=np.float64)
+        window_s = windows.shape[-1] / self._rate_hz
+        averaging = self._noise**2 / window_s
+        beta = 1 / (1 + averaging / self._prior)
+        r = window_s / self._recording_s if target == RECORDING_MEAN else 0.0
+        variance = (1 - r) ** 2 * beta * averaging
+        if target == RECORDING_MEAN:  # and what the rest of the recording is off from the bias
+            variance += (1 - r) * self._noise**2 / self._recording_s
+        biases = r * means + (1 - r) * (self._mean + beta * (means - self._mean))
+        return biases, np.broadcast_to(np.sqrt(variance), biases.shape)

@@ -1,0 +1,107 @@
+"""What a device's past calibrations say about its next bias.
+
+From one recording to the next the bias walks on, and each power-on adds its turn-on deviation:
+
+    bias of recording i = level_i + deviation_i,    level_(i + 1) = level_i + step
+
+with a step of standard deviation D per recording number and a deviation of standard deviation tau
+(a local-level model). A calibration, the mean of a recording, adds its averaging noise. The prior
+of a recording is the conditional mean of its bias given the calibrations before it, the first level
+being unknown (kriging). With D = 0 that is their mean, and the spread tau.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize
+
+from gyro_pipeline.physics.recording_model import RecordingModel
+
+_FEWEST_PAST = 3  # with fewer calibrations before it, a recording has the prior of all
+
+
+@dataclass(frozen=True)
+class BiasHistory:
+    """Calibrations of one gyroscope, in order, and how its bias walks.
+
+    Attributes:
+        numbers: Of the recordings, (n,), increasing.
+        labels: Their means, (n,), deg/s.
+        averaging: Averaging noise of a label, (deg/s)^2.
+        step: D, deg/s.
+        deviation: tau, deg/s.
+    """
+
+    numbers: NDArray[np.integer]
+    labels: NDArray[np.float64]
+    averaging: float
+    step: float
+    deviation: float
+
+    @classmethod
+    def fit(
+        cls, numbers: NDArray[np.integer], labels: NDArray[np.float64], model: RecordingModel
+    ) -> Self:
+        """Fit D and tau by restricted maximum likelihood, with tau's weak prior.
+
+        Args:
+            numbers: Of the recordings, (n,), increasing.
+            labels: Their means, (n,), deg/s.
+            model: Of one recording; its noise makes the averaging noise of a label.
+        """
+        edges = np.array([0, model.samples])
+        averaging = float(model.noise_covariance(edges)[0, 0])
+        if model.mean.size > 1:  # the warm-up is in the label, with its own amplitude
+            averaging += float(model.profiles(edges)[0, 1] ** 2 * model.covariance[1, 1])
+        scale = np.log(labels.std(ddof=1))
+
+        def deviance(x: NDArray[np.float64]) -> float:
+            history = cls(numbers, labels, averaging, *np.exp(x))
+            whitening = np.linalg.inv(np.linalg.cholesky(history._covariance(numbers)))
+            ones, y = whitening.sum(axis=1), whitening @ (labels - labels.mean())
+            information = ones @ ones
+            squares = y @ y - (ones @ y) ** 2 / information
+            logs = -2 * np.log(np.diag(whitening)).sum() + np.log(information)
+            return float(logs + squares - 2 * x[1])
+
+        starts = [scale + np.array(start) for start in ((-1.0, -0.5), (-4.0, 0.0))]
+        bounds = [(scale - 9, scale + 3)] * 2
+        found = [optimize.minimize(deviance, x, bounds=bounds, method="L-BFGS-B") for x in starts]
+        best = min(found, key=lambda result: result.fun)
+        return cls(numbers, labels, averaging, *map(float, np.exp(best.x)))
+
+    def _covariance(self, numbers: NDArray[np.integer]) -> NDArray[np.float64]:
+        """Of labels, about a level that is unknown at the first recording."""
+        since = numbers - self.numbers[0]
+        walk = self.step**2 * np.minimum(since[:, None], since[None, :])
+        return walk + (self.deviation**2 + self.averaging) * np.eye(numbers.size)
+
+    def prior(self, model: RecordingModel, recording: int | None) -> RecordingModel:
+        """The model with the prior of one recording.
+
+        Args:
+            model: With the prior of any recording; kept where fewer than three calibrations came
+                before.
+            recording: Its number; None for the one after all.
+        """
+        next_number = int(self.numbers[-1]) + 1 if recording is None else recording
+        past = self.numbers < next_number
+        if past.sum() < _FEWEST_PAST:
+            return model
+        # the warm-up's share of a label is the same for all but for its scatter
+        offset = model.profiles(np.array([0, model.samples]))[0, 1:] @ model.mean[1:]
+        numbers, labels = self.numbers[past], self.labels[past] - offset
+        covariance = self._covariance(np.append(numbers, next_number))
+        among, with_next = covariance[:-1, :-1], covariance[:-1, -1]
+        solved = np.linalg.solve(among, np.column_stack([np.ones(numbers.size), with_next]))
+        information = solved[:, 0].sum()
+        level = solved[:, 0] @ labels / information
+        mean = level + solved[:, 1] @ (labels - level)
+        missing = 1 - solved[:, 1].sum()
+        variance = covariance[-1, -1] - self.averaging - solved[:, 1] @ with_next
+        variance += missing**2 / information
+        prior_mean, prior_covariance = model.mean.copy(), np.diag(np.diag(model.covariance))
+        prior_mean[0], prior_covariance[0, 0] = mean, variance
+        return replace(model, mean=prior_mean, covariance=prior_covariance)

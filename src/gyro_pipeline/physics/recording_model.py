@@ -1,0 +1,288 @@
+"""One gyroscope's recording as a Gaussian process, and the best linear estimates it allows.
+
+A sample at time t after power-on is
+
+    b + a exp(-t / time constant) + white noise N + flicker noise B + random walk K
+
+with the bias b and, where the sensor warms up, the amplitude a drawn at each power-on from a normal
+distribution, the prior. The noise is what :mod:`gyro_pipeline.physics.noise` simulates: flicker of
+one-sided density B^2 / (pi f) down to one cycle in two recordings, and a random walk from 0 at
+power-on. Means over blocks of samples, the mean of the whole recording and the bias are then
+jointly normal, with covariances that are exact for blocks of any lengths. So the best estimate of
+each from the blocks of a window is linear, and is their conditional mean.
+
+Only the window needs to be cut finely: what lies before and after it is one block each. Block
+means lose nothing of white noise and random walk that matters, as long as a block is much shorter
+than the time at which flicker equals white noise, 2 pi N^2 / B^2 (20 s for N = 5.4, B = 3 mdps).
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, linalg
+
+from gyro_pipeline.conventions import DISJOINT, PAPER, TRUE, InputError
+from gyro_pipeline.physics.allan import NoiseFigures
+
+BLOCK_S = 0.5
+"""Length of a block of a window."""
+
+_MOST_BLOCKS = 200
+
+
+@dataclass(frozen=True)
+class RecordingModel:
+    """What is known of one gyroscope before a window is seen.
+
+    Attributes:
+        samples: Of a whole recording.
+        rate_hz: Samples per second.
+        noise: N, B and K.
+        mean: Of the prior: bias and, if the sensor warms up, amplitude; (1,) or (2,), deg/s.
+        covariance: Of the prior, with the uncertainty of ``mean`` if it was learned; (1, 1) or
+            (2, 2), (deg/s)^2.
+        time_constant_s: Of the warm-up; not used without one.
+    """
+
+    samples: int
+    rate_hz: float
+    noise: NoiseFigures
+    mean: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    time_constant_s: float = np.inf
+
+    def noise_covariance(self, edges: NDArray[np.integer]) -> NDArray[np.float64]:
+        """Covariance of the noise of block means.
+
+        Args:
+            edges: (m + 1,), sample numbers, increasing; block i is ``edges[i]:edges[i + 1]``.
+
+        Returns:
+            (m, m), (deg/s)^2.
+        """
+        figures = self.noise.white, self.noise.instability, self.noise.random_walk
+        unit = noise_covariances(edges, self.samples, self.rate_hz)
+        return np.tensordot(np.square(figures), unit, axes=1)
+
+    def profiles(self, edges: NDArray[np.integer]) -> NDArray[np.float64]:
+        """Block means of what the bias and the amplitude are multiplied with, (m, 1) or (m, 2)."""
+        return profiles(edges, self.rate_hz, self.time_constant_s)[:, : self.mean.size]
+
+
+@dataclass(frozen=True)
+class LinearEstimate:
+    """An estimate that is a weighted sum of a window's block means.
+
+    Attributes:
+        edges: Of the blocks within the window, (m + 1,), samples.
+        weights: (m,).
+        constant: deg/s.
+        variance: Of the error, (deg/s)^2.
+    """
+
+    edges: NDArray[np.integer]
+    weights: NDArray[np.float64]
+    constant: float
+    variance: float
+
+    def __call__(self, windows: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Estimates from windows, (n, samples) to (n,), deg/s."""
+        return self.constant + block_means(windows, self.edges) @ self.weights
+
+
+def best_linear(
+    model: RecordingModel, start: int, size: int, truth: str, block_s: float = BLOCK_S
+) -> LinearEstimate:
+    """The best estimate of a truth from a window; none is better if all is Gaussian.
+
+    Args:
+        model: What is known before.
+        start: First sample of the window, counted from power-on.
+        size: Samples of the window.
+        truth: PAPER (mean of the whole recording), DISJOINT (mean outside the window) or TRUE
+            (the bias).
+        block_s: The window is cut into blocks of about this length, 200 at most.
+
+    Returns:
+        Weights, constant and error variance. For DISJOINT the variance still holds the averaging
+        noise of the truth.
+
+    Raises:
+        InputError: A window that is not inside the recording, or an unknown truth.
+    """
+    joint = _Joint.of(model, start, size, truth, block_s)
+    weights = linalg.solve(joint.covariance, joint.shared, assume_a="pos")
+    variance = joint.truth_variance - weights @ joint.shared
+    constant = joint.truth_mean - weights @ joint.mean
+    return LinearEstimate(joint.edges - start, weights, float(constant), float(variance))
+
+
+def mean_squares(
+    model: RecordingModel, start: int, size: int, truth: str, block_s: float = BLOCK_S
+) -> tuple[float, float]:
+    """Expected squared errors of the best linear estimate and of the running mean.
+
+    The first is the ceiling for this noise: its root is the least RMSE that any function of the
+    window can have, if all is Gaussian and the model is known.
+
+    Args:
+        model: The drawn one, or a fitted one.
+        start: First sample of the window, counted from power-on.
+        size: Samples of the window.
+        truth: PAPER, DISJOINT (the averaging noise of that truth is taken off, which may leave a
+            negative square where noise is correlated) or TRUE.
+        block_s: See :func:`best_linear`.
+
+    Returns:
+        Two squares, (deg/s)^2.
+
+    Raises:
+        InputError: A window that is not inside the recording, or an unknown truth.
+    """
+    joint = _Joint.of(model, start, size, truth, block_s)
+    weights = np.diff(joint.edges) / size
+    offset = weights @ joint.mean - joint.truth_mean
+    variance = weights @ (joint.covariance @ weights - 2 * joint.shared) + joint.truth_variance
+    best = best_linear(model, start, size, truth, block_s).variance
+    return best - joint.truth_noise, float(variance + offset**2 - joint.truth_noise)
+
+
+@dataclass(frozen=True)
+class _Joint:
+    """The joint normal distribution of a window's block means and a truth."""
+
+    edges: NDArray[np.integer]
+    mean: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    shared: NDArray[np.float64]
+    truth_mean: float
+    truth_variance: float
+    truth_noise: float
+
+    @classmethod
+    def of(
+        cls, model: RecordingModel, start: int, size: int, truth: str, block_s: float
+    ) -> "_Joint":
+        stop = start + size
+        if not 0 <= start < stop <= model.samples:
+            raise InputError(
+                f"window: expected it inside a recording of {model.samples} samples, got samples "
+                f"{start} to {stop}; start_s counts from power-on"
+            )
+        inner = start + block_edges(size, round(block_s * model.rate_hz))
+        edges = np.unique([0, *inner, model.samples])
+        inside = (edges[:-1] >= start) & (edges[1:] <= stop)
+        profile, noise = model.profiles(edges), model.noise_covariance(edges)
+        lengths = np.diff(edges)
+        # the truth is coefficients @ (bias, amplitude) + averaging @ (noise of all blocks)
+        if truth == PAPER:
+            averaging = lengths / model.samples
+        elif truth == DISJOINT and size < model.samples:
+            averaging = np.where(inside, 0, lengths) / (model.samples - size)
+        elif truth == TRUE:
+            averaging = np.zeros(lengths.size)
+        else:
+            raise InputError(
+                f"truth: expected {PAPER!r}, {DISJOINT!r} (for a window shorter than the "
+                f"recording) or {TRUE!r}, got {truth!r}"
+            )
+        coefficients = np.eye(model.mean.size)[0] if truth == TRUE else averaging @ profile
+        covariance = profile @ model.covariance @ profile.T + noise
+        shared = profile @ model.covariance @ coefficients + noise @ averaging
+        own = averaging @ noise @ averaging
+        return cls(
+            inner,
+            (profile @ model.mean)[inside],
+            covariance[np.ix_(inside, inside)],
+            shared[inside],
+            float(coefficients @ model.mean),
+            float(coefficients @ model.covariance @ coefficients + own),
+            float(own) if truth == DISJOINT else 0.0,
+        )
+
+
+def block_edges(size: int, block: int) -> NDArray[np.integer]:
+    """Cut ``size`` samples into blocks of about ``block``, 200 at most, of nearly equal lengths.
+
+    Returns:
+        (m + 1,), sample numbers from 0 to ``size``.
+    """
+    count = int(np.clip(round(size / max(block, 1)), 1, min(_MOST_BLOCKS, size)))
+    return np.rint(np.linspace(0, size, count + 1)).astype(int)
+
+
+def block_means(samples: NDArray[np.floating], edges: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Means of blocks, (..., n) to (..., m); sums are in float64."""
+    sums = np.add.reduceat(samples, edges[:-1], axis=-1, dtype=np.float64)
+    return np.asarray(sums / np.diff(edges))
+
+
+def profiles(
+    edges: NDArray[np.integer], rate_hz: float, time_constant_s: float
+) -> NDArray[np.float64]:
+    """Block means of 1 and of exp(-t / time constant), (m, 2); sample i is at (i + 1/2) / rate."""
+    period = 1 / (rate_hz * time_constant_s)
+    powers = np.exp(-edges * period)
+    # a geometric sum; its limit is 1 without a time constant
+    scale = np.exp(-period / 2) / -np.expm1(-period) if period > 0 else 0.0
+    decay = scale * -np.diff(powers) / np.diff(edges) if period > 0 else np.ones(edges.size - 1)
+    return np.stack([np.ones(edges.size - 1), decay], axis=1)
+
+
+def noise_covariances(
+    edges: NDArray[np.integer], samples: int, rate_hz: float
+) -> NDArray[np.float64]:
+    """Covariances of block means of white noise, flicker and random walk of N = B = K = 1.
+
+    Args:
+        edges: (m + 1,), sample numbers, increasing.
+        samples: Of the whole recording, which sets the lowest frequency of the flicker.
+        rate_hz: Samples per second.
+
+    Returns:
+        (3, m, m).
+    """
+    lengths = np.diff(edges).astype(np.float64)
+    white = np.diag(rate_hz / lengths)
+    of_sum = _flicker_sum_variance(samples)
+    # of sums over [a, b) and [c, d): half of V(d - a) + V(c - b) - V(c - a) - V(d - b)
+    at = of_sum[np.abs(edges[:, None] - edges[None, :])]
+    flicker = (at[:-1, 1:] + at[1:, :-1] - at[:-1, :-1] - at[1:, 1:]) / 2
+    middle = (edges[:-1] + edges[1:] + 1) / 2  # mean number of steps until a sample of the block
+    walk = np.minimum(middle[:, None], middle[None, :]) / rate_hz
+    # within a block: the mean of min(i, j) + 1 over all pairs of its samples
+    shared = edges[:-1] + 1 + (lengths - 1) * (2 * lengths - 1) / (6 * lengths)
+    np.fill_diagonal(walk, shared / rate_hz)
+    return np.stack([white, flicker / np.outer(lengths, lengths), walk])
+
+
+@lru_cache(maxsize=8)
+def _flicker_sum_variance(samples: int) -> NDArray[np.float64]:
+    """Variance V(m) of the sum of m successive samples of flicker with B = 1, (samples + 1,).
+
+    The autocovariance is that of ``physics.noise``: (1 / pi) sum of cos(2 pi k lag / length) / k.
+    """
+    length = fft.next_fast_len(2 * samples, real=True)
+    spectrum = np.zeros(length // 2 + 1)
+    spectrum[1:] = 1 / (2 * np.pi * np.arange(1, length // 2 + 1))
+    autocovariance = fft.irfft(spectrum, length, norm="forward")[:samples]
+    steps = 2 * np.cumsum(autocovariance) - autocovariance[0]
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def constant_bias(
+    samples: int, rate_hz: float, noise: NoiseFigures, prior_mean: float, turn_on_spread: float
+) -> RecordingModel:
+    """A model without warm-up.
+
+    Args:
+        samples: Of a whole recording.
+        rate_hz: Samples per second.
+        noise: N, B and K.
+        prior_mean: mu, deg/s.
+        turn_on_spread: tau, deg/s.
+    """
+    variance = np.array([[turn_on_spread**2]])
+    return RecordingModel(samples, rate_hz, noise, np.array([prior_mean]), variance)

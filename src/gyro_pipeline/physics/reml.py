@@ -1,0 +1,197 @@
+"""Restricted maximum likelihood (REML) of a gyroscope's noise, prior and warm-up.
+
+The recordings of one gyroscope are independent draws from one
+:class:`~gyro_pipeline.physics.recording_model.RecordingModel`. Their block means y (m,) are normal
+with mean X c and covariance
+
+    C = N^2 V_white + B^2 V_flicker + K^2 V_walk + tau^2 x_1 x_1' + s^2 x_2 x_2'
+
+where X = (x_1, x_2) holds the block means of 1 and of the warm-up's decay, c = (mean bias, mean
+amplitude), tau is the turn-on spread and s the spread of the amplitude. REML is the likelihood of
+what is left of the data once c has been fitted (Patterson & Thompson 1971, Biometrika 58), so that
+the variances are not too small by what fitting c took.
+
+A handful of recordings can give a spread of zero by chance, and an estimator that believes it pulls
+everything to the mean. Therefore log tau + log s is added, the weak prior of Chung et al. 2013
+(Psychometrika 78, 685): the maximum is then off zero by about one standard error, and with many
+recordings nowhere else than without it.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import linalg, optimize
+from threadpoolctl import threadpool_limits
+
+from gyro_pipeline.conventions import InputError
+from gyro_pipeline.physics.allan import NoiseFigures
+from gyro_pipeline.physics.recording_model import (
+    RecordingModel,
+    block_edges,
+    block_means,
+    noise_covariances,
+    profiles,
+)
+
+FEWEST_RECORDINGS = 3
+"""Fewer do not fix a spread, even with its weak prior."""
+
+_BLOCK_S = 0.5
+_RANGE = 1e4  # of a standard deviation about its first guess
+_STEP = 1e-3  # of the numerical gradient, in logarithms
+_TIME_CONSTANTS = (0.02, 0.1, 0.3, 1.0, 3.0)  # of the recording: limits, and where searches start
+
+
+@threadpool_limits.wrap(limits=1, user_api="blas")  # of matrices so small, more only wait
+def fit_recording_model(
+    recordings: NDArray[np.floating],
+    rate_hz: float,
+    warm_up: bool = False,
+    noise: NoiseFigures | None = None,
+) -> RecordingModel:
+    """Fit the model of one gyroscope to whole recordings.
+
+    Args:
+        recordings: (n, samples), deg/s, from power-on; no NaN.
+        rate_hz: Samples per second.
+        warm_up: Whether there is one; its time constant is the same in all recordings.
+        noise: Known N, B and K; fitted together with the rest if None.
+
+    Returns:
+        The model; its prior is that of the next recording: the spread between recordings plus
+        the uncertainty of the mean, learned from n of them.
+
+    Raises:
+        InputError: Fewer than three recordings.
+    """
+    if len(recordings) < FEWEST_RECORDINGS:
+        raise InputError(
+            f"noise model: expected at least {FEWEST_RECORDINGS} recordings of a gyroscope, got "
+            f"{len(recordings)}; with fewer, use an estimator without a prior"
+        )
+    samples = recordings.shape[-1]
+    likelihood = _Likelihood(recordings, rate_hz, warm_up, noise)
+    best = min(
+        (likelihood.maximise(share * samples / rate_hz) for share in _TIME_CONSTANTS[1:-1])
+        if warm_up
+        else [likelihood.maximise(np.inf)],
+        key=lambda result: result.fun,
+    )
+    figures, spreads, time_constant_s = likelihood.unpack(best.x)
+    _, mean, uncertainty = likelihood.deviance(best.x)
+    mean[0] += likelihood.offset
+    covariance = np.diag(np.square(spreads)) + uncertainty
+    fitted = noise or NoiseFigures(*map(float, figures))
+    return RecordingModel(samples, rate_hz, fitted, mean, covariance, time_constant_s)
+
+
+def guarded_spread(scatter: ArrayLike, freedom: ArrayLike, averaging: ArrayLike) -> float:
+    """The turn-on spread tau from recordings' means alone, with the same weak prior.
+
+    The means of group g (a gyroscope) scatter by tau^2 + v_g about their own mean, where v_g is
+    the averaging noise of one. The maximum of the restricted likelihood times tau.
+
+    Args:
+        scatter: (groups,), sum of the squared deviations from the mean, (deg/s)^2.
+        freedom: (groups,), number of means less one; the sum is at least 2.
+        averaging: (groups,), v, (deg/s)^2, such as N^2 / T.
+
+    Returns:
+        One tau for all groups, deg/s; never 0 unless all is.
+    """
+    given = (scatter, freedom, averaging)
+    squares, nu, v = (np.atleast_1d(np.asarray(value, np.float64)) for value in given)
+    largest = squares.sum() + (nu * v).sum()
+    if largest == 0:
+        return 0.0
+
+    def slope(log_variance: float) -> float:
+        variance = np.exp(log_variance)
+        share = variance / (variance + v)
+        return float(np.sum(share * (nu - squares / (variance + v)))) - 1
+
+    # negative where tau is nothing beside v, positive where it explains more than all scatter
+    limits = np.log(largest) + np.array([-60.0, 5.0])
+    return float(np.exp(optimize.brentq(slope, *limits) / 2))
+
+
+class _Likelihood:
+    """Of the block means of one gyroscope's recordings.
+
+    The parameters x are logarithms: of N, B and K unless they are known, of tau, and with a
+    warm-up of s and the time constant.
+    """
+
+    def __init__(
+        self,
+        recordings: NDArray[np.floating],
+        rate_hz: float,
+        warm_up: bool,
+        noise: NoiseFigures | None,
+    ) -> None:
+        samples = recordings.shape[-1]
+        self.edges = block_edges(samples, round(_BLOCK_S * rate_hz))
+        means = block_means(recordings, self.edges)
+        self.offset = float(means.mean())
+        self.means = means - self.offset
+        self.rate_hz, self.duration_s, self.warm_up = rate_hz, samples / rate_hz, warm_up
+        self.unit = noise_covariances(self.edges, samples, rate_hz)
+        self.known: NDArray[np.float64] | None = None
+        if noise is not None:
+            self.known = np.array([noise.white, noise.instability, noise.random_walk])
+
+    def guess(self, time_constant_s: float) -> NDArray[np.float64]:
+        """Where a search starts: the noise from differences of blocks, tau from their means."""
+        block_s = np.diff(self.edges).mean() / self.rate_hz
+        jumps = np.diff(self.means, axis=1).std() / np.sqrt(2)
+        white = max(jumps * np.sqrt(block_s), np.finfo(float).tiny)
+        spread = self.means.mean(axis=1).std(ddof=1)
+        figures = [white, white / 3, white / 50] if self.known is None else []
+        settling = [(self.means[:, 0] - self.means[:, -1]).std(), time_constant_s]
+        return np.log(np.maximum([*figures, spread, *(settling if self.warm_up else [])], 1e-12))
+
+    def unpack(
+        self, x: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+        """N, B and K; tau and s; the time constant in seconds."""
+        values = np.exp(x)
+        figures, rest = (values[:3], values[3:]) if self.known is None else (self.known, values)
+        return figures, rest[:2] if self.warm_up else rest, rest[2] if self.warm_up else np.inf
+
+    def deviance(
+        self, x: NDArray[np.float64]
+    ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+        """-2 times the restricted log-likelihood and prior; the fitted c and its covariance."""
+        figures, spreads, time_constant_s = self.unpack(x)
+        design = profiles(self.edges, self.rate_hz, time_constant_s)[:, : spreads.size]
+        covariance = np.tensordot(np.square(figures), self.unit, axes=1)
+        covariance += (design * np.square(spreads)) @ design.T
+        root = np.linalg.cholesky(covariance)
+        white = linalg.solve_triangular(
+            root, np.column_stack([self.means.T, design]), lower=True, check_finite=False
+        )
+        y, z = white[:, : len(self.means)], white[:, len(self.means) :]
+        information = len(self.means) * z.T @ z
+        mean = np.linalg.solve(information, (z.T @ y).sum(axis=1))
+        deviance = 2 * len(self.means) * np.log(np.diag(root)).sum()
+        deviance += np.linalg.slogdet(information)[1]
+        deviance += np.sum((y - (z @ mean)[:, None]) ** 2) - 2 * np.log(spreads).sum()
+        return float(deviance), mean, np.linalg.inv(information)
+
+    def maximise(self, time_constant_s: float) -> optimize.OptimizeResult:
+        """Search from the guess with this time constant."""
+        start = self.guess(time_constant_s)
+        reach = np.log(_RANGE)
+        bounds = np.column_stack([start - reach, start + reach])
+        if self.warm_up:
+            shortest, *_, longest = _TIME_CONSTANTS
+            bounds[-1] = np.log([shortest * self.duration_s, longest * self.duration_s])
+
+        def gradient(x: NDArray[np.float64]) -> NDArray[np.float64]:
+            steps = _STEP * np.eye(x.size)
+            return np.array(
+                [(self.deviance(x + h)[0] - self.deviance(x - h)[0]) / (2 * _STEP) for h in steps]
+            )
+
+        return optimize.minimize(
+            lambda x: self.deviance(x)[0], start, jac=gradient, bounds=bounds, method="L-BFGS-B"
+        )

@@ -1,0 +1,83 @@
+"""Simulated recordings of one or more IMUs, and what an estimator makes of their windows."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyro_pipeline.conventions import AXES, DIMENSIONS, RECORDING_MEAN
+from gyro_pipeline.physics.noise import simulate_noise, warm_up
+from gyro_pipeline.protocol.windows import cut_windows
+
+
+def labelled(rates, rate_hz):
+    """(imu, recording, axis, sample) in the layout of the conventions."""
+    coords = {
+        "imu": np.arange(1, 1 + rates.shape[0]),
+        "recording": np.arange(1, 1 + rates.shape[1]),
+        "axis": list(AXES),
+    }
+    attrs = {"sensor": "test", "source": "test", "simulated": 0, "rate_hz": rate_hz}
+    return xr.Dataset({"angular_rate": (DIMENSIONS, rates)}, coords, attrs)
+
+
+@pytest.fixture(scope="session")
+def simulate():
+    """Recordings and their biases from a :class:`RecordingModel`, the same for all axes."""
+
+    def make(model, count, seed=0, imus=1, unit_bias=0.5):
+        generator, noise = np.random.default_rng(seed), model.noise
+        shape = (imus, count, len(AXES))
+        rates = simulate_noise(
+            generator,
+            (*shape, model.samples),
+            model.rate_hz,
+            noise.white,
+            flicker_dps=noise.instability,
+            random_walk_dps_rts=noise.random_walk,
+        ).astype(np.float64)
+        drawn = generator.multivariate_normal(model.mean, model.covariance, shape)
+        unit = generator.uniform(-unit_bias, unit_bias, (imus, 1, len(AXES)))
+        bias = unit + drawn[..., 0]
+        rates += bias[..., None]
+        if model.mean.size > 1:
+            rates += warm_up(drawn[..., 1], model.time_constant_s, model.samples, model.rate_hz)
+        recordings = labelled(rates.astype(np.float32), model.rate_hz)
+        recordings["true_bias"] = (DIMENSIONS[:-1], bias)
+        recordings["true_unit_bias"] = (("imu", "axis"), unit[:, 0])
+        return recordings
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def judged():
+    """Errors and sigmas of an estimator in all windows of IMU 1."""
+
+    def judge(estimator, recordings, window_s, target=RECORDING_MEAN):
+        rate_hz = recordings.attrs["rate_hz"]
+        size = round(window_s * rate_hz)
+        errors, sigmas = [], []
+        for number in recordings.recording.to_numpy():
+            one = recordings.sel(imu=1, recording=number)
+            samples = one.angular_rate.to_numpy()
+            windows = cut_windows(samples, size).transpose(1, 0, 2)
+            starts = np.arange(len(windows)) * size / rate_hz
+            bias, sigma = estimator.estimate(windows, target, starts, int(number))
+            mean = samples.mean(axis=-1, dtype=np.float64)
+            errors.append(bias - (mean if target == RECORDING_MEAN else one.true_bias.to_numpy()))
+            sigmas.append(sigma)
+        return np.concatenate(errors), np.concatenate(sigmas)
+
+    return judge
+
+
+@pytest.fixture(scope="session")
+def memsense():
+    """The public Memsense recordings."""
+    folder = os.environ.get("GYRO_PIPELINE_REAL_DATA")
+    if folder is None:
+        pytest.skip("GYRO_PIPELINE_REAL_DATA, the folder of the real recordings, is not set")
+    return labelled(np.load(Path(folder) / "memsense_test_real.npy")[None], 250.0)

@@ -1,0 +1,182 @@
+"""What all estimators have in common, and what the simple ones return."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from gyro_pipeline.conventions import BIAS, MDPS, PAPER, RECORDING_MEAN, TRUE, InputError
+from gyro_pipeline.estimators import (
+    DEFAULT,
+    ESTIMATORS,
+    EmpiricalBayes,
+    LastCalibration,
+    RunningMean,
+)
+from gyro_pipeline.physics.allan import NoiseFigures
+from gyro_pipeline.physics.ceiling import oracle, running_mean_rmse
+from gyro_pipeline.physics.recording_model import constant_bias
+from gyro_pipeline.physics.reml import guarded_spread
+
+RATE, SAMPLES, SIZE = 20.0, 1600, 200
+N, TAU = 5 * MDPS, 1 * MDPS
+MODEL = constant_bias(SAMPLES, RATE, NoiseFigures(N, 0, 0), 0.0, TAU)
+NO_SIGMA = {"median", "trimmed_mean", "ridge", "ridge_same_time"}
+NO_PRIOR = {"mean", "median", "trimmed_mean"}
+
+
+@pytest.fixture(scope="module")
+def recordings(simulate):
+    return simulate(MODEL, 12, imus=2)
+
+
+@pytest.fixture(scope="module")
+def windows(recordings):
+    return recordings.angular_rate.to_numpy()[0, :, :, :SIZE]
+
+
+@pytest.fixture(scope="module")
+def fitted(recordings):
+    return {name: make().fit(recordings) for name, make in ESTIMATORS.items()}
+
+
+@pytest.mark.parametrize("target", [RECORDING_MEAN, BIAS])
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_an_estimate_is_a_bias_and_its_sigma(fitted, windows, name, target):
+    bias, sigma = fitted[name].estimate(windows, target)
+    assert bias.shape == sigma.shape == (12, 3)
+    assert bias.dtype == sigma.dtype == np.float64
+    assert np.isfinite(bias).all()
+    assert np.isnan(sigma).all() if name in NO_SIGMA else (sigma > 0).all()
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_a_shift_of_all_recordings_shifts_the_estimates(recordings, fitted, windows, name):
+    """By 1 deg/s, thousands of times what the power-ons scatter."""
+    shifted = recordings.copy()
+    shifted["angular_rate"] = recordings.angular_rate.astype(np.float64) + 1
+    bias, sigma = fitted[name].estimate(windows)
+    other, other_sigma = ESTIMATORS[name]().fit(shifted).estimate(windows.astype(np.float64) + 1)
+    np.testing.assert_allclose(other, bias + 1, atol=0.005 * MDPS)
+    np.testing.assert_allclose(other_sigma, sigma, rtol=0.01)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_estimates_do_not_depend_on_what_is_estimated_beside_them(fitted, windows, name):
+    bias, sigma = fitted[name].estimate(windows)
+    one, one_sigma = fitted[name].estimate(windows[3:4])
+    np.testing.assert_allclose(one, bias[3:4], atol=1e-12)
+    np.testing.assert_allclose(one_sigma, sigma[3:4])
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_an_unknown_target_is_refused(fitted, windows, name):
+    with pytest.raises(InputError, match="expected 'recording_mean' or 'bias', got 'mean'"):
+        fitted[name].estimate(windows, "mean")
+
+
+def test_some_are_recommended_and_the_default_is_one_of_them(fitted):
+    recommended = {name for name, estimator in fitted.items() if estimator.recommended}
+    assert DEFAULT in recommended
+    assert {"empirical_bayes", "best_linear", "best_linear_warm_up"} <= recommended
+    assert not recommended & {"mean", "training_mean", "ridge", "empirical_bayes_pooled"}
+
+
+def test_every_one_that_uses_a_stored_prior_says_so(fitted):
+    """Seen from outside: whether other training biases change the estimates."""
+    assert {name for name, one in fitted.items() if not one.uses_prior} == NO_PRIOR
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_what_says_that_it_uses_no_prior_does_not(recordings, fitted, windows, name):
+    moved = recordings.copy()
+    moved["angular_rate"] = recordings.angular_rate + np.float32(0.1)
+    bias, _ = fitted[name].estimate(windows)
+    other, _ = ESTIMATORS[name]().fit(moved).estimate(windows)
+    assert np.allclose(bias, other, atol=1e-9) == (not fitted[name].uses_prior)
+
+
+@pytest.mark.parametrize("name", ["empirical_bayes", "empirical_bayes_pooled", "best_linear"])
+def test_on_an_unseen_device_nothing_beats_the_mean(simulate, judged, name):
+    """Its prior is the spread from unit to unit, here 100 times that of the noise."""
+    known = simulate(MODEL, 6, seed=3, imus=5, unit_bias=0.5)
+    unseen = simulate(MODEL, 10, seed=4, unit_bias=0.5)
+    for training in (known.sel(imu=slice(2, 5)), known.sel(imu=slice(2, 3))):
+        estimator = ESTIMATORS[name]().fit(training, imu=1)
+        errors, _ = judged(estimator, unseen, 10, BIAS)
+        mean, _ = judged(RunningMean(), unseen, 10, BIAS)
+        assert np.sqrt(np.mean(errors**2) / np.mean(mean**2)) == pytest.approx(1, abs=0.01)
+
+
+def test_one_recording_of_each_known_device_is_enough_for_an_unseen_one(simulate, windows):
+    known = simulate(MODEL, 1, seed=5, imus=6).sel(imu=slice(2, 6))
+    for name in ("empirical_bayes", "best_linear"):
+        bias, sigma = ESTIMATORS[name]().fit(known, imu=1).estimate(windows)
+        np.testing.assert_allclose(bias, windows.mean(axis=-1), atol=0.1 * N)
+        np.testing.assert_allclose(sigma, N / np.sqrt(SIZE / RATE), rtol=0.2)
+
+
+def test_averages_are_those_of_numpy_and_scipy(fitted, windows):
+    exact = windows.astype(np.float64)
+    for name, expected in {
+        "mean": exact.mean(axis=-1),
+        "median": np.median(exact, axis=-1),
+        "trimmed_mean": stats.trim_mean(exact, 0.1, axis=-1),
+    }.items():
+        np.testing.assert_allclose(fitted[name].estimate(windows)[0], expected, atol=1e-12)
+
+
+def test_the_running_mean_needs_no_fit_but_for_its_sigma(windows, fitted):
+    bias, sigma = RunningMean().estimate(windows)
+    np.testing.assert_array_equal(bias, fitted["mean"].estimate(windows)[0])
+    assert np.isnan(sigma).all()
+    for target, truth in {RECORDING_MEAN: PAPER, BIAS: TRUE}.items():
+        _, sigma = fitted["mean"].estimate(windows, target)
+        expected = running_mean_rmse(N, SIZE / RATE, SAMPLES / RATE, truth)
+        np.testing.assert_allclose(sigma, expected, rtol=0.15)
+
+
+def test_the_constant_is_the_mean_of_the_labels(recordings, fitted, windows):
+    labels = recordings.angular_rate.to_numpy()[0].mean(axis=-1, dtype=np.float64)
+    bias, sigma = fitted["training_mean"].estimate(windows, RECORDING_MEAN)
+    np.testing.assert_allclose(bias, np.tile(labels.mean(axis=0), (12, 1)))
+    np.testing.assert_allclose(sigma[0], labels.std(axis=0, ddof=1) * np.sqrt(1 + 1 / 12))
+
+
+def test_the_last_calibration_is_that_of_the_recording_before(recordings, windows):
+    labels = recordings.angular_rate.to_numpy()[0].mean(axis=-1, dtype=np.float64)
+    estimator = LastCalibration().fit(recordings.sel(recording=[2, 7, 4]))
+    for number, stored in {3: 2, 4: 2, 5: 4, 7: 4, 8: 7, None: 7}.items():
+        bias, _ = estimator.estimate(windows[:1], recording=number)
+        np.testing.assert_allclose(bias[0], labels[stored - 1])
+    nothing_stored, _ = estimator.estimate(windows[:1], recording=2)
+    np.testing.assert_allclose(nothing_stored[0], labels[[1, 6, 3]].mean(axis=0))
+
+
+@pytest.mark.parametrize(("target", "truth"), [(RECORDING_MEAN, PAPER), (BIAS, TRUE)])
+def test_empirical_bayes_is_the_oracle_with_what_it_learned(recordings, windows, target, truth):
+    estimator = EmpiricalBayes().fit(recordings)
+    labels = recordings.angular_rate.to_numpy()[0].mean(axis=-1, dtype=np.float64)
+    noise, recording_s = estimator._noise, SAMPLES / RATE
+    own = noise**2 / recording_s
+    tau = np.array([guarded_spread(s, 11, v) for s, v in zip(labels.var(0) * 12, own, strict=True)])
+    prior = np.sqrt(tau**2 + (tau**2 + own) / 12)
+    m = windows.mean(axis=-1, dtype=np.float64)
+    expected = oracle(m, labels.mean(axis=0), prior, noise, SIZE / RATE, recording_s, truth)
+    np.testing.assert_allclose(estimator.estimate(windows, target)[0], expected, atol=1e-12)
+
+
+def test_pooled_empirical_bayes_has_one_spread(recordings):
+    pooled = EmpiricalBayes(pooled=True).fit(recordings)
+    own = pooled._noise**2 / (SAMPLES / RATE)
+    tau = np.sqrt((pooled._prior - own / 12) / (1 + 1 / 12))
+    np.testing.assert_allclose(tau, tau[0])
+    assert tau[0] == pytest.approx(TAU, rel=0.3)
+
+
+def test_recordings_that_a_device_lacks_are_left_out(recordings, windows):
+    lacking = recordings.copy(deep=True)
+    lacking.angular_rate[0, [2, 5]] = np.nan
+    fewer = recordings.isel(recording=[0, 1, 3, 4, *range(6, 12)])
+    for name in ("training_mean", "empirical_bayes", "best_linear", "ridge"):
+        bias, _ = ESTIMATORS[name]().fit(lacking).estimate(windows)
+        np.testing.assert_allclose(bias, ESTIMATORS[name]().fit(fewer).estimate(windows)[0])

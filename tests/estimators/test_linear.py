@@ -1,0 +1,154 @@
+import numpy as np
+import pytest
+
+from gyro_pipeline.conventions import BIAS, MDPS, RECORDING_MEAN, InputError
+from gyro_pipeline.estimators import (
+    BestLinear,
+    EmpiricalBayes,
+    LastCalibration,
+    Ridge,
+    TrainingMean,
+)
+from gyro_pipeline.estimators.linear import ridge_regression
+from gyro_pipeline.physics.allan import NoiseFigures
+from gyro_pipeline.physics.recording_model import RecordingModel, block_edges, block_means
+from gyro_pipeline.physics.recording_model import constant_bias as model_of
+
+RATE, SAMPLES, SIZE = 20.0, 1600, 200
+N, TAU = 5 * MDPS, 1 * MDPS
+WHITE = model_of(SAMPLES, RATE, NoiseFigures(N, 0, 0), 0.0, TAU)
+COLOURED = model_of(SAMPLES, RATE, NoiseFigures(N, 5 * MDPS, 0.3 * MDPS), 0.0, TAU)
+
+
+def rms(errors):
+    return np.sqrt(np.mean(errors**2))
+
+
+@pytest.mark.parametrize("target", [RECORDING_MEAN, BIAS])
+@pytest.mark.parametrize("start", [0, 800])
+def test_it_is_the_dense_conditional_mean_given_training_and_window(simulate, target, start):
+    """One normal distribution of training recordings and the new one, with a diffuse mean."""
+    recordings = simulate(COLOURED, 6)
+    estimator = BestLinear().fit(recordings.isel(recording=slice(5)))
+    fitted = estimator._axes[0]
+    edges = block_edges(SAMPLES, 10)
+    means = block_means(recordings.angular_rate.to_numpy()[0, :, 0].astype(np.float64), edges)
+    offset = means.mean()
+    # REML gives tau^2 + its share of the mean's own uncertainty; take the two apart
+    noise = fitted.noise_covariance(edges)
+    precision = np.linalg.inv(noise).sum()  # of one recording's bias
+    uncertain = fitted.covariance[0, 0]
+    tau2 = (uncertain - 1 / precision / 5) / (1 + 1 / 5)
+    blocks = len(edges) - 1
+    same = np.kron(np.eye(6), np.ones((blocks, blocks)))
+    diffuse = 1e3
+    joint = np.kron(np.eye(6), noise) + tau2 * same + diffuse * np.ones_like(same)
+    seen = np.ones(6 * blocks, dtype=bool)
+    window = (edges[:-1] >= start) & (edges[1:] <= start + SIZE)
+    seen[-blocks:] = window
+    if target == RECORDING_MEAN:
+        aim = np.concatenate([np.zeros(5 * blocks), np.full(blocks, 1 / blocks)])
+        shared, own = joint @ aim, aim @ joint @ aim
+    else:
+        shared = diffuse + tau2 * np.repeat([0] * 5 + [1], blocks)
+        own = diffuse + tau2
+    weights = np.linalg.solve(joint[np.ix_(seen, seen)], shared[seen])
+    expected = offset + weights @ (means.ravel() - offset)[seen]
+    sigma = np.sqrt(own - weights @ shared[seen])
+    samples = recordings.angular_rate.to_numpy()[0, 5:, :, start : start + SIZE]
+    bias, estimated = estimator.estimate(samples, target, start / RATE)
+    assert bias[0, 0] == pytest.approx(expected, abs=1e-4 * TAU)
+    assert estimated[0, 0] == pytest.approx(sigma, rel=1e-3)
+
+
+def test_on_white_noise_it_is_empirical_bayes(simulate, judged):
+    recordings = simulate(WHITE, 60, seed=1)
+    training, tested = (
+        recordings.isel(recording=slice(30)),
+        recordings.isel(recording=slice(30, 60)),
+    )
+    linear, bayes = (cls().fit(training) for cls in (BestLinear, EmpiricalBayes))
+    errors, sigma = judged(linear, tested, 10)
+    other, other_sigma = judged(bayes, tested, 10)
+    assert rms(errors - other) < 0.1 * rms(other)
+    np.testing.assert_allclose(sigma, other_sigma, rtol=0.08)
+
+
+def test_noise_from_the_allan_fit_does_as_well(simulate, judged):
+    recordings = simulate(COLOURED, 80, seed=2)
+    training, tested = (
+        recordings.isel(recording=slice(40)),
+        recordings.isel(recording=slice(40, 80)),
+    )
+    reml, allan = (BestLinear(noise=noise).fit(training) for noise in ("reml", "allan"))
+    assert rms(judged(allan, tested, 10)[0]) < 1.1 * rms(judged(reml, tested, 10)[0])
+
+
+def test_each_place_of_a_window_has_its_own_weights(simulate):
+    model = RecordingModel(
+        SAMPLES, RATE, WHITE.noise, np.array([0.0, 20 * MDPS]), np.diag([TAU**2, TAU**2]), 15.0
+    )
+    recordings = simulate(model, 12, seed=3)
+    estimator = BestLinear(warm_up=True).fit(recordings)
+    samples = recordings.angular_rate.to_numpy()[0, 0]
+    windows = np.stack([samples[:, :SIZE], samples[:, 600 : 600 + SIZE]])
+    both, _ = estimator.estimate(windows, start_s=np.array([0.0, 30.0]))
+    np.testing.assert_allclose(both[0], estimator.estimate(windows[:1], start_s=0.0)[0][0])
+    np.testing.assert_allclose(both[1], estimator.estimate(windows[1:], start_s=30.0)[0][0])
+    wrong, _ = estimator.estimate(windows[1:])
+    assert np.abs(wrong - both[1]).min() > MDPS
+
+
+def test_history_follows_a_bias_that_walks(simulate, judged):
+    errors = {BestLinear: [], LastCalibration: [], TrainingMean: [], EmpiricalBayes: []}
+    for seed in range(6):
+        recordings = simulate(WHITE, 40, seed)
+        walk = np.random.default_rng(seed).normal(0, 2 * MDPS, (1, 40, 3)).cumsum(axis=1)
+        recordings["angular_rate"] = recordings.angular_rate + walk[..., None]
+        training, tested = recordings.isel(recording=slice(36)), recordings.isel(recording=[36])
+        for cls, found in errors.items():
+            options = {"history": True} if cls is BestLinear else {}
+            found.append(judged(cls(**options).fit(training), tested, 5)[0])
+    history, last, constant, bayes = (rms(np.concatenate(found)) for found in errors.values())
+    assert history < 0.95 * min(last, bayes)
+    assert history < 0.5 * constant
+
+
+def test_an_unknown_noise_is_refused():
+    with pytest.raises(InputError, match="expected 'reml' or 'allan', got 'white'"):
+        BestLinear(noise="white")
+
+
+def test_ridge_regression_solves_its_normal_equations():
+    generator = np.random.default_rng(4)
+    x = generator.normal(size=(30, 2, 4)) + 5
+    y = x @ [1.0, -1.0, 0.5, 0.0] + 0.1 * generator.normal(size=(30, 2)) + 7
+    weights, constant = ridge_regression(x, y)
+    flat, centred = x.reshape(-1, 4), x.reshape(-1, 4) - x.mean(axis=(0, 1))
+    penalty = (centred.T @ (y.ravel() - y.mean() - centred @ weights)) / weights
+    np.testing.assert_allclose(penalty, penalty[0], rtol=1e-6)
+    assert penalty[0] > 0
+    assert constant == pytest.approx(y.mean() - flat.mean(axis=0) @ weights)
+    np.testing.assert_allclose(weights, [1.0, -1.0, 0.5, 0.0], atol=0.1)
+
+
+def test_ridge_returns_the_constant_where_windows_tell_nothing(simulate):
+    flat = model_of(SAMPLES, RATE, NoiseFigures(N, 0, 0), 0.0, 0.0)
+    recordings = simulate(flat, 60, seed=5)
+    windows = recordings.angular_rate.to_numpy()[0, :, :, :SIZE]
+    bias, _ = Ridge().fit(recordings).estimate(windows)
+    constant = recordings.angular_rate.to_numpy()[0].mean(axis=(0, 2), dtype=np.float64)
+    assert rms(bias - constant) < 0.2 * N / np.sqrt(SIZE / RATE)
+
+
+def test_ridge_of_the_same_time_copes_with_a_warm_up(simulate, judged):
+    model = RecordingModel(
+        SAMPLES, RATE, WHITE.noise, np.array([0.0, 20 * MDPS]), np.diag([TAU**2, TAU**2]), 15.0
+    )
+    recordings = simulate(model, 100, seed=6)
+    training, tested = (
+        recordings.isel(recording=slice(70)),
+        recordings.isel(recording=slice(70, 100)),
+    )
+    same, any_time = (rms(judged(Ridge(t).fit(training), tested, 10)[0]) for t in (True, False))
+    assert same < 0.9 * any_time

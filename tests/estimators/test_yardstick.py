@@ -1,0 +1,157 @@
+"""What the recommended estimators reach; ``benchmarks/estimators.py`` has it at full size."""
+
+import numpy as np
+import pytest
+
+from gyro_pipeline.conventions import MDPS, PAPER, RECORDING_MEAN
+from gyro_pipeline.estimators import ESTIMATORS
+from gyro_pipeline.physics.allan import NoiseFigures
+from gyro_pipeline.physics.recording_model import RecordingModel, best_linear, constant_bias
+
+SAMPLES, RECORDING_S = 1300, 87.0  # a tenth of SparkFun's rate: what matters is N, not sigma
+RATE = SAMPLES / RECORDING_S
+N, TAU = 3.3 * MDPS, 0.31 * MDPS
+WHITE = constant_bias(SAMPLES, RATE, NoiseFigures(N, 0, 0), 0.0, TAU)
+COLOURED = constant_bias(SAMPLES, RATE, NoiseFigures(N, 3 * MDPS, 0), 0.0, TAU)
+WARMING = RecordingModel(
+    SAMPLES,
+    RATE,
+    NoiseFigures(N, 3 * MDPS, 0.1 * MDPS),
+    np.array([0.0, 20 * MDPS]),
+    np.diag([TAU**2, (5 * MDPS) ** 2]),
+    time_constant_s=30.0,
+)
+TESTED = 60
+
+
+class Oracle:
+    """The best estimate of the recording's mean by one who knows the model and the device."""
+
+    def __init__(self, model, recordings):
+        self._model = model
+        self._unit = recordings.true_unit_bias.to_numpy()[0]
+
+    def estimate(self, windows, target, start_s, recording):
+        assert target == RECORDING_MEAN
+        starts = np.rint(start_s * self._model.rate_hz).astype(int)
+        size = windows.shape[-1]
+        lines = [best_linear(self._model, int(start), size, PAPER) for start in starts]
+        relative = windows - self._unit[:, None]
+        bias = np.stack([line(one) for line, one in zip(lines, relative, strict=True)])
+        return bias + self._unit, np.full(bias.shape, np.nan)
+
+
+def rms(errors):
+    return np.sqrt(np.mean(errors**2))
+
+
+def ratios_to_the_oracle(simulate, judged, model, names, training, seeds):
+    """One row per seed."""
+    rows = []
+    for seed in range(seeds):
+        made = simulate(model, training + TESTED, seed=[training, seed])
+        tested = made.isel(recording=slice(training, None))
+        oracle = rms(judged(Oracle(model, made), tested, 10)[0])
+        fitted = [ESTIMATORS[n]().fit(made.isel(recording=slice(training))) for n in names]
+        rows.append([rms(judged(estimator, tested, 10)[0]) / oracle for estimator in fitted])
+    return np.array(rows)
+
+
+@pytest.mark.parametrize(("training", "bar"), [(80, 1.03), (10, 1.08)])
+def test_on_white_noise_they_are_as_good_as_the_oracle(simulate, judged, training, bar):
+    names = ["empirical_bayes", "best_linear"]
+    ratios = ratios_to_the_oracle(simulate, judged, WHITE, names, training, seeds=6)
+    assert (ratios.mean(axis=0) <= bar).all(), ratios
+    assert (ratios.mean(axis=0) > 0.99).all(), ratios
+
+
+def test_with_flicker_random_walk_and_warm_up_the_one_that_knows_is(simulate, judged):
+    names = ["best_linear_warm_up", "best_linear"]
+    (aware, stationary), *_ = ratios_to_the_oracle(simulate, judged, WARMING, names, 80, seeds=1)
+    assert 0.98 < aware <= 1.08
+    assert stationary >= 2
+
+
+@pytest.fixture(scope="module")
+def leave_one_out(memsense, judged):
+    """Errors and sigmas on the real recordings, by estimator and window length."""
+    found = {}
+    for i in range(memsense.sizes["recording"]):
+        others = memsense.isel(recording=np.delete(np.arange(memsense.sizes["recording"]), i))
+        for name in ("mean", "training_mean", "empirical_bayes", "best_linear"):
+            estimator = ESTIMATORS[name]().fit(others)
+            for window_s in (1, 5, 10, 30):
+                one = judged(estimator, memsense.isel(recording=[i]), window_s)
+                found.setdefault((name, window_s), []).append(one)
+    return {
+        key: [np.concatenate(part) for part in zip(*v, strict=True)] for key, v in found.items()
+    }
+
+
+RECOMMENDED = ["empirical_bayes", "best_linear"]
+
+
+@pytest.mark.parametrize("name", RECOMMENDED)
+@pytest.mark.parametrize(("window_s", "bar"), [(1, 0.30), (5, 0.57), (10, 0.72), (30, 1.05)])
+def test_memsense_against_the_running_mean(leave_one_out, name, window_s, bar):
+    ratio = rms(leave_one_out[name, window_s][0]) / rms(leave_one_out["mean", window_s][0])
+    assert ratio <= bar
+    if window_s == 10:
+        assert ratio >= 0.53, "less than chance allows an honest method: look for a leak"
+
+
+def test_the_memsense_constant_is_the_published_one(leave_one_out):
+    assert rms(leave_one_out["training_mean", 10][0]) == pytest.approx(0.0014536, abs=5e-8)
+
+
+@pytest.mark.parametrize("name", RECOMMENDED)
+@pytest.mark.parametrize("window_s", [1, 5, 10, 30])
+def test_coverage_on_memsense(leave_one_out, name, window_s):
+    errors, sigma = leave_one_out[name, window_s]
+    assert 0.60 <= np.mean(np.abs(errors) < sigma) <= 0.78
+    assert 0.90 <= np.mean(np.abs(errors) < 2 * sigma) <= 0.98
+
+
+@pytest.mark.parametrize(
+    ("model", "name"),
+    [
+        (WHITE, "empirical_bayes"),
+        (WHITE, "best_linear"),
+        (COLOURED, "best_linear"),
+        (WARMING, "best_linear_warm_up"),
+    ],
+)
+def test_coverage_on_a_thousand_simulated_recordings(simulate, judged, model, name):
+    made = simulate(model, 1080, seed=1)
+    estimator = ESTIMATORS[name]().fit(made.isel(recording=slice(80)))
+    errors, sigma = judged(estimator, made.isel(recording=slice(80, None)), 10)
+    assert 0.65 <= np.mean(np.abs(errors) < sigma) <= 0.72
+    assert 0.93 <= np.mean(np.abs(errors) < 2 * sigma) <= 0.97
+
+
+@pytest.fixture(scope="module")
+def sources(simulate):
+    return {name: simulate(m, 100) for name, m in {"white": WHITE, "coloured": COLOURED}.items()}
+
+
+def of_five(recordings, judged, resamples):
+    """Mean ratios of the recommended estimators to the running mean at 1, 10 and 30 s."""
+    rows = []
+    for resample in range(resamples):
+        order = np.random.default_rng(resample).permutation(recordings.sizes["recording"])
+        training = recordings.isel(recording=np.sort(order[:5]))
+        tested = recordings.isel(recording=np.sort(order[5:45]))
+        fitted = [ESTIMATORS[name]().fit(training) for name in ("mean", *RECOMMENDED)]
+        errors = [[rms(judged(one, tested, w)[0]) for w in (1, 10, 30)] for one in fitted]
+        rows.append(np.array(errors[1:]) / errors[0])
+    return np.mean(rows, axis=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("source", ["white", "coloured"])
+def test_five_training_recordings_suffice_not_to_be_worse_than_the_mean(sources, judged, source):
+    assert (of_five(sources[source], judged, 8) <= 1.05).all()
+
+
+def test_five_memsense_recordings_suffice_too(memsense, judged):
+    assert (of_five(memsense, judged, 15) <= 1.05).all()

@@ -1,0 +1,184 @@
+import numpy as np
+import pytest
+
+from gyro_pipeline.conventions import DISJOINT, MDPS, PAPER, TRUE, InputError
+from gyro_pipeline.physics.allan import NoiseFigures
+from gyro_pipeline.physics.ceiling import ceiling_rmse, oracle, running_mean_rmse
+from gyro_pipeline.physics.noise import simulate_noise, warm_up
+from gyro_pipeline.physics.recording_model import (
+    RecordingModel,
+    best_linear,
+    block_edges,
+    block_means,
+    constant_bias,
+    mean_squares,
+    noise_covariances,
+)
+
+RATE, SAMPLES = 20.0, 1200
+N, B, K, TAU = 5 * MDPS, 3 * MDPS, 0.3 * MDPS, 1 * MDPS
+WHITE = constant_bias(SAMPLES, RATE, NoiseFigures(N, 0, 0), 0.02, TAU)
+COLOURED = constant_bias(SAMPLES, RATE, NoiseFigures(N, B, K), 0.02, TAU)
+WARMING = RecordingModel(
+    SAMPLES,
+    RATE,
+    NoiseFigures(N, B, K),
+    np.array([0.02, 0.015]),
+    np.diag([TAU**2, (5 * MDPS) ** 2]),
+    time_constant_s=20.0,
+)
+MODELS = {"white": WHITE, "coloured": COLOURED, "warming": WARMING}
+TRUTHS = (PAPER, DISJOINT, TRUE)
+
+
+def simulated(model, count, seed=0):
+    """Recordings of a model, and their biases."""
+    generator = np.random.default_rng(seed)
+    noise = simulate_noise(
+        generator,
+        (count, model.samples),
+        model.rate_hz,
+        model.noise.white,
+        flicker_dps=model.noise.instability,
+        random_walk_dps_rts=model.noise.random_walk,
+    ).astype(np.float64)
+    drawn = generator.multivariate_normal(model.mean, model.covariance, count)
+    rates = noise + drawn[:, :1]
+    if drawn.shape[1] > 1:
+        rates += warm_up(drawn[:, 1], model.time_constant_s, model.samples, model.rate_hz)
+    return rates, drawn[:, 0]
+
+
+def truth_of(rates, bias, start, size, truth):
+    outside = np.delete(rates, np.s_[start : start + size], axis=1)
+    return {PAPER: rates.mean(axis=1), DISJOINT: outside.mean(axis=1), TRUE: bias}[truth]
+
+
+@pytest.mark.parametrize("edges", [[0, 10, 35, 36, 400, 1200], [100, 200, 300]])
+@pytest.mark.parametrize("part", [0, 1, 2])
+def test_covariances_are_those_of_the_simulated_noise(part, edges):
+    """Block by block, in units of what chance allows with so many recordings."""
+    levels = np.eye(3)[part]
+    names = dict(zip(("flicker_dps", "random_walk_dps_rts"), levels[1:], strict=True))
+    count = 10_000
+    noise = simulate_noise(
+        np.random.default_rng(part), (count, SAMPLES), RATE, levels[0], **names
+    ).astype(np.float64)
+    means = np.stack([noise[:, a:b].mean(axis=1) for a, b in zip(edges, edges[1:], strict=False)])
+    expected = noise_covariances(np.array(edges), SAMPLES, RATE)[part]
+    deviation = np.sqrt((np.outer(*2 * [np.diag(expected)]) + expected**2) / count)
+    assert (np.abs(means @ means.T / count - expected) < 4.5 * deviation).all()
+
+
+@pytest.mark.parametrize("name", ["white", "coloured", "warming"])
+@pytest.mark.parametrize("start", [0, 300])
+@pytest.mark.parametrize("truth", TRUTHS)
+def test_weights_are_those_of_the_dense_solution_on_all_blocks(name, start, truth):
+    """Everything outside the window in one block each changes nothing."""
+    model, size = MODELS[name], 200
+    line = best_linear(model, start, size, truth)
+    edges = np.arange(0, SAMPLES + 1, 10)
+    inside = (edges[:-1] >= start) & (edges[1:] <= start + size)
+    profile, noise = model.profiles(edges), model.noise_covariance(edges)
+    covariance = profile @ model.covariance @ profile.T + noise
+    average = {PAPER: np.ones(len(inside)), DISJOINT: 1.0 * ~inside, TRUE: None}[truth]
+    if truth == TRUE:
+        shared, variance = (profile @ model.covariance)[:, 0], model.covariance[0, 0]
+        mean = model.mean[0]
+    else:
+        average = average / average.sum()
+        shared, variance = covariance @ average, average @ covariance @ average
+        mean = average @ profile @ model.mean
+    window = covariance[np.ix_(inside, inside)]
+    weights = np.linalg.solve(window, shared[inside])
+    np.testing.assert_array_equal(line.edges, np.arange(0, size + 1, 10))
+    np.testing.assert_allclose(line.weights, weights, atol=1e-9)
+    assert line.constant == pytest.approx(mean - weights @ (profile @ model.mean)[inside])
+    assert line.variance == pytest.approx(variance - weights @ shared[inside])
+
+
+def test_blocks_lose_nothing_that_matters_against_single_samples():
+    for truth in TRUTHS:
+        best, _ = mean_squares(WARMING, 100, 200, truth)
+        finest, _ = mean_squares(WARMING, 100, 200, truth, block_s=1 / RATE)
+        assert finest <= best * (1 + 1e-12)
+        assert finest == pytest.approx(best, rel=2e-3)
+
+
+@pytest.mark.parametrize("truth", TRUTHS)
+@pytest.mark.parametrize("start", [0, 700])
+def test_on_white_noise_it_is_the_oracle_of_the_closed_form(truth, start):
+    size, recording_s = 200, SAMPLES / RATE
+    best, mean = mean_squares(WHITE, start, size, truth)
+    window_s = size / RATE
+    assert np.sqrt(best) == pytest.approx(ceiling_rmse(N, TAU, window_s, recording_s, truth))
+    assert np.sqrt(mean) == pytest.approx(running_mean_rmse(N, window_s, recording_s, truth))
+    windows = np.random.default_rng(1).normal(0.02, N, (5, size))
+    expected = oracle(windows.mean(axis=1), 0.02, TAU, N, window_s, recording_s, truth)
+    np.testing.assert_allclose(best_linear(WHITE, start, size, truth)(windows), expected)
+
+
+@pytest.mark.parametrize("name", ["coloured", "warming"])
+@pytest.mark.parametrize("start", [0, 600])
+@pytest.mark.parametrize("truth", TRUTHS)
+def test_monte_carlo_has_the_expected_errors(name, start, truth):
+    model, size, count = MODELS[name], 200, 8000
+    rates, bias = simulated(model, count, seed=2)
+    aim = truth_of(rates, bias, start, size, truth)
+    windows = rates[:, start : start + size]
+    line = best_linear(model, start, size, truth)
+    error = line(windows) - aim
+    assert abs(error.mean()) < 4 * error.std() / np.sqrt(count)
+    assert np.mean(error**2) == pytest.approx(line.variance, rel=0.06)
+    own = np.mean((windows.mean(axis=1) - aim) ** 2)
+    best, mean = mean_squares(model, start, size, truth)
+    noise = line.variance - best  # of the truth itself
+    assert (noise > 0) == (truth == DISJOINT)
+    assert own == pytest.approx(mean + noise, rel=0.06)
+    assert best < mean
+
+
+def test_the_averaging_noise_of_the_disjoint_truth_is_that_of_the_model():
+    edges = np.array([0, 200, SAMPLES])
+    own = COLOURED.noise_covariance(edges)[1, 1]
+    best, _ = mean_squares(COLOURED, 0, 200, DISJOINT)
+    assert best_linear(COLOURED, 0, 200, DISJOINT).variance - best == pytest.approx(own)
+
+
+def test_coloured_noise_lowers_what_a_window_can_gain():
+    def ratio(model):
+        best, mean = mean_squares(model, 0, 200, PAPER)
+        return best / mean
+
+    known = constant_bias(SAMPLES, RATE, COLOURED.noise, 0.0, 1e-9)
+    bias_known = constant_bias(SAMPLES, RATE, WHITE.noise, 0.0, 1e-9)
+    assert ratio(bias_known) == pytest.approx(200 / SAMPLES, rel=1e-3)  # r
+    assert ratio(known) > 2 * ratio(bias_known)
+
+
+def test_a_window_of_the_whole_recording_knows_its_mean():
+    line = best_linear(WARMING, 0, SAMPLES, PAPER)
+    rates, _ = simulated(WARMING, 3)
+    np.testing.assert_allclose(line(rates), rates.mean(axis=1))
+    assert line.variance == pytest.approx(0, abs=1e-12 * TAU**2)
+
+
+@pytest.mark.parametrize(("start", "size"), [(-1, 10), (1150, 51), (0, 0)])
+def test_a_window_outside_the_recording_is_refused(start, size):
+    with pytest.raises(InputError, match="inside a recording of 1200 samples"):
+        best_linear(WHITE, start, size, PAPER)
+
+
+def test_an_unknown_truth_is_refused():
+    with pytest.raises(InputError, match="got 'mean'"):
+        best_linear(WHITE, 0, 100, "mean")
+    with pytest.raises(InputError, match="shorter than the recording"):
+        best_linear(WHITE, 0, SAMPLES, DISJOINT)
+
+
+def test_blocks_have_nearly_equal_lengths_and_are_200_at_most():
+    np.testing.assert_array_equal(block_edges(10, 3), [0, 3, 7, 10])
+    np.testing.assert_array_equal(block_edges(2, 10), [0, 2])
+    assert len(block_edges(10_000, 10)) == 201
+    samples = np.arange(10, dtype=np.float32)[None]
+    np.testing.assert_allclose(block_means(samples, np.array([0, 3, 7, 10])), [[1, 4.5, 8]])

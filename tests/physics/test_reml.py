@@ -1,0 +1,110 @@
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+from gyro_pipeline.conventions import MDPS, InputError
+from gyro_pipeline.physics.allan import NoiseFigures
+from gyro_pipeline.physics.noise import simulate_noise, warm_up
+from gyro_pipeline.physics.recording_model import block_edges, block_means, constant_bias
+from gyro_pipeline.physics.reml import _Likelihood, fit_recording_model, guarded_spread
+
+RATE, SAMPLES = 20.0, 1600
+N, B, K, TAU = 5 * MDPS, 5 * MDPS, 0.5 * MDPS, 2 * MDPS
+
+
+def recorded(count, seed=0, flicker=0.0, walk=0.0, amplitudes=None, level=0.3):
+    generator = np.random.default_rng(seed)
+    noise = simulate_noise(generator, (count, SAMPLES), RATE, N, 0.0, flicker, walk)
+    rates = noise + level + generator.normal(0, TAU, (count, 1))
+    if amplitudes:
+        rates += warm_up(generator.normal(*amplitudes, count), 15.0, SAMPLES, RATE)
+    return rates
+
+
+def test_white_noise_and_prior_are_found():
+    model = fit_recording_model(recorded(80), RATE)
+    assert model.noise.white == pytest.approx(N, rel=0.03)
+    assert model.noise.instability < 0.15 * N
+    assert model.mean[0] == pytest.approx(0.3, abs=3 * TAU / np.sqrt(80))
+    assert np.sqrt(model.covariance[0, 0]) == pytest.approx(TAU, rel=0.25)
+
+
+def test_flicker_and_random_walk_are_told_apart():
+    flicker = fit_recording_model(recorded(80, 1, flicker=B), RATE).noise
+    assert flicker.instability == pytest.approx(B, rel=0.08)
+    assert flicker.white == pytest.approx(N, rel=0.05)
+    walk = fit_recording_model(recorded(80, 2, walk=K), RATE).noise
+    assert walk.random_walk == pytest.approx(K, rel=0.15)
+    assert walk.instability < B / 3
+
+
+def test_a_warm_up_is_found():
+    model = fit_recording_model(recorded(80, 3, B, 0.0, (20 * MDPS, 5 * MDPS)), RATE, warm_up=True)
+    assert model.mean[1] == pytest.approx(20 * MDPS, rel=0.15)
+    assert np.sqrt(model.covariance[1, 1]) == pytest.approx(5 * MDPS, rel=0.3)
+    assert model.time_constant_s == pytest.approx(15, rel=0.15)
+
+
+def test_known_noise_is_kept():
+    noise = NoiseFigures(6 * MDPS, 1 * MDPS, 0.0)
+    assert fit_recording_model(recorded(10), RATE, noise=noise).noise == noise
+
+
+def test_the_likelihood_is_the_dense_one_of_all_contrasts():
+    """REML is the likelihood of the data projected to where the fixed effect is not."""
+    rates = recorded(4, 5)
+    likelihood = _Likelihood(rates, RATE, False, None)
+    edges = block_edges(SAMPLES, 10)
+    means = block_means(rates, edges).ravel()
+    contrasts = np.linalg.svd(np.ones((means.size, 1)))[0][:, 1:]
+
+    def dense(figures, tau):
+        model = constant_bias(SAMPLES, RATE, NoiseFigures(*figures), 0.0, tau)
+        one = model.noise_covariance(edges) + tau**2
+        covariance = contrasts.T @ np.kron(np.eye(4), one) @ contrasts
+        return stats.multivariate_normal.logpdf(contrasts.T @ means, None, covariance)
+
+    points = [((N, B, K), TAU), ((N / 2, B / 9, 2 * K), TAU / 3)]
+    fast = [-likelihood.deviance(np.log([*f, tau]))[0] / 2 - np.log(tau) for f, tau in points]
+    assert fast[1] - fast[0] == pytest.approx(dense(*points[1]) - dense(*points[0]), rel=1e-8)
+
+
+def test_the_prior_holds_what_is_not_known_of_its_mean():
+    noise = NoiseFigures(N, 0.0, 0.0)
+    rates = recorded(5, 6)
+    model = fit_recording_model(rates, RATE, noise=noise)
+    label_noise = N**2 * RATE / SAMPLES
+    tau = optimize.brentq(lambda t: t**2 + (t**2 + label_noise) / 5 - model.covariance[0, 0], 0, 1)
+    means = rates.mean(axis=1)
+    assert tau == pytest.approx(guarded_spread(means.var() * 5, 4, label_noise), rel=1e-3)
+    assert model.mean[0] == pytest.approx(means.mean())
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_fewer_than_three_recordings_are_refused(count):
+    with pytest.raises(InputError, match=f"at least 3 recordings of a gyroscope, got {count}"):
+        fit_recording_model(recorded(3)[:count], RATE)
+
+
+def test_the_guarded_spread_solves_its_equation():
+    """The root of a quadratic in w = tau^2 + v for one group."""
+    squares, freedom, v = 30.0, 9, 2.0
+    b = squares + freedom * v
+    w = (b + np.sqrt(b**2 - 4 * (freedom - 1) * v * squares)) / (2 * (freedom - 1))
+    assert guarded_spread(squares, freedom, v) == pytest.approx(np.sqrt(w - v))
+
+
+def test_the_guard_matters_with_few_recordings_only():
+    v = 4.0
+    assert guarded_spread(0.5 * 4 * v, 4, v) > 0.3  # the plain estimate is 0
+    many = 10_000
+    assert guarded_spread(3 * many, many, 2.0) == pytest.approx(1.0, rel=1e-3)
+    assert guarded_spread(0.0, 5, 0.0) == 0
+
+
+def test_groups_with_the_same_spread_are_pooled():
+    generator = np.random.default_rng(8)
+    v = np.array([0.5, 1.0, 4.0])
+    labels = generator.normal(0, np.sqrt(2.0**2 + v), (400, 3))
+    scatter = labels.var(axis=0) * 400
+    assert guarded_spread(scatter, np.full(3, 399), v) == pytest.approx(2.0, rel=0.05)
