@@ -160,7 +160,7 @@ def test_imports_of_the_own_part_are_not_violations():
 
 
 def test_physics_is_numpy():
-    known = {NAME, "numpy", "scipy", "allantools", *sys.stdlib_module_names}
+    known = {NAME, "numpy", "scipy", "allantools", "threadpoolctl", *sys.stdlib_module_names}
     for name, names in names_of("physics").items():
         assert roots(names) <= known, name
 

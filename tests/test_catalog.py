@@ -21,6 +21,7 @@ ENVS = sorted(
 PIPELINES = {
     "__default__",
     "augmentation",
+    "estimators",
     "ground_truth",
     "input_channels",
     "leakage",
@@ -139,6 +140,8 @@ def test_every_pattern_is_used(pipelines):
         ("dot.raw_logs.files", "simulated_logs.SimulatedLogs"),
         ("augmentation.reporting.tables.results", "reports.ReportTable"),
         ("augmentation.reporting.figures.dot_3_real", "reports.ReportFigure"),
+        ("estimators.reporting.tables.comparison", "reports.ReportTable"),
+        ("estimators.reporting.figures.ng", "reports.ReportFigure"),
         ("reporting.folder", "report_page.ReportFolder"),
         ("reporting.report", "report_page.ReportPage"),
         ("reporting.tables.dataset_hours", "reports.ReportTable"),
@@ -171,6 +174,14 @@ def test_data_that_a_report_may_lack_name_the_pipeline_that_makes_them(pipelines
         pipeline, only = made_by.removeprefix("kedro run --pipeline=").split(" --params=")
         assert only == f"only.sensor={sensor}"
         assert name in registered[pipeline].all_outputs()
+
+
+def test_the_estimators_are_a_pipeline_of_their_own(pipelines):
+    registered = pipelines()
+    study = "estimators.sparkfun.evaluation.runs"
+    assert study in registered["estimators"].all_outputs()
+    for name in ("__default__", "reporting"):
+        assert not {one for one in datasets_of({name: registered[name]}) if "estimators." in one}
 
 
 def test_a_studys_runs_are_narrowed_to_it_and_tracked_ones_are_not():

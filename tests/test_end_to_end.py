@@ -13,6 +13,8 @@ import pandas as pd
 import pytest
 from mlflow import MlflowClient
 
+from gyro_pipeline.estimators import ESTIMATORS, ORIENTATION_NOTE
+
 SERIAL = {"executor": "serial"}  # where few trainings are not worth the start of processes
 REAL_FILE = "memsense_test_real.npy"
 REPORT = "data/08_reporting/simulated_smoke"
@@ -440,6 +442,51 @@ def test_deleted_recordings_are_missed_by_exactly_what_needs_them(
         assert f"kedro run --pipeline={stage} --params=only.sensor=ng" in without_recordings.output
 
 
+@pytest.fixture(scope="module")
+def estimators(new_project):
+    """Of one sensor and window, made, and asked for again."""
+    project = new_project()
+    only = {"sensor": "sparkfun", "window_s": 10}
+    done = project.run_here("estimators", "smoke", only=only)
+    made = project.runs("estimators")
+    return project, done, made, project.run_here("estimators", "smoke", only=only)
+
+
+def test_every_estimator_without_a_network_is_a_finished_run(estimators):
+    _, done, runs, _ = estimators
+    assert done.code == 0, done.output
+    assert sorted(run.data.params["estimator"] for run in runs) == sorted(ESTIMATORS)
+    for run in runs:
+        assert run.info.status == "FINISHED"
+        assert set(run.data.params) == PARAMS | {"folds"}
+        name, metrics = run.data.params["estimator"], run.data.metrics
+        for suffix in ("", "_all", "_true", "_all_true"):
+            assert {f"{base}{suffix}" for base in ("test_rmse_dps", "beats_oracle_p")} <= set(
+                metrics
+            )
+        assert {"test_mse_dps2_all_disjoint", "ceiling_rmse_dps_all"} <= set(metrics)
+        covered = {f"coverage_{n}sigma_all{truth}" for n in (1, 2) for truth in ("", "_true")}
+        stated = name not in ("median", "trimmed_mean", "ridge", "ridge_same_time")
+        assert covered & set(metrics) == (covered if stated else set())
+        assert ("uses_prior" in run.data.tags) == ESTIMATORS[name]().uses_prior
+
+
+def test_they_are_compared_in_the_report_and_judged_once(estimators):
+    project, _, runs, again = estimators
+    assert again.code == 0, again.output
+    assert f"sparkfun: 0 runs evaluated, {len(ESTIMATORS)} skipped" in again.output
+    assert identities(project.runs("estimators")) == identities(runs)
+    table = pd.read_csv(project.folder / REPORT / "tables/estimators_comparison.csv")
+    assert table["Estimator"].tolist() == list(ESTIMATORS)
+    by_name = {run.data.params["estimator"]: run for run in runs}
+    rmse = 1e3 * by_name["ridge"].data.metrics["test_rmse_dps_all"]
+    assert table.set_index("Estimator")["RMSE mdps"]["ridge"] == pytest.approx(rmse, abs=1e-3)
+    page = (project.folder / f"{PAGE}.html").read_text()
+    assert "Estimators without a network" in page
+    assert "best_linear_history" in page
+    assert ORIENTATION_NOTE in page
+
+
 def test_ground_truth_alone(new_project):
     project = new_project()
     assert project.run_here("ground_truth", "smoke", only={"sensor": "ng"}).code == 0
@@ -520,3 +567,19 @@ def test_the_real_file_stands_beside_the_simulated_one_in_the_report(memsense):
     assert len(row["Runs"].split()) == 11
     results = pd.read_csv(folder / "real2real_results.csv")
     assert (results.source == "published (measured)").sum() == 4
+
+
+def test_estimators_without_a_network_reach_on_the_real_file_what_is_known(memsense):
+    project, _, _ = memsense
+    done = project.kedro_run(
+        "--pipeline=estimators", "--env=memsense_real", "--params=only.window_s=10"
+    )
+    assert done.code == 0, done.output
+    runs = {run.data.params["estimator"]: run for run in project.runs("estimators")}
+    assert set(runs) == set(ESTIMATORS)
+    assert all(run.data.params["folds"] == "11" for run in runs.values())
+    rmse = {name: run.data.metrics["test_rmse_dps_all"] for name, run in runs.items()}
+    assert f"{rmse['training_mean']:.7f}" == "0.0014536"
+    assert 0.53 < rmse["empirical_bayes"] / rmse["mean"] <= 0.72
+    assert 0.53 < rmse["best_linear"] / rmse["mean"] <= 0.72
+    assert 0.6 <= runs["best_linear"].data.metrics["coverage_1sigma_all"] <= 0.78

@@ -104,6 +104,16 @@ def test_the_configuration_of_this_project_is_accepted(loaded, monkeypatch, tmp_
             "a window of 60 s is longer than a recording of memsense, 52 s",
         ),
         ({"windows_s": []}, "windows_s:", "at least 1 item"),
+        (
+            {"studies": {"estimators": {"windows_s": [10, 60]}}},
+            "studies.estimators.windows_s:",
+            "a window of 60 s is longer than a recording of memsense, 52 s",
+        ),
+        (
+            {"studies": {"estimators": {"estimators": ["mean", "mean"]}}},
+            "studies.estimators.estimators:",
+            "names one of them twice",
+        ),
         ({"windows_s": [0]}, "windows_s.0:", "greater than 0"),
         ({"seeds": []}, "seeds:", "at least 1 item"),
         ({"leakage": {"sensors": ["bosch"]}}, "", "leakage.sensors: unknown sensor 'bosch'"),

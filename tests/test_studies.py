@@ -1,9 +1,11 @@
+from collections import Counter
 from dataclasses import replace
 from itertools import product
 
 import pytest
 
 from gyro_pipeline.conventions import HOLD_OUT, LEAKS, NO_LEAK, TEST_IN_TRAINING, InputError
+from gyro_pipeline.estimators import ESTIMATORS
 from gyro_pipeline.fingerprints import fingerprint
 from gyro_pipeline.parameters import Only
 from gyro_pipeline.studies import (
@@ -83,11 +85,29 @@ def test_the_other_grids_are_the_papers(base, study, method, gyroscopes):
     assert {(c.method, c.virtual_gyros) for c in cells} == {(method, 0)}
 
 
-def test_the_three_studies_need_46_trainings(base):
-    cells = sum((cells_of(base, study) for study in base.studies), [])
+def test_the_three_studies_of_the_paper_need_46_trainings(base):
+    studies = ("augmentation", "real2real", "input_channels")
+    cells = sum((cells_of(base, study) for study in studies), [])
     assert len(networks(cells)) == 24 + 24 + 8
     assert len(distinct(networks(cells))) == 46
     assert len(distinct(cells)) == 46 + 8
+
+
+def test_the_estimators_study_is_all_of_them_at_five_windows_on_every_sensor(base):
+    cells = cells_of(base, "estimators")
+    named = Counter((c.estimator, c.sensor, c.window_s) for c in cells)
+    assert named == Counter(product(ESTIMATORS, base.sensors, (1.0, 2.0, 5.0, 10.0, 30.0)))
+    fitted = [c for c in cells if c.estimator != MEAN]
+    assert {(c.method, c.real_gyros, c.seed, c.fold) for c in fitted} == {(0, 3, 0, HOLD_OUT)}
+    assert networks(cells) == []
+
+
+def test_estimators_are_the_same_for_every_seed_and_narrowed_like_networks(base, parameters):
+    assert cells_of(parameters("full"), "estimators") == cells_of(base, "estimators")
+    narrowed = cells_of(base, "estimators", sensor="dot", window_s=10, real_gyros=3)
+    assert [c.estimator for c in narrowed] == list(ESTIMATORS)
+    assert cells_of(base, "estimators", real_gyros=6) == []
+    assert cells_of(base, "estimators", virtual_gyros=12) == []
 
 
 def test_full_is_five_seeds_of_base(base, parameters):
@@ -167,9 +187,14 @@ def test_used_sensors_are_those_with_cells_left(base, parameters):
     assert everything["augmentation"] == ["sparkfun", "dot"]
     assert everything["real2real"] == ["sparkfun", "dot", "ng", "memsense"]
     narrowed = used_sensors(parameters("base", only={"sensor": "dot", "real_gyros": 6}))
-    assert narrowed == {"augmentation": [], "real2real": ["dot"], "input_channels": []}
+    assert {study: sensors for study, sensors in narrowed.items() if sensors} == {
+        "real2real": ["dot"]
+    }
     memsense = used_sensors(parameters("memsense_real"))
-    assert memsense == {"augmentation": [], "real2real": ["memsense"], "input_channels": []}
+    assert {study: sensors for study, sensors in memsense.items() if sensors} == {
+        "real2real": ["memsense"],
+        "estimators": ["memsense"],
+    }
 
 
 # folds
@@ -183,6 +208,12 @@ def test_networks_are_repeated_in_every_fold_and_running_means_are_not(base):
         folds = [c.fold for c in networks(folded) if c.window_s == window_s]
         assert folds == list(range(11))
     assert len(distinct(folded)) == 2 + 22
+
+
+def test_an_estimator_without_a_network_is_one_run_over_all_folds(base):
+    cells = cells_of(base, "estimators", sensor="memsense", window_s=10)
+    assert {c.fold for c in over_folds(cells, range(11), Only())} == {HOLD_OUT}
+    assert len(over_folds(cells, range(11), Only())) == len(ESTIMATORS)
 
 
 def test_only_narrows_folds(base):

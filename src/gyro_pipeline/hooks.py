@@ -105,7 +105,11 @@ class Provenance:
 def _check_matches(parameters: Parameters, pipelines: Sequence[str]) -> None:
     """Refuse an ``only`` that leaves the studies to run without a single cell."""
     sensors = used_sensors(parameters)
-    studies = [study for study in sensors if study in pipelines or "__default__" in pipelines]
+    studies = [
+        study
+        for study, asked in parameters.studies.items()
+        if study in pipelines or (asked.default and "__default__" in pipelines)
+    ]
     if LEAKAGE in pipelines:
         sensors[LEAKAGE] = leak_sensors(parameters.leakage, parameters.only)
         studies.append(LEAKAGE)

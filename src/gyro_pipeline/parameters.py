@@ -4,7 +4,7 @@ An unknown key, a value out of bounds or a study that asks for what a sensor can
 refused before any node runs (see :class:`gyro_pipeline.hooks.Preflight`).
 """
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -165,9 +165,18 @@ class Grid(Parameter):
 
 
 class Study(Parameter):
-    """A part of the paper: networks to compare, tracked in one MLflow experiment."""
+    """Estimators to compare, tracked in one MLflow experiment; each of the paper's has networks."""
 
     experiment: str = Field(description="name of the MLflow experiment; the study's own name")
+    estimators: list[str] = Field(
+        ["cnn"],
+        min_length=1,
+        description="beside the running mean; names of gyro_pipeline.estimators",
+    )
+    windows_s: list[Annotated[float, Field(gt=0)]] | None = Field(
+        None, min_length=1, description="its own; null: those of all studies"
+    )
+    default: bool = Field(True, description="part of `kedro run` and `--pipeline=reporting`")
     sensors: dict[str, Grid]
 
 
@@ -312,7 +321,11 @@ class Parameters(Parameter):
 
     @model_validator(mode="after")
     def _studies_ask_for_what_sensors_give(self) -> Self:
-        for name, values in (("seeds", self.seeds), ("windows_s", self.windows_s)):
+        listed: dict[str, list[Any]] = {"seeds": self.seeds, "windows_s": self.windows_s}
+        for study, asked in self.studies.items():
+            listed[f"studies.{study}.windows_s"] = asked.windows_s or []
+            listed[f"studies.{study}.estimators"] = asked.estimators
+        for name, values in listed.items():
             if len(set(values)) < len(values):
                 raise ValueError(f"{name}: {values} names one of them twice")
         known = self._known
@@ -336,10 +349,21 @@ class Parameters(Parameter):
                     )
         if self.only.sensor is not None and self.only.sensor not in self.sensors:
             raise ValueError(f"only.sensor: unknown sensor {self.only.sensor!r}; {known}")
-        for name, sensor in self.sensors.items():
-            if max(self.windows_s) > sensor.recording_s:
+        return self
+
+    @model_validator(mode="after")
+    def _windows_fit_into_recordings(self) -> Self:
+        asked = [("windows_s", self.windows_s, name) for name in self.sensors]
+        asked += [
+            (f"studies.{study}.windows_s", one.windows_s or [], name)
+            for study, one in self.studies.items()
+            for name in one.sensors
+        ]
+        for where, windows_s, name in asked:
+            recording_s = self.sensors[name].recording_s
+            if max(windows_s, default=0) > recording_s:
                 raise ValueError(
-                    f"windows_s: a window of {max(self.windows_s):g} s is longer than a "
-                    f"recording of {name}, {sensor.recording_s:g} s"
+                    f"{where}: a window of {max(windows_s):g} s is longer than a "
+                    f"recording of {name}, {recording_s:g} s"
                 )
         return self

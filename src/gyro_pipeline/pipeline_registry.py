@@ -35,6 +35,7 @@ def register_pipelines() -> dict[str, Pipeline]:
     parameters = _selected or base_parameters()
     sensors = used_sensors(parameters)
     every_sensor = {study: list(asked.sensors) for study, asked in parameters.studies.items()}
+    default = [study for study, asked in parameters.studies.items() if asked.default]
     wanted = parameters.only.sensor
     pipelines = {
         study: _runs(parameters, {study: sensors[study]})
@@ -49,12 +50,13 @@ def register_pipelines() -> dict[str, Pipeline]:
     )
     published = parameters.published
     pipelines["reporting"] = reporting.create_pipeline(
-        every_sensor,
+        {study: every_sensor[study] for study in default},
         sensors=[row.sensor for row in published.specifications],
         virtual=[row.sensor for row in published.hours if row.virtual],
     )
     pipelines[LEAKAGE] = _leakage(parameters)
-    pipelines["__default__"] = _runs(parameters, sensors) + pipelines["reporting"]
+    runs = _runs(parameters, {study: sensors[study] for study in default})
+    pipelines["__default__"] = runs + pipelines["reporting"]
     return pipelines
 
 

@@ -36,7 +36,8 @@ class Cell:
     """One estimator on one sensor, window and fold: one MLflow run.
 
     The fields are parameters of the run, by these names. The running mean is trained on nothing:
-    its ``method``, ``real_gyros`` and ``virtual_gyros`` are 0.
+    its ``method``, ``real_gyros`` and ``virtual_gyros`` are 0. Other estimators without a network
+    have method 0 and seed 0, and are fitted in each fold when they are judged.
     """
 
     study: str
@@ -109,24 +110,29 @@ def study_cells(  # noqa: PLR0913 - what a grid is made of
 ) -> list[Cell]:
     """Cells of a study on a sensor on the hold-out split; the running mean of each window first.
 
-    ``only`` narrows the networks. A running mean stays wherever a network of its window does.
+    ``only`` narrows them. A running mean stays wherever another estimator of its window does.
     """
     name, grid = study.experiment, study.sensors[sensor]
     networks = [
         Cell(name, grid.method, sensor, source, real, virtual, float(window_s), seed, HOLD_OUT, CNN)
         for real, virtual, window_s, seed in product(
-            grid.real_gyros, grid.virtual_gyros, windows_s, seeds
+            grid.real_gyros, grid.virtual_gyros, study.windows_s or windows_s, seeds
         )
     ]
+    cells = list(
+        dict.fromkeys(
+            cell if estimator == CNN else replace(cell, method=0, seed=0, estimator=estimator)
+            for estimator in study.estimators
+            for cell in networks
+        )
+    )
     wanted = only.model_dump(exclude_none=True, exclude={"fold"})  # folds: known only with data
-    networks = [
-        c for c in networks if all(getattr(c, key) == value for key, value in wanted.items())
-    ]
+    cells = [c for c in cells if all(getattr(c, key) == value for key, value in wanted.items())]
     means = [
         Cell(name, 0, sensor, source, 0, 0, window_s, 0, HOLD_OUT, MEAN)
-        for window_s in dict.fromkeys(cell.window_s for cell in networks)
+        for window_s in dict.fromkeys(cell.window_s for cell in cells)
     ]
-    return means + networks
+    return means + [cell for cell in cells if cell.estimator != MEAN]
 
 
 def used_sensors(parameters: Parameters) -> dict[str, list[str]]:
@@ -143,7 +149,7 @@ def used_sensors(parameters: Parameters) -> dict[str, list[str]]:
 
 
 def over_folds(cells: Sequence[Cell], folds: Sequence[int], only: Only) -> list[Cell]:
-    """One network per fold; the running mean, which learns nothing, once over all recordings.
+    """One network per fold; any other estimator once, over the recordings of all folds.
 
     Raises:
         InputError: If ``only.fold`` is none of the folds.

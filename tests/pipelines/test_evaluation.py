@@ -16,8 +16,10 @@ from gyro_pipeline.conventions import (
     TEST,
     TRAIN,
     TRUE,
+    InputError,
 )
-from gyro_pipeline.estimators import RunningMean
+from gyro_pipeline.estimators import ESTIMATORS, ORIENTATION_NOTE, RunningMean
+from gyro_pipeline.parameters import Grid, Study
 from gyro_pipeline.pipelines.evaluation import bench as bench_module
 from gyro_pipeline.pipelines.evaluation.bench import (
     Bench,
@@ -25,6 +27,7 @@ from gyro_pipeline.pipelines.evaluation.bench import (
     known_recordings,
     off_the_curve,
 )
+from gyro_pipeline.pipelines.evaluation.folds import Fitted
 from gyro_pipeline.pipelines.evaluation.nodes import evaluate
 from gyro_pipeline.pipelines.ground_truth.nodes import measure_allan_variance, measure_bias
 from gyro_pipeline.studies import CNN, MEAN
@@ -344,3 +347,106 @@ def test_the_curve_at_the_window_is_the_running_means_rmse(bench, windows):
     rmse = np.sqrt(curve.sum_sq.sum() / curve["count"].sum())
     name = "test_rmse_dps" + ("" if windows == FIRST else "_all")
     assert bench.metrics(bench.errors(RunningMean()), LAST)[name] == pytest.approx(rmse)
+
+
+# estimators without a network
+
+
+def of_estimators(world, names, roles=None):
+    study = Study(
+        experiment="estimators",
+        estimators=list(names),
+        sensors={"sparkfun": Grid(method=2, real_gyros=[3])},
+    )
+    return replace(world, study=study, virtual=None, roles=world.roles if roles is None else roles)
+
+
+def judge(world, as_stored):
+    """Metrics, tags and artifacts of each estimator."""
+    runs = [as_stored(run, f"id{i}") for i, run in enumerate(world.train())]
+    names = {run.run_id: run.params["estimator"] for run in runs}
+    given = {n: getattr(world, n) for n in "recordings bias allan roles evaluation".split()}
+    return {names[run.run_id]: run for run in evaluate(cells=world.plan(), runs=runs, **given)}
+
+
+@pytest.fixture(scope="module")
+def all_judged(world, as_stored):
+    return judge(of_estimators(world, ESTIMATORS), as_stored)
+
+
+def test_every_estimator_is_judged_like_a_network(world, all_judged):
+    assert list(all_judged) == list(ESTIMATORS)
+    for name, run in all_judged.items():
+        for base in ("test_rmse_dps", "mean_rmse_dps", "accuracy_gain_pct", "ceiling_rmse_dps"):
+            assert {base, f"{base}_all", f"{base}_all_lo"} <= set(run.metrics), name
+        assert "test_mse_dps2_all_disjoint" in run.metrics
+        assert set(run.artifacts[ERRORS].weights) == {LAST}
+        estimator = ESTIMATORS[name]()
+        assert run.tags["recommended"] == str(estimator.recommended)
+        assert run.tags.get("uses_prior") == (ORIENTATION_NOTE if estimator.uses_prior else None)
+    assert all_judged["best_linear"].metrics["accuracy_gain_pct_all"] > 0
+
+
+def test_it_is_fitted_to_all_recordings_but_those_that_test(world, all_judged):
+    known = world.recordings.sel(recording=slice(1, 10))
+    constant = known.angular_rate.sel(imu=1).mean("sample", dtype=np.float64).mean("recording")
+    tested = world.recordings.angular_rate.sel(imu=1, recording=list(TESTED))
+    off = constant - tested.mean("sample", dtype=np.float64)
+    metrics = all_judged["training_mean"].metrics
+    assert metrics["test_rmse_dps_all"] == pytest.approx(float(np.sqrt((off**2).mean())))
+
+
+def test_coverage_is_that_of_the_stated_deviations(all_judged):
+    stated = {name for name, run in all_judged.items() if "coverage_1sigma_all" in run.metrics}
+    assert set(all_judged) - stated == {"median", "trimmed_mean", "ridge", "ridge_same_time"}
+    for name in stated:
+        errors = all_judged[name].artifacts[ERRORS].query("truth == 'paper'")
+        within = (errors.error_dps.abs() < 2 * errors.sigma_dps).mean()
+        assert all_judged[name].metrics["coverage_2sigma_all"] == pytest.approx(within)
+        assert "coverage_1sigma_all_disjoint" not in all_judged[name].metrics
+    assert 0.55 < all_judged["mean"].metrics["coverage_1sigma_all"] < 0.8
+
+
+@pytest.fixture
+def folds(world):
+    """Of seven recordings each; the first is fitted to the second half, and the reverse."""
+    first = [TEST] * 7 + [TRAIN] * 7
+    return pd.concat(
+        pd.DataFrame({"fold": fold, "recording": range(1, 15), "role": roles})
+        for fold, roles in enumerate((first, first[::-1]))
+    )
+
+
+def test_in_a_k_fold_one_run_holds_the_recordings_of_all_folds(world, as_stored, folds):
+    judged = judge(of_estimators(world, ["training_mean"], folds), as_stored)
+    errors = judged["training_mean"].artifacts[ERRORS].query("truth == 'paper' and window == 0")
+    assert errors.recording.nunique() == 14
+    means = world.recordings.angular_rate.sel(imu=1).mean("sample", dtype=np.float64).to_numpy()
+    expected = np.concatenate([means[7:].mean(0) - means[:7], means[:7].mean(0) - means[7:]])
+    np.testing.assert_allclose(errors.error_dps, expected.ravel(), atol=1e-12)
+
+
+def test_an_estimator_never_sees_the_drawn_values(simulated, world, monkeypatch):
+    seen = []
+
+    class Spy(RunningMean):
+        def fit(self, recordings, imu=1):
+            seen.append(recordings)
+            return self
+
+    monkeypatch.setitem(ESTIMATORS, "mean", Spy)
+    Fitted(simulated, world.roles).estimator("mean")
+    assert len(seen) == 1  # once for all recordings
+    assert set(seen[0].data_vars) == {"angular_rate"}
+    assert seen[0].recording.to_numpy().tolist() == list(range(1, 11))
+
+
+def test_too_few_recordings_are_an_error_that_says_so(world, as_stored, make_roles):
+    roles = make_roles(14, test=12)
+    with pytest.raises(InputError, match="best_linear cannot be fitted to 2 recordings: .*leave"):
+        judge(of_estimators(world, ["best_linear"], roles), as_stored)
+
+
+def test_an_estimate_that_is_none_is_refused(bench):
+    with pytest.raises(InputError, match="recording 11: expected an estimate for every window"):
+        bench.errors(Off(bench, np.nan))

@@ -109,8 +109,8 @@ def sentence(content, words):
 
 
 def test_every_table_and_figure_of_the_paper_has_a_caption():
-    made = create_pipeline({study: [] for study in ("augmentation", "real2real", "input_channels")},
-                           sensors=["sparkfun"]).all_outputs()  # fmt: skip
+    studies = ("augmentation", "real2real", "input_channels", "estimators")
+    made = create_pipeline({study: [] for study in studies}, sensors=["sparkfun"]).all_outputs()
     places = {
         f"{kind}/{study.replace('.', '_')}{name}"
         for study, _, rest in (address.partition("reporting.") for address in made)
@@ -121,6 +121,17 @@ def test_every_table_and_figure_of_the_paper_has_a_caption():
     for place, caption in CAPTIONS.items():
         name = place.split("/")[1]
         assert name.startswith(caption.pipeline) or caption.pipeline == "reporting"
+
+
+def test_of_a_study_without_networks_it_says_how_many_estimators(write, rows):
+    rows[1:] = [result(1, 60.0, estimator="best_linear", method=0)]
+    content, _ = write(runs=[stored(0, "mean"), stored(1, "best_linear")])
+    facts = dict(content["facts"])
+    assert facts["Estimators"] == "1 without a network, windows of 10 s"
+    assert not {"Networks", "Seeds", "Windows"} & set(facts)
+    labels = [row["label"] for study in content["studies"] for row in study["rows"]]
+    assert labels == ["sparkfun, running mean, 10 s", "sparkfun, best_linear, 10 s: A 60 %"]
+    assert content["comparison"].empty
 
 
 def test_it_says_what_was_run(write):
@@ -162,7 +173,7 @@ def test_findings_are_counted(write):
     assert "1 of 2 are better than what is expected of a constant" in ranked
     assert "changes A by +4 points, in 1 comparisons" in sentence(content, "virtual gyroscopes")
     assert not [one for one in content["findings"] if "Adding real" in one]
-    assert "smallest p value of 2 trainings is 1" in sentence(content, "No network beats")
+    assert "smallest p value of 2 is 1" in sentence(content, "No estimator beats")
 
 
 def test_networks_stand_between_the_mean_and_the_ceiling(write):

@@ -13,6 +13,7 @@ from gyro_pipeline.pipelines.reporting.figures import (
     gyroscopes_10s,
     input_channels,
     saving_against_turn_on_spread,
+    sparkfun,
     sparkfun_3_real,
     sparkfun_12_real,
     training_data,
@@ -31,6 +32,7 @@ from gyro_pipeline.pipelines.reporting.signals import (
     running_average,
 )
 from gyro_pipeline.pipelines.reporting.tables import (
+    comparison,
     dataset_hours,
     generalization,
     multiple_gyroscopes,
@@ -677,3 +679,78 @@ def test_without_gaps_or_when_narrowed_on_purpose_all_is_well(caplog):
     assert not caplog.text
     refuse_gaps(Only(seed=0), ("make a",))
     assert "narrowed by only: 1 results" in caplog.text
+
+
+# estimators without a network
+
+
+@pytest.fixture
+def estimators(make_run, mean, settings, parameters):
+    """The running mean and two estimators; one is better than the other in every window."""
+    recordings = range(1, 9)
+    base = errors(recordings, 0.002)
+    tables = {"empirical_bayes": base, "best_linear": base.assign(error_dps=base.error_dps / 2)}
+    runs = [
+        make_run(name, recordings, table, study="estimators", estimator=name, method=0)
+        for name, table in tables.items()
+    ]
+    runs = [replace(run, metrics={**run.metrics, "coverage_1sigma_all": 0.68}) for run in runs]
+    study = Study(
+        experiment="estimators",
+        estimators=["mean", *tables],
+        windows_s=[WINDOW_S],
+        sensors={"sparkfun": Grid(method=2, real_gyros=[3])},
+    )
+
+    def pooled(runs):
+        given = (study, "simulated", [30.0], [0], *settings, parameters().evaluation)
+        return pool_results(*given, runs)[0]
+
+    return pooled, [mean(recordings, study="estimators"), *runs]
+
+
+def test_estimators_are_compared_with_the_mean_and_the_best_linear_one(estimators, nothing):
+    pooled, runs = estimators
+    results = pooled(runs)
+    assert results.estimator.tolist() == ["mean", "empirical_bayes", "best_linear"]
+    bayes = results.iloc[1]
+    own, mean_rmse = rmse([runs[1].load(ERRORS)]), rmse([runs[0].load(ERRORS)])
+    assert bayes.less_mean_dps == pytest.approx(own - mean_rmse)
+    assert bayes.less_mean_dps_lo < bayes.less_mean_dps < bayes.less_mean_dps_hi < 0
+    assert bayes.less_best_linear_dps == pytest.approx(own / 2)
+    table = comparison(results, nothing).set_index("Estimator")
+    assert table["Recommended"].tolist() == ["no", "yes", "yes"]
+    assert table["Stored prior"].tolist() == ["no", "yes", "yes"]
+    assert table["RMSE / running mean's"]["empirical_bayes"] == round(own / 0.1, 3)  # its metric
+    assert table["Less running mean mdps"]["mean"] == "–"
+    assert table["Less best_linear mdps"]["best_linear"] == "–"
+    assert table["Less best_linear mdps"]["empirical_bayes"].startswith(f"{own / 2 / 1e-3:+.3f} [+")
+    assert table["Within ±1σ %"]["best_linear"] == 68
+    assert pd.isna(table["Within ±1σ %"]["mean"])
+    assert (table["Recordings"] == 8).all()
+
+
+def test_what_is_there_is_compared_and_the_command_for_the_rest_is_given(estimators, nothing):
+    pooled, runs = estimators
+    results = pooled(runs[:2])
+    (command,) = results.missing.dropna()
+    assert command == (
+        "kedro run --pipeline=estimators --params=only.sensor=sparkfun,only.window_s=10"
+    )
+    table = comparison(results, nothing)
+    assert table["Estimator"].tolist() == ["mean", "empirical_bayes"]
+    assert (table["Less best_linear mdps"] == "–").all()
+    assert comparison(pooled([]), nothing) == Missing(tuple([command] * 3))
+    assert sparkfun(results, nothing) == Missing((command,))
+
+
+def test_their_figure_has_a_line_for_each_and_the_ceiling(estimators, nothing):
+    pooled, runs = estimators
+    results = pooled(runs)
+    figure = sparkfun(results, nothing)
+    for ax in figure.axes:
+        labels = ax.get_legend_handles_labels()[1]
+        best = [f"{name} (recommended)" for name in ("empirical bayes", "best linear")]
+        assert labels == ["mean", *best, "ceiling"]
+    elsewhere = results.assign(source="published", simulated=False)
+    assert len(sparkfun(results, elsewhere).axes) == 4

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.parameters import Execution, Only
+from gyro_pipeline.parameters import Execution, Grid, Only, Study
 from gyro_pipeline.pipelines.training import nodes
 from gyro_pipeline.pipelines.training.nodes import Devices
 from gyro_pipeline.studies import CNN, CNN_SHUFFLED, HOLD_OUT, MEAN, Cell
@@ -376,3 +376,46 @@ def test_only_what_is_missing_is_trained(world, stored):
     kept = [run for run in stored if run.params["real_gyros"] != "6"]
     (first, second) = world.train(tracked=kept)
     assert first.params["real_gyros"] == second.params["real_gyros"] == 6
+
+
+# estimators without a network
+
+
+def of_estimators(world, *names, roles=None):
+    grid = Grid(method=2, real_gyros=[3])
+    study = Study(
+        experiment="estimators",
+        estimators=list(names),
+        windows_s=[5.0, 20.0],
+        sensors={"sparkfun": grid},
+    )
+    return replace(world, study=study, virtual=None, roles=world.roles if roles is None else roles)
+
+
+def test_estimators_are_planned_at_the_windows_of_their_study_and_leave_nothing_to_train(world):
+    asked = of_estimators(world, "ridge", "best_linear")
+    cells = asked.plan()
+    named = cells[["estimator", "window_s"]].to_numpy().tolist()
+    assert named == [[n, w] for n in (MEAN, "ridge", "best_linear") for w in (5.0, 20.0)]
+    runs = asked.train()
+    assert len(runs) == 6
+    assert all(not run.artifacts and run.history is None for run in runs)
+    assert {run.params["fold"] for run in runs} == {HOLD_OUT}
+
+
+def test_they_change_with_the_recordings_that_test(world, make_roles):
+    names = [MEAN, "ridge"]
+    same, fewer = make_roles(14, test=4, validation=3), make_roles(14, test=3, validation=2)
+    plain, validated, tested = (
+        of_estimators(world, *names, roles=roles).plan()[FINGERPRINT].tolist()
+        for roles in (world.roles, same, fewer)
+    )
+    assert plain == validated  # fitted to those that train and those that validate
+    assert not set(plain) & set(tested)
+
+
+def test_an_unknown_estimator_is_refused_with_those_there_are(world):
+    with pytest.raises(
+        InputError, match="estimators: unknown estimator 'oracle'; there are cnn, m"
+    ):
+        of_estimators(world, "oracle").plan()

@@ -14,10 +14,12 @@ from gyro_pipeline.protocol.scores import (
     Curve,
     SquaredErrors,
     beats_oracle,
+    coverage,
     curve_errors,
     equivalent_time,
     holm,
     resampled_weights,
+    rmse_difference,
     score,
     squared_errors,
     with_interval,
@@ -342,3 +344,29 @@ def test_holm_by_hand():
     np.testing.assert_allclose(holm([0.01, 0.04, 0.03, 0.005]), [0.03, 0.06, 0.06, 0.02])
     np.testing.assert_allclose(holm([0.7, 0.6]), [1.0, 1.0])
     np.testing.assert_allclose(holm([0.02]), [0.02])
+
+
+# pairs of estimators, and stated standard deviations
+
+
+def test_a_difference_is_paired_over_recordings():
+    generator = np.random.default_rng(3)
+    hard = generator.uniform(0.1, 10, (30, 1))  # what makes a recording hard for both
+    worse = squares(hard * [1.1, -1.1])
+    less = rmse_difference(squares(hard * [1, -1]), worse, resampled_weights(30, 500, 1))
+    whole = np.sqrt((hard**2).mean())
+    assert less.value == pytest.approx(-0.1 * whole)
+    assert -0.15 * whole < less.lo < less.value < less.hi < -0.05 * whole
+    own = rmse_difference(worse, worse, resampled_weights(30, 500, 1))
+    assert own.value == own.lo == own.hi == 0
+
+
+def test_coverage_counts_the_errors_within_the_stated_deviations():
+    errors = [0.5, -0.9, 1.5, 3.0]
+    table = errors_table(*((1, w, PAPER, e, 0.0) for w, e in enumerate(errors)))
+    table = pd.concat([table, table.assign(truth=TRUE, error_dps=0.0)])
+    table["sigma_dps"] = 1.0
+    assert coverage(table, PAPER, 1) == 0.5
+    assert coverage(table, PAPER, 2) == 0.75
+    assert coverage(table, TRUE, 1) == 1
+    assert np.isnan(coverage(table.assign(sigma_dps=np.nan), PAPER, 1))

@@ -266,8 +266,8 @@ def _is_dead(owner: str) -> bool:
 
 def _run_name(params: Mapping[str, Any]) -> str:
     """Readable at a glance in a list of runs."""
-    if params["estimator"] == "mean":
-        return f"{params['sensor']} mean {params['window_s']:g} s"
+    if params["estimator"] != "cnn":
+        return f"{params['sensor']} {params['estimator']} {params['window_s']:g} s"
     fold = f" fold {params['fold']}" if params["fold"] >= 0 else ""
     if "leak" in params:
         shuffled = " shuffled labels" if params["estimator"] == "cnn_shuffled" else ""

@@ -211,6 +211,37 @@ def paired_difference(
     return with_interval(errors.mean(weights) - reference.mean(weights), confidence_pct)
 
 
+def rmse_difference(
+    errors: SquaredErrors, reference: SquaredErrors, weights: np.ndarray
+) -> Estimate:
+    """RMSE of an estimator less that of another on the same windows, paired over recordings.
+
+    Args:
+        errors: Of the estimator; negative differences are in its favour.
+        reference: Of the other one, in the same order of recordings.
+        weights: From :func:`resampled_weights`.
+
+    Returns:
+        deg/s.
+    """
+    return with_interval(np.sqrt(errors.mean(weights)) - np.sqrt(reference.mean(weights)))
+
+
+def coverage(errors: pd.DataFrame, truth: str, sigmas: float) -> float:
+    """Fraction of all windows whose error is within so many stated standard deviations.
+
+    Args:
+        errors: Columns ``truth, error_dps, sigma_dps``.
+        truth: One of the truths that are exact; the noise of another would widen the errors.
+        sigmas: How many.
+
+    Returns:
+        From 0 to 1; NaN where no standard deviation is stated.
+    """
+    chosen = errors[(errors.truth == truth) & errors.sigma_dps.notna()]
+    return float((chosen.error_dps.abs() < sigmas * chosen.sigma_dps).mean())
+
+
 def beats_oracle(errors: SquaredErrors, oracle: SquaredErrors) -> float:
     """One-sided p value that an estimator is better than the oracle on the same windows.
 

@@ -69,18 +69,23 @@ class TestRecording:
         return truths
 
 
-def error_table(recording: TestRecording, size: int, estimates: np.ndarray) -> pd.DataFrame:
+def error_table(
+    recording: TestRecording, size: int, estimates: np.ndarray, sigma: np.ndarray | None = None
+) -> pd.DataFrame:
     """Errors of the estimates on one recording, a row per window, axis and truth.
 
     Args:
         recording: What was estimated.
         size: Samples per window.
         estimates: Shape (windows, 3), deg/s.
+        sigma: The standard deviations that the estimator states, same shape; NaN for none.
 
     Returns:
-        Columns ``recording, window, axis, truth, error_dps, truth_variance``.
+        Columns ``recording, window, axis, truth, error_dps, truth_variance``, and ``sigma_dps``
+        where they are given.
     """
     n = len(estimates)
+    stated = {} if sigma is None else {"sigma_dps": sigma.ravel()}
     return pd.concat(
         pd.DataFrame(
             {
@@ -90,6 +95,7 @@ def error_table(recording: TestRecording, size: int, estimates: np.ndarray) -> p
                 "truth": truth,
                 "error_dps": (estimates - value).ravel(),
                 "truth_variance": np.tile(variance, n),
+                **stated,
             }
         )
         for truth, (value, variance) in recording.truths(size).items()

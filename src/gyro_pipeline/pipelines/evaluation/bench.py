@@ -11,6 +11,7 @@ import xarray as xr
 
 from gyro_pipeline.conventions import (
     ALL,
+    AXES,
     BEST,
     BIAS,
     DISJOINT,
@@ -23,6 +24,7 @@ from gyro_pipeline.conventions import (
     TEST,
     TEST_IMU,
     TRUE,
+    InputError,
 )
 from gyro_pipeline.estimators import Estimator, RunningMean
 from gyro_pipeline.parameters import Evaluation
@@ -40,6 +42,7 @@ from gyro_pipeline.protocol.scores import (
     Curve,
     Estimate,
     beats_oracle,
+    coverage,
     curve_errors,
     resampled_weights,
     score,
@@ -166,19 +169,34 @@ class Bench:
         Args:
             estimator: Sees ``imus`` IMUs side by side, the test IMU first.
             imus: How many.
+
+        Raises:
+            InputError: If it gives no estimate for some window.
         """
         seen = self.recordings.angular_rate.sel(imu=slice(TEST_IMU, TEST_IMU + imus - 1))
         tables = []
         for recording in self.tested:
-            samples = seen.sel(recording=recording.number).to_numpy()
-            windows = cut_windows(samples.reshape(-1, samples.shape[-1]), self.size)
+            samples = (
+                recording.samples
+                if imus == 1
+                else np.concatenate(seen.sel(recording=recording.number).to_numpy())
+            )
+            windows = cut_windows(samples, self.size)
             windows = windows.transpose(1, 0, 2)
             start_s = np.arange(len(windows)) * self.size / self.recordings.attrs["rate_hz"]
             for target in (RECORDING_MEAN, BIAS):
-                biases, _ = estimator.estimate(windows, target, start_s, recording.number)
-                table = error_table(recording, self.size, biases[:, : samples.shape[1]])
+                given = estimator.estimate(windows, target, start_s, recording.number)
+                judged = (values[:, : len(AXES)] for values in given)
+                table = error_table(recording, self.size, *judged)
                 tables.append(table[table.truth.map(TARGET_OF) == target])
-        return pd.concat(tables, ignore_index=True)
+        errors = pd.concat(tables, ignore_index=True)
+        for number in errors.recording[errors.error_dps.isna()].unique():
+            raise InputError(
+                f"{self.recordings.attrs['sensor']} recording {number}: expected an estimate for "
+                f"every window of {self.window_s:g} s, got NaN; bring more training recordings or "
+                "leave the estimator out of the study"
+            )
+        return errors
 
     @cached_property
     def mean_errors(self) -> pd.DataFrame:
@@ -245,6 +263,10 @@ class Bench:
         )
         metrics: dict[str, float] = {}
         for truth in errors.truth.unique():
+            if truth != DISJOINT and errors.sigma_dps.notna().any():
+                for sigmas in (1, 2):
+                    name = metric_name(f"coverage_{sigmas}sigma", ALL, weights, truth)
+                    metrics[name] = coverage(errors, truth, sigmas)
             for windows in (FIRST, ALL):
                 scores = score(
                     squared_errors(errors, truth, windows),

@@ -141,8 +141,8 @@ def strided_error_table(estimator: Estimator, bench: Bench, divided: Division) -
         sums = one.running_sums[:, starts + bench.size] - one.running_sums[:, starts]
         means = sums.T / bench.size
         seen = cut_windows(one.samples, bench.size, starts).transpose(1, 0, 2)
-        network, _ = estimator.estimate(seen, RECORDING_MEAN)
-        estimates = {"": network, "mean_": means, "constant_": constant}
+        estimated, _ = estimator.estimate(seen, RECORDING_MEAN)
+        estimates = {"": estimated, "mean_": means, "constant_": constant}
         if device.unit_bias is not None and device.white:
             known = (device.unit_bias, device.spread[0], device.noise[0])
             estimates["oracle_"] = oracle(means, *known, bench.window_s, bench.recording_s, PAPER)

@@ -8,8 +8,8 @@ import xarray as xr
 
 from gyro_pipeline.conventions import ALL, BEST, FIRST, LAST
 from gyro_pipeline.estimators import (
+    ORIENTATION_NOTE,
     Estimator,
-    RunningMean,
     averages,
     base,
     linear,
@@ -22,6 +22,7 @@ from gyro_pipeline.parameters import Evaluation
 from gyro_pipeline.physics import allan as allan_module
 from gyro_pipeline.physics import ceiling, history, recording_model, reml
 from gyro_pipeline.pipelines.evaluation import bench as bench_module
+from gyro_pipeline.pipelines.evaluation import folds
 from gyro_pipeline.pipelines.evaluation.bench import (
     Bench,
     describe_device,
@@ -29,8 +30,9 @@ from gyro_pipeline.pipelines.evaluation.bench import (
     off_the_curve,
     test_recordings,
 )
+from gyro_pipeline.pipelines.evaluation.folds import Fitted
 from gyro_pipeline.protocol import scores, truths, windows
-from gyro_pipeline.studies import MEAN
+from gyro_pipeline.studies import CNN, MEAN
 from gyro_pipeline.tracking import (
     CURVE,
     ERRORS,
@@ -47,7 +49,7 @@ logger = logging.getLogger(__name__)
 _CODE = (
     *(allan_module, ceiling, recording_model, reml, history),
     *(averages, base, linear, noise, shrinkage),
-    *(bench_module, scores, truths, windows),
+    *(bench_module, folds, scores, truths, windows),
 )
 
 
@@ -75,6 +77,7 @@ def evaluate(
         Metrics and per-window errors, to be added to each run.
     """
     trained = {run.fingerprint: run for run in reversed(runs)}
+    fitted = Fitted(recordings, roles)
     judged_with = fingerprint([code_hash(_CODE), evaluation.model_dump()])
     seed = evaluation.bootstrap_seed
     device = describe_device(recordings, bias, allan, known_recordings(roles), seed)
@@ -89,7 +92,7 @@ def evaluate(
         if key not in benches:
             numbers = test_recordings(roles, cell["fold"])
             benches[key] = Bench(recordings, device, numbers, cell["window_s"], evaluation)
-        yield _judge(run, benches[key], judged_with)
+        yield _judge(run, benches[key], fitted, judged_with)
     logger.info(
         "%s: %d runs evaluated, %d skipped",
         recordings.attrs["sensor"],
@@ -98,14 +101,16 @@ def evaluate(
     )
 
 
-def _judge(run: StoredRun, bench: Bench, judged_with: str) -> EvaluatedRun:
+def _judge(run: StoredRun, bench: Bench, fitted: Fitted, judged_with: str) -> EvaluatedRun:
     artifacts = {}
-    if run.params["estimator"] == MEAN:
-        judged: dict[str, Estimator] = {LAST: RunningMean()}
-        artifacts[CURVE] = bench.curve
+    name = run.params["estimator"]
+    if name != CNN:
+        judged: dict[str, Estimator] = {LAST: fitted.estimator(name)}
     else:
         stored = run.load(WEIGHTS)
         judged = {which: NetworkEstimator(stored, which) for which in (LAST, BEST) if stored[which]}
+    if name == MEAN:
+        artifacts[CURVE] = bench.curve
     side_by_side = int(run.params["real_gyros"]) // 3 if run.params["method"] == "1" else 1
     metrics: dict[str, float] = {}
     tables = []
@@ -116,6 +121,9 @@ def _judge(run: StoredRun, bench: Bench, judged_with: str) -> EvaluatedRun:
     artifacts[ERRORS] = pd.concat(tables, ignore_index=True)
     tags = {EVALUATED_WITH: judged_with, "ceiling": bench.ceiling_basis}
     tags |= off_the_curve(metrics)
+    tags["recommended"] = str(judged[LAST].recommended)
+    if judged[LAST].uses_prior:
+        tags["uses_prior"] = ORIENTATION_NOTE
     logger.info(
         "%s %s: RMSE %.7f deg/s in the first window, %.6f in all (last epoch)",
         *(run.study, _title(run)),

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from gyro_pipeline.estimators import ORIENTATION_NOTE
+
 
 @dataclass(frozen=True)
 class Caption:
@@ -30,6 +32,12 @@ _ON_CURVE = (
     "the ceiling. Lower is better."
 )
 _ALIKE = "To be read like the figure of SparkFun with 3 real gyroscopes."
+_ESTIMATORS = (
+    "Left: error over all windows. Right: the same relative to the running mean. Relatives share a "
+    "colour, filled markers are the recommended estimators. The dashed line is the ceiling, on "
+    "measured data an estimate for white noise. Lower is better. Estimators of the black family "
+    f"need no training recordings; each of the others {ORIENTATION_NOTE}."
+)
 _TOLERANCE = "The band is the tolerance around the mean of the recording, which counts as truth."
 
 CAPTIONS = {
@@ -44,6 +52,14 @@ CAPTIONS = {
         f"{_SUMMARY} Where runs on measured data of another source are in the store, they stand "
         "below the row of the same sensor.",
         "real2real",
+    ),
+    "tables/estimators_comparison": Caption(
+        "Estimators without a network",
+        "RMSE over all windows, against the mean of the recording. Differences are of RMSEs on the "
+        "same windows, with 95 % intervals over recordings; negative ones are in favour of the "
+        "row's estimator. The last columns say how often the truth lies within one and two of the "
+        f"standard deviations that it states: 68 and 95 % are right. One that {ORIENTATION_NOTE}.",
+        "estimators",
     ),
     "tables/sensor_specifications": Caption(
         "Sensors: datasheets and recordings",
@@ -64,6 +80,18 @@ CAPTIONS = {
         "how much can be gained. The line is the ceiling of a sensor with that spread, markers "
         "are what the networks save, with 95 % intervals.",
         "real2real",
+    ),
+    "figures/estimators_sparkfun": Caption(
+        "SparkFun: estimators without a network against the window length",
+        _ESTIMATORS,
+        "estimators",
+    ),
+    "figures/estimators_dot": Caption(
+        "DOT: estimators without a network", _ESTIMATORS, "estimators"
+    ),
+    "figures/estimators_ng": Caption("NG: estimators without a network", _ESTIMATORS, "estimators"),
+    "figures/estimators_memsense": Caption(
+        "Memsense: estimators without a network", _ESTIMATORS, "estimators"
     ),
     "figures/input_channels_input_channels": Caption(
         "Method 1: more gyroscopes as input channels",

@@ -13,7 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 from gyro_pipeline.conventions import ALL, FIRST, MDPS, PAPER, Missing
 from gyro_pipeline.parameters import Published, PublishedResult
 from gyro_pipeline.physics.ceiling import best_saving, ceiling_rmse, running_mean_rmse
-from gyro_pipeline.pipelines.reporting.style import CEILING, COLOURS, LOOK, MARKERS, share_legend
+from gyro_pipeline.pipelines.reporting.style import (
+    CEILING,
+    COLOURS,
+    LOOK,
+    MARKERS,
+    estimator_look,
+    share_legend,
+)
 from gyro_pipeline.pipelines.reporting.tables import measured_elsewhere, source_of
 from gyro_pipeline.studies import CNN, MEAN
 
@@ -126,6 +133,26 @@ def saving_against_turn_on_spread(
     return figure
 
 
+def sparkfun(results: pd.DataFrame, elsewhere: pd.DataFrame) -> Figure | Missing:
+    """SparkFun: all estimators against the window length."""
+    return _estimators(results, elsewhere, "sparkfun")
+
+
+def dot(results: pd.DataFrame, elsewhere: pd.DataFrame) -> Figure | Missing:
+    """Movella DOT: all estimators against the window length."""
+    return _estimators(results, elsewhere, "dot")
+
+
+def ng(results: pd.DataFrame, elsewhere: pd.DataFrame) -> Figure | Missing:
+    """NG: all estimators against the window length."""
+    return _estimators(results, elsewhere, "ng")
+
+
+def memsense(results: pd.DataFrame, elsewhere: pd.DataFrame) -> Figure | Missing:
+    """Memsense: all estimators against the window length."""
+    return _estimators(results, elsewhere, "memsense")
+
+
 def equal_spread(row: pd.Series, bound: str = "") -> float:
     """The turn-on spread tau that, on all axes, gives the ceiling of a result.
 
@@ -155,6 +182,43 @@ def _best_saving_pct(row: pd.Series, spreads_dps: NDArray[np.float64]) -> NDArra
     limit = ceiling_rmse(noise, spreads_dps, *times, PAPER)
     rho = limit / running_mean_rmse(noise, *times, PAPER)
     return 100 * best_saving(rho, row.window_s / row.recording_s)
+
+
+def _estimators(results: pd.DataFrame, elsewhere: pd.DataFrame, sensor: str) -> Figure | Missing:
+    """RMSE against the window length; a row of panels for each source of the recordings."""
+    own = _of(results, sensor)
+    if lacking := tuple(own.missing.dropna()):
+        return Missing(lacking)
+    sources = [own, *(rows for _, rows in _of(elsewhere, sensor).groupby("source"))]
+    with LOOK():
+        figure = Figure(figsize=(10, 1.6 + 4 * len(sources)), layout="constrained")
+        axes = figure.subplots(len(sources), 2, squeeze=False)
+        for (left, right), rows in zip(axes, sources, strict=True):
+            _draw_estimators(left, right, rows)
+        share_legend(figure, axes.ravel(), columns=4)
+        figure.suptitle(f"{sensor}: error against window length, all windows")
+    return figure
+
+
+def _draw_estimators(left: Axes, right: Axes, rows: pd.DataFrame) -> None:
+    means = rows[rows.estimator == MEAN].set_index("window_s").sort_index()
+    for place, (name, own) in enumerate(rows.groupby("estimator", sort=False)):
+        rmse = own.set_index("window_s").test_rmse_dps_all.sort_index()
+        shift = 1 + 0.015 * (place - rows.estimator.nunique() / 2)
+        for ax, values in ((left, rmse / MDPS), (right, rmse / means.test_rmse_dps_all)):
+            ax.plot(values.index * shift, values, **estimator_look(str(name)))
+    limit = means.ceiling_rmse_dps_all
+    for ax, values in ((left, limit / MDPS), (right, limit / means.test_rmse_dps_all)):
+        ax.plot(values.index, values, color=CEILING, lw=2, ls="--", label="ceiling")
+        ax.set(xscale="log", yscale="log", xlabel="window length [s], points side by side")
+        ax.set_xticks(means.index.tolist(), minor=False)
+        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.set_major_formatter("{x:g}")
+        ax.minorticks_off()
+    title = source_of(rows.iloc[0])
+    left.set(title=title, ylabel="RMSE against the recording's mean [mdps]")
+    right.set(title=title, ylabel="RMSE / RMSE of the running mean")
 
 
 def _of(results: pd.DataFrame, sensor: str) -> pd.DataFrame:

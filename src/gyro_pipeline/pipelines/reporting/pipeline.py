@@ -25,6 +25,7 @@ TABLES: _Makers = {
         tables.multiple_gyroscopes: ["results", "published"],
     },
     "real2real": {tables.generalization: ["results", "measured_elsewhere", "published"]},
+    "estimators": {tables.comparison: ["results", "measured_elsewhere"]},
 }
 FIGURES: _Makers = {
     "augmentation": {
@@ -39,8 +40,12 @@ FIGURES: _Makers = {
         figures.saving_against_turn_on_spread: ["results", "measured_elsewhere", "published"],
     },
     "input_channels": {figures.input_channels: ["results", "curves"]},
+    "estimators": {
+        figure: ["results", "measured_elsewhere"]
+        for figure in (figures.sparkfun, figures.dot, figures.ng, figures.memsense)
+    },
 }
-"""The paper's tables and figures that each study carries, and what they are made from."""
+"""The tables and figures that each study carries, and what they are made from."""
 
 _SHOWN = "sparkfun"
 """Whose signals the figures of signals show."""

@@ -126,23 +126,32 @@ def _facts(
         advice = "Commands below need the `--env` of this report, if it has one."
         return [("Data", f"Source `{source}`; {none}. {advice}")]
     networks = {run.tags[FINGERPRINT]: run for run in runs if run.params["estimator"] == CNN}
+    others = [run for run in runs if run.params["estimator"] not in (CNN, MEAN)]
 
-    def of(name: str) -> str:
-        values = sorted({float(run.params[name]) for run in networks.values()})
+    def of(name: str, some: Iterable[StoredRun]) -> str:
+        values = sorted({float(run.params[name]) for run in some})
         return ", ".join(f"{value:g}" for value in values)
+
+    trained = networks.values()
+    fitted = {run.params["estimator"] for run in others}
 
     used = {name: sensors[name] for name in sensors if name in {r.params["sensor"] for r in runs}}
     started = [datetime.fromtimestamp(run.started_ms / 1000, UTC) for run in runs]
     facts = {
         "Data": _data(source, runs),
         "Recordings": _recordings(used, all(run.tags["simulated"] == "1" for run in runs)),
-        "Networks": f"{len(networks)} trained, of {of('epochs')} epochs (the paper: 1200)",
-        "Seeds": of("seed"),
-        "Windows": f"{of('window_s')} s",
+        "Networks": f"{len(networks)} trained, of {of('epochs', trained)} epochs (the paper: 1200)",
+        "Seeds": of("seed", trained),
+        "Windows": f"{of('window_s', trained)} s",
+        "Estimators": f"{len(fitted)} without a network, windows of {of('window_s', others)} s",
         "Trained": f"{min(started):%Y-%m-%d %H:%M} to {max(started):%Y-%m-%d %H:%M} UTC",
         "Code": _code(runs),
         "Environment": ", ".join(f"`{e}`" for e in sorted({r.tags["kedro_env"] for r in runs})),
     }
+    for name in ("Networks", "Seeds", "Windows") if not networks else ():
+        del facts[name]
+    if not others:
+        del facts["Estimators"]
     if narrowed:
         facts["Narrowed to"] = f"`only`: {narrowed}"
     if elsewhere:
@@ -252,6 +261,9 @@ def _study(
 def _label(row: pd.Series) -> str:
     if row.estimator == MEAN:
         return f"{row.sensor}, running mean, {row.window_s:g} s"
+    if row.estimator != CNN:
+        gain = f"A {row.accuracy_gain_pct_all:.0f} %"
+        return f"{row.sensor}, {row.estimator}, {row.window_s:g} s: {gain}"
     virtual = f" + {row.virtual_gyros} virtual" if row.virtual_gyros else ""
     channels = ", as input channels" if row.method == 1 else ""
     return (

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from itertools import groupby
 from typing import Any
 
@@ -9,19 +10,23 @@ import numpy as np
 import pandas as pd
 
 from gyro_pipeline.conventions import ALL, FIRST, HOLD_OUT, LAST, PAPER
+from gyro_pipeline.estimators import DEFAULT
 from gyro_pipeline.parameters import Evaluation
 from gyro_pipeline.protocol.scores import (
     Estimate,
     curve_errors,
     resampled_weights,
+    rmse_difference,
     score,
     squared_errors,
 )
-from gyro_pipeline.studies import MEAN, Cell, run_params
+from gyro_pipeline.studies import CNN, MEAN, Cell, run_params
 from gyro_pipeline.tracking import CURVE, ERRORS, StoredRun, metric_name
 
 ROW = ["sensor", "source", "estimator", "method", "real_gyros", "virtual_gyros", "window_s"]
 """What names a result."""
+
+COVERAGES = [metric_name(f"coverage_{sigmas}sigma", ALL) for sigmas in (1, 2)]
 
 CEILINGS = ["ceiling_rmse_dps", "ceiling_time_saving_pct", "ceiling_accuracy_gain_pct"]
 
@@ -46,10 +51,15 @@ def pool(
     """
     results: list[dict[str, Any]] = []
     means: dict[tuple[str, float], StoredRun] = {}
-    for cells in rows:
+    defaults: dict[tuple[str, float], pd.DataFrame] = {}
+    found_rows = [(cells, find_runs(cells, runs, settings)) for cells in rows]
+    for cells, found in found_rows:
+        if found and cells[0].estimator == DEFAULT:
+            defaults[cells[0].sensor, cells[0].window_s] = _errors(found)
+    for cells, stored in found_rows:
         cell = cells[0]
         key = cell.sensor, cell.window_s
-        found = find_runs(cells, runs, settings)
+        found = [replace(run, load=cache(run.load)) for run in stored]
         row = {name: getattr(cell, name) for name in ROW} | {"missing": None, "run_ids": None}
         if not found or (cell.estimator != MEAN and key not in means):
             results.append(row | {"missing": command_for(cells)})
@@ -57,8 +67,14 @@ def pool(
         if cell.estimator == MEAN:
             means[key] = found[0]
             row |= mean_row(found[0])
+            if key in defaults:
+                row |= differences(found, {DEFAULT: defaults[key]}, evaluation)
         else:
             row |= network_row(found, means[key], cell.window_s, evaluation)
+            if key in defaults:
+                references = {MEAN: _errors([means[key]]), DEFAULT: defaults[key]}
+                row |= differences(found, references, evaluation)
+        row |= {name: found[0].metrics.get(name) for name in COVERAGES}
         row["simulated"] = found[0].tags["simulated"] == "1"
         row["folds"] = int(found[0].params["folds"])
         row["run_ids"] = " ".join(run.run_id for run in found)
@@ -70,9 +86,9 @@ def command_for(cells: Sequence[Cell]) -> str:
     """The command that makes the runs of a row."""
     cell = cells[0]
     only = {"sensor": cell.sensor, "window_s": f"{cell.window_s:g}"}
-    if cell.estimator != MEAN:
+    if cell.estimator == CNN:
         only |= {"real_gyros": str(cell.real_gyros), "virtual_gyros": str(cell.virtual_gyros)}
-    if len(cells) == 1 and cell.estimator != MEAN:
+    if len(cells) == 1 and cell.estimator == CNN:
         only["seed"] = str(cell.seed)
     params = ",".join(f"only.{key}={value}" for key, value in only.items())
     return f"kedro run --pipeline={cell.study} --params={params}"
@@ -111,7 +127,7 @@ def find_runs(
         return []
     newest = max(chosen.values(), key=lambda run: run.started_ms)
     found = [r for r in chosen.values() if r.tags["data_hash"] == newest.tags["data_hash"]]
-    folds = 1 if cells[0].estimator == MEAN else int(newest.params["folds"])
+    folds = int(newest.params["folds"]) if cells[0].estimator == CNN else 1
     return found if len(found) == folds * len(cells) else []
 
 
@@ -151,7 +167,7 @@ def mean_row(mean: StoredRun) -> dict[str, Any]:
 def network_row(
     runs: Sequence[StoredRun], mean: StoredRun, window_s: float, evaluation: Evaluation
 ) -> dict[str, Any]:
-    """One row of a table: errors of all folds and seeds pooled, judged at the last epoch.
+    """One row of a table: errors of all folds and seeds pooled, networks at the last epoch.
 
     Args:
         runs: All seeds and folds.
@@ -196,6 +212,34 @@ def network_row(
             )
     limits = mean_row(mean)
     return row | {k: v for k, v in limits.items() if k.startswith(("ceiling", "recording_s"))}
+
+
+def differences(
+    runs: Sequence[StoredRun], references: Mapping[str, pd.DataFrame], evaluation: Evaluation
+) -> dict[str, Any]:
+    """RMSE less that of other estimators on the same windows, paired over recordings.
+
+    Over all windows, against the mean of the recording.
+
+    Args:
+        runs: All seeds and folds of the row.
+        references: Errors by the names of the others.
+        evaluation: Resamples and seed of the intervals.
+
+    Returns:
+        ``less_<name>_dps`` with its interval, ``_lo`` and ``_hi``.
+    """
+    own = squared_errors(_errors(runs), PAPER, ALL)
+    weights = resampled_weights(len(own.sums), evaluation.resamples, evaluation.bootstrap_seed)
+    row: dict[str, Any] = {}
+    for name, errors in references.items():
+        less = rmse_difference(own, squared_errors(errors, PAPER, ALL), weights)
+        row |= {f"less_{name}_dps{end}": value for end, value in _ends(less).items()}
+    return row
+
+
+def _ends(estimate: Estimate) -> dict[str, float | None]:
+    return {"": estimate.value, "_lo": estimate.lo, "_hi": estimate.hi}
 
 
 def pooled_curve(mean: StoredRun) -> pd.DataFrame:

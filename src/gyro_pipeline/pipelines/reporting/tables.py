@@ -19,13 +19,14 @@ from gyro_pipeline.conventions import (
     InputError,
     Missing,
 )
+from gyro_pipeline.estimators import DEFAULT, ESTIMATORS
 from gyro_pipeline.parameters import (
     Published,
     PublishedHours,
     PublishedResult,
     PublishedSpecification,
 )
-from gyro_pipeline.studies import CNN
+from gyro_pipeline.studies import CNN, MEAN
 
 logger = logging.getLogger(__name__)
 
@@ -60,6 +61,67 @@ def results_table(results: pd.DataFrame, elsewhere: pd.DataFrame) -> pd.DataFram
     table.insert(1, "source", [source_of(row) for _, row in made.iterrows()])
     logger.info("results\n%s", table.to_string(index=False, na_rep="–"))
     return table.assign(split=made.folds.map(_split), runs=made.run_ids.map(_short))
+
+
+def comparison(results: pd.DataFrame, elsewhere: pd.DataFrame) -> pd.DataFrame | Missing:
+    """Estimators side by side, over all windows against the mean of the recording.
+
+    Differences are of RMSEs on the same windows, with 95 % intervals over recordings; negative ones
+    are in favour of the row's estimator.
+
+    Args:
+        results: From ``pool_results``.
+        elsewhere: From ``pool_measured_elsewhere``.
+
+    Returns:
+        A row per sensor, source, window and estimator.
+    """
+    own = results[results.missing.isna()]
+    if own.empty:
+        return Missing(tuple(results.missing))
+    made = pd.concat([part for part in (own, elsewhere) if len(part)], ignore_index=True)
+    made["rank"] = made.estimator.map({name: i for i, name in enumerate(ESTIMATORS)})
+    made = made.sort_values(["sensor", "simulated", "source", "window_s", "rank"])
+    groups = made.groupby(["sensor", "source", "window_s"], sort=False)
+    rows = [_compared(row, group) for _, group in groups for _, row in group.iterrows()]
+    return pd.DataFrame(rows)
+
+
+def _compared(row: pd.Series, group: pd.DataFrame) -> dict[str, Any]:
+    mean = group[group.estimator == MEAN].test_rmse_dps_all.iloc[0]
+    known = ESTIMATORS[row.estimator]() if row.estimator in ESTIMATORS else None
+    return {
+        "Sensor": row.sensor,
+        "Source": source_of(row),
+        "Window s": row.window_s,
+        "Estimator": row.estimator,
+        "Recommended": "yes" if known and known.recommended else "no",
+        "Stored prior": "yes" if known is None or known.uses_prior else "no",
+        "RMSE mdps": round(row.test_rmse_dps_all / MDPS, 3),
+        "RMSE / running mean's": round(row.test_rmse_dps_all / mean, 3),
+        "Less running mean mdps": _difference(row, MEAN),
+        f"Less {DEFAULT} mdps": _difference(row, DEFAULT),
+        "Ceiling mdps": round(row.ceiling_rmse_dps_all / MDPS, 3),
+        "Within ±1σ %": _covered(row.coverage_1sigma_all),
+        "Within ±2σ %": _covered(row.coverage_2sigma_all),
+        "Recordings": int(group.recordings.max()),
+        "Split": _split(row.folds),
+        "Runs": _short(row.run_ids),
+    }
+
+
+def _covered(fraction: float | None) -> float | None:
+    return None if fraction is None else round(100 * fraction, 1)
+
+
+def _difference(row: pd.Series, name: str) -> str:
+    value, lo, hi = (row.get(f"less_{name}_dps{end}") for end in ("", "_lo", "_hi"))
+    if value is None or pd.isna(value) or name == row.estimator:
+        return "–"
+    ends = (
+        "" if lo is None or hi is None or pd.isna(lo) else f" [{lo / MDPS:+.3f}, {hi / MDPS:+.3f}]"
+    )
+    return f"{value / MDPS:+.3f}{ends}"
 
 
 def three_gyroscopes(results: pd.DataFrame, published: Published) -> pd.DataFrame | Missing:

@@ -11,6 +11,7 @@ import pandas as pd
 import xarray as xr
 
 from gyro_pipeline.conventions import AXES, TEST, TEST_IMU, TRAIN, VALIDATION, InputError
+from gyro_pipeline.estimators import ESTIMATORS
 from gyro_pipeline.fingerprints import code_hash, fingerprint
 from gyro_pipeline.learning import (
     batched,
@@ -28,7 +29,15 @@ from gyro_pipeline.learning.trainings import run_trainings
 from gyro_pipeline.parameters import Execution, Only, Splits, Study, Training, VirtualGyros
 from gyro_pipeline.protocol.splits import check_roles, refuse_two_roles, with_role
 from gyro_pipeline.protocol.windows import window_size
-from gyro_pipeline.studies import CNN_SHUFFLED, NETWORKS, Cell, over_folds, run_params, study_cells
+from gyro_pipeline.studies import (
+    CNN,
+    CNN_SHUFFLED,
+    NETWORKS,
+    Cell,
+    over_folds,
+    run_params,
+    study_cells,
+)
 from gyro_pipeline.tracking import FINGERPRINT, HISTORY, TRAINED_IN, WEIGHTS, StoredRun, TrainedRun
 
 logger = logging.getLogger(__name__)
@@ -77,6 +86,8 @@ def plan(
         if cell.estimator in NETWORKS:
             content |= {"training": training.model_dump(), "code": code}
             content |= {"roles": roles[roles.fold == cell.fold].role.tolist()}
+        else:
+            content |= {"tested": {fold: with_role(roles, fold, TEST) for fold in folds}}
         if cell.virtual_gyros and virtual is not None:
             content |= {"virtual": virtual.attrs["data_hash"]}
         hashed = fingerprint(content)
@@ -263,6 +274,11 @@ def check_cell(cell: Cell, recordings: xr.Dataset, training: Training) -> None:
     Raises:
         InputError: A window that does not fit, or IMUs that are not there.
     """
+    if cell.estimator not in (*NETWORKS, *ESTIMATORS):
+        raise InputError(
+            f"{cell.study}: unknown estimator {cell.estimator!r}; there are {CNN}, "
+            f"{', '.join(ESTIMATORS)}"
+        )
     samples, rate_hz = recordings.sizes["sample"], recordings.attrs["rate_hz"]
     size = window_size(cell.window_s, rate_hz, samples, cell.sensor)
     if cell.estimator in NETWORKS:
