@@ -266,8 +266,6 @@ def _is_dead(owner: str) -> bool:
 
 def _run_name(params: Mapping[str, Any]) -> str:
     """Readable at a glance in a list of runs."""
-    if params["estimator"] != "cnn":
-        return f"{params['sensor']} {params['estimator']} {params['window_s']:g} s"
     fold = f" fold {params['fold']}" if params["fold"] >= 0 else ""
     if "leak" in params:
         shuffled = " shuffled labels" if params["estimator"] == "cnn_shuffled" else ""
@@ -275,6 +273,8 @@ def _run_name(params: Mapping[str, Any]) -> str:
             f"{params['sensor']} leak {params['leak']}{shuffled} {params['window_s']:g} s every "
             f"{params['window_stride_s']:g} s seed {params['seed']}{fold}"
         )
+    if params["estimator"] != "cnn":
+        return f"{params['sensor']} {params['estimator']} {params['window_s']:g} s"
     return (
         f"{params['sensor']} {params['real_gyros']}+{params['virtual_gyros']} "
         f"{params['window_s']:g} s seed {params['seed']}{fold}"
