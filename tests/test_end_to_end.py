@@ -29,7 +29,7 @@ HYPER_PARAMETERS = {
 BASES = {
     "test_rmse_dps", "mean_rmse_dps", "equivalent_time_s", "time_saving_pct", "accuracy_gain_pct",
     "test_mse_dps2", "ceiling_rmse_dps", "ceiling_time_saving_pct", "ceiling_accuracy_gain_pct",
-    "beats_oracle_p",
+    "beats_oracle_p", "coverage_1sigma", "coverage_2sigma",
 }  # fmt: skip
 SUFFIXES = ["".join(parts) for parts in product(("", "_all"), ("", "_best"), ("", "_true"))]
 REPORTED = {

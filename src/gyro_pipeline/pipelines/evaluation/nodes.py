@@ -32,7 +32,7 @@ from gyro_pipeline.pipelines.evaluation.bench import (
 )
 from gyro_pipeline.pipelines.evaluation.folds import Fitted
 from gyro_pipeline.protocol import scores, truths, windows
-from gyro_pipeline.studies import CNN, MEAN
+from gyro_pipeline.studies import MEAN, NETWORKS
 from gyro_pipeline.tracking import (
     CURVE,
     ERRORS,
@@ -104,7 +104,7 @@ def evaluate(
 def _judge(run: StoredRun, bench: Bench, fitted: Fitted, judged_with: str) -> EvaluatedRun:
     artifacts = {}
     name = run.params["estimator"]
-    if name != CNN:
+    if name not in NETWORKS:
         judged: dict[str, Estimator] = {LAST: fitted.estimator(name)}
     else:
         stored = run.load(WEIGHTS)
