@@ -112,6 +112,7 @@ def test_coverage_on_memsense(leave_one_out, name, window_s):
     assert 0.90 <= np.mean(np.abs(errors) < 2 * sigma) <= 0.98
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "name"),
     [
@@ -122,11 +123,15 @@ def test_coverage_on_memsense(leave_one_out, name, window_s):
     ],
 )
 def test_coverage_on_a_thousand_simulated_recordings(simulate, judged, model, name):
-    made = simulate(model, 1080, seed=1)
-    estimator = ESTIMATORS[name]().fit(made.isel(recording=slice(80)))
-    errors, sigma = judged(estimator, made.isel(recording=slice(80, None)), 10)
-    assert 0.65 <= np.mean(np.abs(errors) < sigma) <= 0.72
-    assert 0.93 <= np.mean(np.abs(errors) < 2 * sigma) <= 0.97
+    """Of four devices: 80 recordings fix the spread of one, and so its sigma, to a tenth or so."""
+    ratios = []
+    for device in range(4):
+        made = simulate(model, 330, seed=device)
+        estimator = ESTIMATORS[name]().fit(made.isel(recording=slice(80)))
+        errors, sigma = judged(estimator, made.isel(recording=slice(80, None)), 10)
+        ratios.append(np.abs(errors) / sigma)
+    assert 0.65 <= np.mean(np.array(ratios) < 1) <= 0.72
+    assert 0.93 <= np.mean(np.array(ratios) < 2) <= 0.97
 
 
 @pytest.fixture(scope="module")

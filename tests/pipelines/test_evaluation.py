@@ -95,6 +95,25 @@ def test_errors_of_the_running_mean_are_those_computed_by_hand(world, bench):
     assert metrics["test_mse_dps2_all_disjoint"] == pytest.approx(honest)
 
 
+class Asked:
+    """Returns a number that tells which target it was asked for, and where the window is."""
+
+    def estimate(self, windows, target, start_s, recording):
+        told = {"recording_mean": 1000.0, "bias": 2000.0}[target] + start_s + 100 * recording
+        biases = np.tile(told[:, None], (1, 3))
+        return biases, np.full(biases.shape, np.nan)
+
+
+def test_an_estimator_is_asked_for_the_target_that_the_truth_is_about(world, simulated):
+    bench = Bench(simulated, device_of(world, simulated), (12,), WINDOW_S, world.evaluation)
+    errors = bench.errors(Asked())
+    truth = simulated.angular_rate.sel(imu=1, recording=12).mean("sample", dtype=np.float64)
+    for row in errors[errors.truth != DISJOINT].itertuples():
+        aim = float(truth.sel(axis=row.axis)) + (1e-4 if row.truth == TRUE else 0)
+        asked = {PAPER: 1000.0, TRUE: 2000.0}[row.truth] + WINDOW_S * row.window + 1200
+        assert row.error_dps == pytest.approx(asked - aim)
+
+
 def test_the_running_mean_gains_nothing_on_itself(bench):
     metrics = bench.metrics(bench.mean_errors, LAST)
     assert metrics["accuracy_gain_pct"] == 0
