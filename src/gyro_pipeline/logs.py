@@ -1,0 +1,91 @@
+"""Raw logs: the contract between the sources, the quality control and the raw-logs stage.
+
+A source lists its recordings without reading them; each is read where it is inspected, in whichever
+process that is, so that a few recordings are in memory at a time.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+KEPT, REPAIRED, REJECTED = "kept", "repaired", "rejected"
+"""How a finding, and a recording, can end."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that was noticed about a recording.
+
+    Attributes:
+        check: What looked, in two or three words, such as ``zero rows`` or ``sample rate``.
+        outcome: KEPT, REPAIRED or REJECTED.
+        detail: What was found, where (0-based data rows), and what was cut or why it cannot be
+            used; a sentence without a full stop.
+    """
+
+    check: str
+    outcome: str
+    detail: str
+
+
+@dataclass(frozen=True)
+class Log:
+    """One recording of one IMU, as its file has it.
+
+    Attributes:
+        samples: (n, 3), float64, deg/s; may hold NaN and infinity.
+        rate_hz: Measured from timestamps; None where there are none.
+        gap_rows: Rows before which samples are missing or out of order, increasing; a stretch
+            between two of them is gap-free.
+        temperature_c: (n,), degrees Celsius; None where the file has none.
+        findings: Of the reading.
+    """
+
+    samples: NDArray[np.float64]
+    rate_hz: float | None = None
+    gap_rows: NDArray[np.integer] = field(default_factory=lambda: np.empty(0, np.intp))
+    temperature_c: NDArray[np.float64] | None = None
+    findings: tuple[Finding, ...] = ()
+
+
+@dataclass(frozen=True)
+class LogEntry:
+    """A recording that a source lists.
+
+    Attributes:
+        imu: From 1.
+        recording: From 1.
+        where: For messages: the file, and where in it.
+        read: Reads it; can be pickled. Raises InputError where the file cannot be used.
+        split: ``train`` or ``test``, where the source came split.
+    """
+
+    imu: int
+    recording: int
+    where: str
+    read: Callable[[], Log]
+    split: str | None = None
+
+
+@dataclass(frozen=True)
+class Logs:
+    """What a source gives.
+
+    Attributes:
+        sensor: Its name.
+        source: Where the logs come from, as stored paths name it.
+        simulated: Whether they are.
+        rate_hz: Expected; measured ones are compared with it.
+        entries: The recordings, by IMU and number.
+        drawn: What was drawn for simulated recordings, to be stored with them.
+    """
+
+    sensor: str
+    source: str
+    simulated: bool
+    rate_hz: float
+    entries: Sequence[LogEntry]
+    drawn: xr.Dataset | None = None
