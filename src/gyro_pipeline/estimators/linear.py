@@ -50,7 +50,7 @@ class BestLinear:
     then that from unit to unit. Where fewer than three devices are known, the prior is flat.
 
     Args:
-        warm_up: Whether the sensor warms up.
+        warm_up: Whether the sensor warms up; None: if its recordings say so.
         noise: ``"reml"``: N, B and K fitted together with the prior; ``"allan"``: from the Allan
             fit, which does not know of warm-up.
         history: Whether the prior of a recording follows from the device's calibrations before
@@ -60,7 +60,9 @@ class BestLinear:
 
     uses_prior: ClassVar[bool] = True
 
-    def __init__(self, warm_up: bool = False, noise: str = "reml", history: bool = False) -> None:
+    def __init__(
+        self, warm_up: bool | None = False, noise: str = "reml", history: bool = False
+    ) -> None:
         if noise not in ("reml", "allan"):
             raise InputError(f"noise: expected 'reml' or 'allan', got {noise!r}")
         self.recommended = noise == "reml"  # the Allan fit knows nothing of warm-up
@@ -89,6 +91,11 @@ class BestLinear:
             ]
         self._estimates: dict[tuple[int, int, int, str, int | None], LinearEstimate] = {}
         return self
+
+    @property
+    def models(self) -> list[RecordingModel]:
+        """What was fitted, one for each axis."""
+        return self._axes
 
     def estimate(
         self,

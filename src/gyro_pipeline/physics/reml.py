@@ -17,6 +17,8 @@ everything to the mean. Therefore log tau + log s is added, the weak prior of Ch
 recordings nowhere else than without it.
 """
 
+from typing import Self
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, optimize
@@ -45,7 +47,7 @@ _TIME_CONSTANTS = (0.02, 0.1, 0.3, 1.0, 3.0)  # of the recording: limits, and wh
 def fit_recording_model(
     recordings: NDArray[np.floating],
     rate_hz: float,
-    warm_up: bool = False,
+    warm_up: bool | None = False,
     noise: NoiseFigures | None = None,
 ) -> RecordingModel:
     """Fit the model of one gyroscope to whole recordings.
@@ -53,7 +55,9 @@ def fit_recording_model(
     Args:
         recordings: (n, samples), deg/s, from power-on; no NaN.
         rate_hz: Samples per second.
-        warm_up: Whether there is one; its time constant is the same in all recordings.
+        warm_up: Whether there is one; its time constant is the same in all recordings. None: if
+            the recordings say so, by the Bayesian information criterion (Schwarz 1978, Annals of
+            Statistics 6).
         noise: Known N, B and K; fitted together with the rest if None.
 
     Returns:
@@ -69,15 +73,11 @@ def fit_recording_model(
             f"{len(recordings)}; with fewer, use an estimator without a prior"
         )
     samples = recordings.shape[-1]
-    likelihood = _Likelihood(recordings, rate_hz, warm_up, noise)
-    best = min(
-        (likelihood.maximise(share * samples / rate_hz) for share in _TIME_CONSTANTS[1:-1])
-        if warm_up
-        else [likelihood.maximise(np.inf)],
-        key=lambda result: result.fun,
-    )
-    figures, spreads, time_constant_s = likelihood.unpack(best.x)
-    _, mean, uncertainty = likelihood.deviance(best.x)
+    tried = [False, True] if warm_up is None else [warm_up]
+    fits = [_Likelihood(recordings, rate_hz, one, noise).fitted() for one in tried]
+    likelihood, x = min(fits, key=lambda fit: fit[0].criterion(fit[1]))
+    figures, spreads, time_constant_s = likelihood.unpack(x)
+    _, mean, uncertainty = likelihood.deviance(x)
     mean[0] += likelihood.offset
     covariance = np.diag(np.square(spreads)) + uncertainty
     fitted = noise or NoiseFigures(*map(float, figures))
@@ -176,6 +176,21 @@ class _Likelihood:
         deviance += np.linalg.slogdet(information)[1]
         deviance += np.sum((y - (z @ mean)[:, None]) ** 2) - 2 * np.log(spreads).sum()
         return float(deviance), mean, np.linalg.inv(information)
+
+    def criterion(self, x: NDArray[np.float64]) -> float:
+        """-2 times the log-likelihood, plus log n for each parameter, spreads and means."""
+        deviance, mean, uncertainty = self.deviance(x)
+        _, spreads, _ = self.unpack(x)
+        # without what restricts it and without the weak prior
+        deviance += np.linalg.slogdet(uncertainty)[1] + 2 * np.log(spreads).sum()
+        return float(deviance + (x.size + mean.size) * np.log(len(self.means)))
+
+    def fitted(self) -> tuple[Self, NDArray[np.float64]]:
+        """Itself, and where its restricted likelihood is largest."""
+        starts_s = [np.inf]
+        if self.warm_up:
+            starts_s = [share * self.duration_s for share in _TIME_CONSTANTS[1:-1]]
+        return self, min(map(self.maximise, starts_s), key=lambda result: result.fun).x
 
     def maximise(self, time_constant_s: float) -> optimize.OptimizeResult:
         """Search from the guess with this time constant."""
