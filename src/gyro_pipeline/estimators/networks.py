@@ -14,7 +14,7 @@ from gyro_pipeline.learning.perceptrons import Perceptrons, train_perceptrons
 from gyro_pipeline.physics.recording_model import innovations
 
 _FOLDS = 5
-_FEWEST = 2 * _FOLDS  # recordings to train a network on and to judge it by
+_FEWEST = 4 * _FOLDS  # recordings to train a network on and to judge it by
 _BLOCKS, _STARTS = 20, 40  # at most, of a window and of a recording
 _ERRORS = 2.0  # standard errors by which a correction must help
 
@@ -50,7 +50,7 @@ class ResidualNetwork:
     independent, and what a network learns is chance. So it never decides alone: recordings are
     dealt into five folds, a network is trained on each four, and the share of its output that
     helped on the fifth, less two standard errors over recordings, is the share that is added. Where
-    that is not positive the estimate is the linear one, as it is with fewer than ten recordings
+    that is not positive the estimate is the linear one, as it is with fewer than twenty recordings
     and for an unseen device.
 
     Its training windows begin at the multiples of the window's length and at random in between.
