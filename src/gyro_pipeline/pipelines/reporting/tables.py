@@ -196,7 +196,8 @@ def _result_table(
     wanted: Sequence[PublishedResult],
     elsewhere: pd.DataFrame | None = None,
 ) -> pd.DataFrame | Missing:
-    estimators = (CNN, RESIDUAL_NETWORK)
+    # a study may do without the second
+    estimators = [one for one in (CNN, RESIDUAL_NETWORK) if one in {CNN, *results.estimator}]
     ours = {one: [find_result(results, row, one) for row in wanted] for one in estimators}
     lacking = tuple(row.missing for rows in ours.values() for row in rows if pd.notna(row.missing))
     if lacking:
@@ -207,7 +208,7 @@ def _result_table(
         if elsewhere is not None:
             for one in estimators:
                 found[one] += measured_elsewhere(elsewhere, published, one)
-        residual = {row.source: row for row in found[RESIDUAL_NETWORK]}
+        residual = {row.source: row for row in found.get(RESIDUAL_NETWORK, [])}
         rows += [_result_row(published, row, residual.get(row.source)) for row in found[CNN]]
     return pd.DataFrame(rows)
 
