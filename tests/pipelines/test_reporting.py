@@ -572,6 +572,16 @@ def test_hours_are_counted(stored, published):
     assert table.loc["all", "Training recordings"] == counted
 
 
+def test_virtual_recordings_of_an_older_version_are_an_error_that_says_what_to_run(
+    stored, published
+):
+    older = stored["dot_virtual"].copy()
+    del older.attrs["train_recordings"]
+    command = r"kedro run --pipeline=virtual_gyros --params=only\.sensor=dot"
+    with pytest.raises(InputError, match=rf"virtual recordings of dot.*older version.*{command}"):
+        hours(stored, published, dot_virtual=older)
+
+
 def test_a_recording_less_is_hours_less(stored, published):
     before = hours(stored, published)
     shorter = stored["sparkfun_recordings"].drop_sel(recording=1)

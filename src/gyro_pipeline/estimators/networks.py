@@ -1,14 +1,13 @@
 """Small networks that know what statistics can do: one adds to it, one sees the mean alone."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Self
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from gyro_pipeline.conventions import BIAS, RECORDING_MEAN, TEST_IMU
-from gyro_pipeline.estimators.base import Estimates, check_target, known_imus, samples_of
+from gyro_pipeline.conventions import BIAS, RECORDING_MEAN
+from gyro_pipeline.estimators.base import FittedEstimator, Windows, known_imus, samples_of
 from gyro_pipeline.estimators.linear import BestLinear
 from gyro_pipeline.learning.perceptrons import Perceptrons, train_perceptrons
 from gyro_pipeline.physics.recording_model import innovations
@@ -40,7 +39,7 @@ class _Correction:
         return self.share * self.networks(inputs / self.scales)[..., 0].mean(axis=0)
 
 
-class ResidualNetwork:
+class ResidualNetwork(FittedEstimator):
     """The best linear predictor, plus what small networks find that it leaves.
 
     The linear predictor is optimal if noise is Gaussian and its model holds, so a network can add
@@ -57,56 +56,45 @@ class ResidualNetwork:
     Windows drawn from the fitted model without end would teach it 0: there the linear predictor is
     the conditional mean.
 
+    Other IMUs' windows train the networks as well, moved to this one's bias; which share is used is
+    decided on this one's.
+
     Args:
         warm_up: See :class:`BestLinear`; by default the recordings say.
     """
 
-    recommended: ClassVar[bool] = True
-    uses_prior: ClassVar[bool] = True
+    recommended = True
+    uses_prior = True
 
     def __init__(self, warm_up: bool | None = None) -> None:
         self._linear = BestLinear(warm_up=warm_up)
 
-    def fit(self, recordings: xr.Dataset, imu: int = TEST_IMU) -> Self:
-        """See :class:`~gyro_pipeline.estimators.FittedEstimator`.
-
-        Other IMUs' windows train the networks as well, moved to this one's bias; which share of
-        them is used is decided on this one's.
-
-        Raises:
-            InputError: Fewer than three training recordings.
-        """
+    def _fit(self, recordings: xr.Dataset, imu: int) -> None:
         self._linear.fit(recordings, imu)
         self._rates = []
         if known_imus(recordings, imu) == [imu]:
             others = [int(one) for one in recordings.imu if one != imu]
             self._rates = [samples_of(recordings, one) for one in (imu, *others)]
         self._corrections: dict[int, _Correction | None] = {}
-        return self
 
-    def estimate(
-        self,
-        windows: NDArray[np.floating],
-        target: str = BIAS,
-        start_s: ArrayLike = 0.0,
-        recording: int | None = None,
-    ) -> Estimates:
-        """See :class:`~gyro_pipeline.estimators.Estimator`."""
-        bias, sigma = self._linear.estimate(windows, target, start_s, recording)
-        correction = self._correction(windows.shape[-1])
+    def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
+        rates, place = windows.samples, (windows.start_s, windows.recording)
+        bias, sigma = self._linear.estimate(rates, windows.target, *place)
+        correction = self._correction(rates.shape[-1])
         if correction is None:
             return bias, sigma
-        model = self._linear.models[0]
-        starts = np.broadcast_to(np.rint(np.asarray(start_s) * model.rate_hz), len(windows))
-        _, unit = self._linear.estimate(windows, RECORDING_MEAN, start_s, recording)
-        for start in np.unique(starts.astype(int)):
+        _, unit = self._linear.estimate(rates, RECORDING_MEAN, *place)
+        starts = np.rint(windows.start_s * self._rate_hz).astype(int)
+        added = np.empty(bias.shape)
+        for start in np.unique(starts):
             chosen = starts == start
-            inputs = self._inputs(windows[chosen].swapaxes(0, 1), int(start))
-            added = correction(inputs.reshape(-1, inputs.shape[-1])).reshape(inputs.shape[:2])
-            # the samples outside the window carry it all
-            outside = 1 - windows.shape[-1] / model.samples if target == BIAS else 1.0
-            bias[chosen] += added.T * unit[chosen] / outside
-        return bias, sigma * correction.sigma
+            inputs = self._inputs(rates[chosen].swapaxes(0, 1), int(start))
+            found = correction(inputs.reshape(-1, inputs.shape[-1]))
+            added[chosen] = found.reshape(inputs.shape[:2]).T * unit[chosen]
+        # the samples outside the window carry it all
+        outside = 1 - rates.shape[-1] / self._linear.models[0].samples
+        share = 1 / outside if windows.target == BIAS else 1.0
+        return bias + share * added, sigma * correction.sigma
 
     def _correction(self, size: int) -> _Correction | None:
         """Trained once for each length of window; None where nothing is to be added."""
@@ -168,40 +156,29 @@ class ResidualNetwork:
         return np.pad(np.stack(found), ((0, 0), (0, 0), (0, 1)), constant_values=began)
 
 
-class WindowMeanNetwork:
+class WindowMeanNetwork(FittedEstimator):
     """A small network that is fed the mean of the window alone.
 
     If it equals the paper's network, that one has learned nothing from the samples but their mean.
     """
 
-    recommended: ClassVar[bool] = False
-    uses_prior: ClassVar[bool] = True
+    uses_prior = True
 
-    def fit(self, recordings: xr.Dataset, imu: int = TEST_IMU) -> Self:
-        """See :class:`~gyro_pipeline.estimators.FittedEstimator`."""
+    def _fit(self, recordings: xr.Dataset, imu: int) -> None:
         known = [samples_of(recordings, one) for one in known_imus(recordings, imu)]
         self._rates = np.concatenate(known)
         self._means = self._rates.mean(axis=-1, dtype=np.float64)
         self._centre = self._means.mean(axis=0)
         self._networks: dict[int, tuple[Perceptrons, float]] = {}
-        return self
 
-    def estimate(
-        self,
-        windows: NDArray[np.floating],
-        target: str = BIAS,
-        start_s: ArrayLike = 0.0,
-        recording: int | None = None,
-    ) -> Estimates:
-        """See :class:`~gyro_pipeline.estimators.Estimator`; sigma is NaN."""
-        check_target(target)
-        size = windows.shape[-1]
+    def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
+        size = windows.samples.shape[-1]
         if size not in self._networks:
             self._networks[size] = self._train(size)
         networks, scale = self._networks[size]
-        means = (windows.mean(axis=-1, dtype=np.float64) - self._centre) / scale
-        outputs = np.split(networks(means)[0], 2, axis=1)[target == BIAS]
-        return self._centre + scale * outputs, np.full(means.shape, np.nan)
+        means = (windows.samples.mean(axis=-1, dtype=np.float64) - self._centre) / scale
+        outputs = np.split(networks(means)[0], 2, axis=1)[windows.target == BIAS]
+        return self._centre + scale * outputs, np.nan
 
     def _train(self, size: int) -> tuple[Perceptrons, float]:
         """A network with the mean of the recording, then that outside the window, as its aims."""

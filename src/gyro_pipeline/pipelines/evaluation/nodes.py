@@ -33,13 +33,13 @@ from gyro_pipeline.pipelines.evaluation.bench import (
     test_recordings,
 )
 from gyro_pipeline.pipelines.evaluation.folds import Fitted
+from gyro_pipeline.pipelines.evaluation.waiting import waiting
 from gyro_pipeline.protocol import scores, truths, windows
 from gyro_pipeline.studies import MEAN, NETWORKS
 from gyro_pipeline.tracking import (
     CURVE,
     ERRORS,
     EVALUATED_WITH,
-    FINGERPRINT,
     WEIGHTS,
     EvaluatedRun,
     StoredRun,
@@ -80,29 +80,17 @@ def evaluate(
     Yields:
         Metrics and per-window errors, to be added to each run.
     """
-    trained = {run.fingerprint: run for run in reversed(runs)}
     fitted = Fitted(recordings, roles, virtual)
     judged_with = fingerprint([code_hash(_CODE), evaluation.model_dump()])
     seed = evaluation.bootstrap_seed
     device = describe_device(recordings, bias, allan, known_recordings(roles), seed)
     benches: dict[tuple[float, int], Bench] = {}
-    skipped = 0
-    for cell in cells.to_dict("records"):
-        run = trained[cell[FINGERPRINT]]
-        if run.finished and run.tags.get(EVALUATED_WITH) == judged_with:
-            skipped += 1
-            continue
+    for cell, run in waiting(cells, runs, judged_with, recordings.attrs["sensor"]):
         key = cell["window_s"], cell["fold"]
         if key not in benches:
             numbers = test_recordings(roles, cell["fold"])
             benches[key] = Bench(recordings, device, numbers, cell["window_s"], evaluation)
         yield _judge(run, benches[key], fitted, judged_with)
-    logger.info(
-        "%s: %d runs evaluated, %d skipped",
-        recordings.attrs["sensor"],
-        len(cells) - skipped,
-        skipped,
-    )
 
 
 def _judge(run: StoredRun, bench: Bench, fitted: Fitted, judged_with: str) -> EvaluatedRun:

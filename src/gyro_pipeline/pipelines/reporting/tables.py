@@ -350,7 +350,7 @@ def _hours(
     if published.virtual:
         recordings = stored[f"{sensor}_virtual"]
         train = _gyroscope_recordings(recordings) & (
-            recordings.recording <= recordings.attrs["train_recordings"]
+            recordings.recording <= _train_recordings(recordings, sensor)
         )
         test = xr.zeros_like(train)
     else:
@@ -381,6 +381,17 @@ def _hours(
         "_lo": fast,
         "_hi": slow,
     }
+
+
+def _train_recordings(virtual: xr.Dataset, sensor: str) -> int:
+    """How many virtual recordings train, as their file says."""
+    if "train_recordings" not in virtual.attrs:
+        raise InputError(
+            f"virtual recordings of {sensor}: expected the attribute train_recordings, got a file "
+            "without it, of an older version; make it anew: kedro run --pipeline=virtual_gyros "
+            f"--params=only.sensor={sensor}"
+        )
+    return int(virtual.attrs["train_recordings"])
 
 
 def _gyroscope_recordings(recordings: xr.Dataset) -> xr.DataArray:
