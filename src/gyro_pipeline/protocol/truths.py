@@ -7,6 +7,8 @@ import numpy as np
 import pandas as pd
 
 from gyro_pipeline.conventions import ALL, AXES, DISJOINT, FIRST, PAPER, TRUE
+from gyro_pipeline.physics.allan import NoiseFigures
+from gyro_pipeline.physics.recording_model import outside_noise
 
 CURVE_STEP_S = 0.25
 """Resolution of the running-mean curve; the equivalent time is interpolated between points."""
@@ -23,14 +25,14 @@ class TestRecording:
         number: Recording number.
         samples: Shape (3, n), deg/s.
         rate_hz: Sample rate, Hz.
-        noise: N per axis from training recordings (drawn, if simulated), (3,), deg/s sqrt(s).
+        noise: N, B and K of each axis from training recordings, or as drawn if simulated.
         true_bias: Drawn bias, shape (3,), deg/s; None on measured data.
     """
 
     number: int
     samples: np.ndarray
     rate_hz: float
-    noise: np.ndarray
+    noise: tuple[NoiseFigures, ...]
     true_bias: np.ndarray | None
 
     @cached_property
@@ -48,22 +50,27 @@ class TestRecording:
         """The truth for every window, with that truth's own averaging variance.
 
         ``PAPER``, the mean of the whole recording, counts as exact (the paper's definition).
-        ``DISJOINT``, the mean of the samples outside the window, is off by N^2 / (T - T0), which
-        is to be taken off the squared error. ``TRUE`` is the drawn bias of simulated data.
+        ``DISJOINT``, the mean of the samples outside the window, has an averaging noise of its own,
+        N^2 / (T - T0) if it is white, which is to be taken off the squared error. If noise is
+        coloured, what window and truth share stays in it. ``TRUE`` is the drawn bias of simulated
+        data.
 
         Args:
             size: Samples per window.
 
         Returns:
-            For each truth its value, shape (windows, 3) in deg/s, and variance, shape (3,).
+            For each truth its value in deg/s and its variance, both of shape (windows, 3).
         """
         n = self.samples.shape[-1]
         sums, total = self.window_sums(size), self.running_sums[:, -1]
-        exact = np.zeros(len(AXES))
+        exact = np.zeros(sums.shape)
         truths = {PAPER: (np.broadcast_to(total / n, sums.shape), exact)}
         if size < n:
-            variance = self.noise**2 * self.rate_hz / (n - size)
-            truths[DISJOINT] = ((total - sums) / (n - size), variance)
+            variance = [
+                [outside_noise(axis, n, self.rate_hz, window * size, size) for axis in self.noise]
+                for window in range(len(sums))
+            ]
+            truths[DISJOINT] = ((total - sums) / (n - size), np.array(variance))
         if self.true_bias is not None:
             truths[TRUE] = (np.broadcast_to(self.true_bias, sums.shape), exact)
         return truths
@@ -94,7 +101,7 @@ def error_table(
                 "axis": np.tile(AXES, n),
                 "truth": truth,
                 "error_dps": (estimates - value).ravel(),
-                "truth_variance": np.tile(variance, n),
+                "truth_variance": variance.ravel(),
                 **stated,
             }
         )

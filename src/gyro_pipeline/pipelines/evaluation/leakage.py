@@ -92,7 +92,7 @@ def _judged(run: StoredRun, bench: Bench, divided: Division, judged_with: str) -
     scored = {f"{base}_strided": estimate for base, estimate in scored.items()}
     metrics = {
         name: value
-        for base, estimate in (scored | bench.ceilings(PAPER)).items()
+        for base, estimate in (scored | bench.ceilings(PAPER, ALL)).items()
         for name, value in (
             (base, estimate.value),
             (f"{base}_lo", estimate.lo),
@@ -131,7 +131,7 @@ def strided_error_table(estimator: Estimator, bench: Bench, divided: Division) -
         seen = cut_windows(one.samples, bench.size, starts).transpose(1, 0, 2)
         estimated, _ = estimator.estimate(seen, RECORDING_MEAN)
         estimates = {"": estimated, "mean_": means, "constant_": constant}
-        if device.unit_bias is not None and device.white:
+        if device.unit_bias is not None and device.models is None:
             known = (device.unit_bias, device.spread[0], device.noise[0])
             estimates["oracle_"] = oracle(means, *known, bench.window_s, bench.recording_s, PAPER)
         of = {"recording": one.number, "start": np.repeat(starts, len(AXES))}
