@@ -149,8 +149,8 @@ def refusal(server, path, blob=None):
 
 
 def left(path):
-    """Files in its folder; locks are empty, and their being there says nothing."""
-    return sorted(one.name for one in path.parent.iterdir() if one.suffix != ".lock")
+    """Files in its folder; the lock is empty, and its being there says nothing."""
+    return sorted(one.name for one in path.parent.iterdir() if one.name != ".lock")
 
 
 # fetching

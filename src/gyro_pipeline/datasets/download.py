@@ -1,6 +1,6 @@
 """Files from a public git repository: whole and verified under their name, or not there at all.
 
-Why requests and tenacity: docs/decisions/0009-download-of-the-published-files.md.
+Why requests and tenacity: docs/decisions/0010-download-of-the-published-files.md.
 """
 
 import hashlib
@@ -43,7 +43,7 @@ def ensure(url: str, path: Path, blob: str) -> None:
     """See that a file is there and is the published one; fetch it only where it is not there.
 
     What was fetched before an interruption is kept beside it and continued, also by a later run.
-    A second process that wants the same file waits for the first.
+    A second process that fetches into the same folder waits for the first.
 
     Args:
         url: Where it is published.
@@ -92,7 +92,7 @@ def _fetch(url: str, path: Path, blob: str) -> None:
     """Put a file in its place once all of it is there and is the right one."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = _part_of(path)
-    with FileLock(part.with_suffix(".lock")):
+    with FileLock(path.with_name(".lock")):
         if path.exists():  # another process was first
             return
         _append_rest(url, part)
@@ -106,7 +106,6 @@ def _fetch(url: str, path: Path, blob: str) -> None:
                 f"file: correct published_address, or put the right one at {path} by hand"
             )
         os.replace(part, path)
-        _LOG.info("fetched and verified: %s", path)
 
 
 def _part_of(path: Path) -> Path:
@@ -162,7 +161,7 @@ def _check_status(answer: requests.Response, part: Path) -> None:
     if code in (_OK, _PART):
         return
     said = f"the server answered {code} {answer.reason}"
-    if code == _NO_SUCH_PART:  # what is there is as long as the file, and was not found to be it
+    if code == _NO_SUCH_PART:  # as long as the file or longer, so not the beginning of it
         part.unlink()
     if code in (_NO_SUCH_PART, _TOO_MANY_REQUESTS) or code >= _SERVER_ERRORS:
         raise _Passing(said)
