@@ -1,5 +1,6 @@
 """The one interface of all estimators, and what they share."""
 
+from dataclasses import dataclass
 from typing import Protocol, Self
 
 import numpy as np
@@ -52,8 +53,34 @@ class Estimator(Protocol):
         """
 
 
-class FittedEstimator(Estimator, Protocol):
-    """An estimator that learns from training recordings."""
+@dataclass(frozen=True)
+class Windows:
+    """What :meth:`Estimator.estimate` is asked, with a start for every window.
+
+    Attributes:
+        samples: (n, gyroscopes, samples), deg/s.
+        target: BIAS or RECORDING_MEAN.
+        start_s: (n,), seconds after power-on.
+        recording: Number of the recording, or None.
+    """
+
+    samples: NDArray[np.floating]
+    target: str
+    start_s: NDArray[np.float64]
+    recording: int | None
+
+
+class FittedEstimator:
+    """Base of the estimators that learn from training recordings.
+
+    A subclass gives ``_estimate``, ``_fit`` if it learns more than the rate and the length of
+    recordings, and the two marks of :class:`Estimator`.
+    """
+
+    recommended = False
+    uses_prior = False
+    _rate_hz = np.nan
+    _recording_s = np.nan
 
     def fit(self, recordings: xr.Dataset, imu: int = TEST_IMU) -> Self:
         """Learn from training recordings, and from nothing else.
@@ -66,17 +93,41 @@ class FittedEstimator(Estimator, Protocol):
         Returns:
             Itself.
         """
+        self._rate_hz = float(recordings.attrs["rate_hz"])
+        self._recording_s = duration_s(recordings)
+        self._fit(recordings, imu)
+        return self
+
+    def estimate(
+        self,
+        windows: NDArray[np.floating],
+        target: str = BIAS,
+        start_s: ArrayLike = 0.0,
+        recording: int | None = None,
+    ) -> Estimates:
+        """See :class:`Estimator`.
+
+        Raises:
+            InputError: An unknown target.
+        """
+        if target not in (RECORDING_MEAN, BIAS):
+            raise InputError(f"target: expected {RECORDING_MEAN!r} or {BIAS!r}, got {target!r}")
+        starts = np.broadcast_to(np.asarray(start_s, np.float64), len(windows))
+        biases, sigma = self._estimate(Windows(windows, target, starts, recording))
+        shape = windows.shape[:2]
+        return np.broadcast_to(biases, shape), np.broadcast_to(sigma, shape)
+
+    def _fit(self, recordings: xr.Dataset, imu: int) -> None:
+        """Nothing to learn."""
+
+    def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
+        """Biases and their sigma, of any shapes that broadcast to (n, gyroscopes)."""
+        raise NotImplementedError
 
 
 ORIENTATION_NOTE = (
     "uses a stored prior, which holds only in the orientation and at the latitude it was learned in"
 )
-
-
-def check_target(target: str) -> None:
-    """Refuse an unknown target."""
-    if target not in (RECORDING_MEAN, BIAS):
-        raise InputError(f"target: expected {RECORDING_MEAN!r} or {BIAS!r}, got {target!r}")
 
 
 def samples_of(recordings: xr.Dataset, imu: int) -> NDArray[np.floating]:

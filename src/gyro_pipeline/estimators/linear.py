@@ -1,16 +1,15 @@
 """Linear estimators on block means: the best linear predictor, and ridge regression."""
 
 from dataclasses import replace
-from typing import ClassVar, Self
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from gyro_pipeline.conventions import BIAS, PAPER, RECORDING_MEAN, TEST_IMU, TRUE, InputError
+from gyro_pipeline.conventions import BIAS, PAPER, RECORDING_MEAN, TRUE, InputError
 from gyro_pipeline.estimators.base import (
-    Estimates,
-    check_target,
+    FittedEstimator,
+    Windows,
     known_imus,
     labels_of,
     samples_of,
@@ -34,7 +33,7 @@ _FLAT = 1e6
 _PENALTIES, _FOLDS = 41, 10
 
 
-class BestLinear:
+class BestLinear(FittedEstimator):
     """The best linear predictor under the fitted noise and prior, axis by axis.
 
     White noise, bias instability, rate random walk, the turn-on spread and, if asked for, a
@@ -50,29 +49,28 @@ class BestLinear:
     then that from unit to unit. Where fewer than three devices are known, the prior is flat.
 
     Args:
-        warm_up: Whether the sensor warms up.
+        warm_up: Whether the sensor warms up; None: if its recordings say so.
         noise: ``"reml"``: N, B and K fitted together with the prior; ``"allan"``: from the Allan
             fit, which does not know of warm-up.
         history: Whether the prior of a recording follows from the device's calibrations before
             it, in their order (:mod:`gyro_pipeline.physics.history`). For a bias that drifts from
             one recording to the next.
+
+    Fitting needs three training recordings at least.
     """
 
-    uses_prior: ClassVar[bool] = True
+    uses_prior = True
 
-    def __init__(self, warm_up: bool = False, noise: str = "reml", history: bool = False) -> None:
+    def __init__(
+        self, warm_up: bool | None = False, noise: str = "reml", history: bool = False
+    ) -> None:
         if noise not in ("reml", "allan"):
             raise InputError(f"noise: expected 'reml' or 'allan', got {noise!r}")
         self.recommended = noise == "reml"  # the Allan fit knows nothing of warm-up
         self._warm_up, self._noise, self._history = warm_up, noise, history
 
-    def fit(self, recordings: xr.Dataset, imu: int = TEST_IMU) -> Self:
-        """See :class:`~gyro_pipeline.estimators.FittedEstimator`.
-
-        Raises:
-            InputError: Fewer than three training recordings.
-        """
-        known, rate_hz = known_imus(recordings, imu), float(recordings.attrs["rate_hz"])
+    def _fit(self, recordings: xr.Dataset, imu: int) -> None:
+        known, rate_hz = known_imus(recordings, imu), self._rate_hz
         seen = known == [imu]
         rates = np.concatenate([samples_of(recordings, one) for one in known])
         axes = range(rates.shape[1])
@@ -88,26 +86,22 @@ class BestLinear:
                 BiasHistory.fit(numbers, labels[:, a], model) for a, model in enumerate(fits)
             ]
         self._estimates: dict[tuple[int, int, int, str, int | None], LinearEstimate] = {}
-        return self
 
-    def estimate(
-        self,
-        windows: NDArray[np.floating],
-        target: str = BIAS,
-        start_s: ArrayLike = 0.0,
-        recording: int | None = None,
-    ) -> Estimates:
-        """See :class:`~gyro_pipeline.estimators.Estimator`."""
-        check_target(target)
-        rate_hz, size = self._axes[0].rate_hz, windows.shape[-1]
-        starts = np.broadcast_to(np.rint(np.asarray(start_s) * rate_hz).astype(int), len(windows))
-        biases = np.empty(windows.shape[:2])
-        sigma = np.empty(windows.shape[:2])
+    @property
+    def models(self) -> list[RecordingModel]:
+        """What was fitted, one for each axis."""
+        return self._axes
+
+    def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
+        rates, starts = windows.samples, np.rint(windows.start_s * self._rate_hz).astype(int)
+        biases = np.empty(rates.shape[:2])
+        sigma = np.empty(rates.shape[:2])
         for start in np.unique(starts):
             chosen = starts == start
-            for axis in range(windows.shape[1]):
-                best = self._best(axis, int(start), size, target, recording)
-                biases[chosen, axis] = best(windows[chosen, axis])
+            place = int(start), rates.shape[-1], windows.target, windows.recording
+            for axis in range(rates.shape[1]):
+                best = self._best(axis, *place)
+                biases[chosen, axis] = best(rates[chosen, axis])
                 sigma[chosen, axis] = np.sqrt(best.variance)
         return biases, sigma
 
@@ -133,7 +127,7 @@ def _of_unseen(model: RecordingModel, devices: int) -> RecordingModel:
     return replace(model, covariance=covariance)
 
 
-class Ridge:
+class Ridge(FittedEstimator):
     """Ridge regression of the target on the block means of the window.
 
     It knows no model: one regression per axis, from all non-overlapping training windows, towards
@@ -145,39 +139,27 @@ class Ridge:
             time after power-on, which a sensor that warms up needs.
     """
 
-    recommended: ClassVar[bool] = False
-    uses_prior: ClassVar[bool] = True
+    uses_prior = True
 
     def __init__(self, same_time: bool = False) -> None:
         self._same_time = same_time
 
-    def fit(self, recordings: xr.Dataset, imu: int = TEST_IMU) -> Self:
-        """See :class:`~gyro_pipeline.estimators.FittedEstimator`."""
-        self._rate_hz = float(recordings.attrs["rate_hz"])
+    def _fit(self, recordings: xr.Dataset, imu: int) -> None:
         known = [samples_of(recordings, one) for one in known_imus(recordings, imu)]
         self._rates = np.concatenate(known)
         self._means = self._rates.mean(axis=-1, dtype=np.float64)
-        self._lines: dict[tuple[int, int | None, int, str], LinearEstimate] = {}
-        return self
+        self._lines: dict[tuple[int, int, int, str], LinearEstimate] = {}
 
-    def estimate(
-        self,
-        windows: NDArray[np.floating],
-        target: str = BIAS,
-        start_s: ArrayLike = 0.0,
-        recording: int | None = None,
-    ) -> Estimates:
-        """See :class:`~gyro_pipeline.estimators.Estimator`; sigma is NaN."""
-        check_target(target)
-        starts = np.rint(np.asarray(start_s) * self._rate_hz).astype(int)
-        starts = np.broadcast_to(starts if self._same_time else 0, len(windows))
-        biases = np.empty(windows.shape[:2])
+    def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
+        rates = windows.samples
+        starts = np.rint(windows.start_s * self._rate_hz * self._same_time).astype(int)
+        biases = np.empty(rates.shape[:2])
         for start in np.unique(starts):
             chosen = starts == start
-            for axis in range(windows.shape[1]):
-                line = self._line(axis, int(start), windows.shape[-1], target)
-                biases[chosen, axis] = line(windows[chosen, axis])
-        return biases, np.full(biases.shape, np.nan)
+            for axis in range(rates.shape[1]):
+                line = self._line(axis, int(start), rates.shape[-1], windows.target)
+                biases[chosen, axis] = line(rates[chosen, axis])
+        return biases, np.nan
 
     def _line(self, axis: int, start: int, size: int, target: str) -> LinearEstimate:
         key = axis, start, size, target

@@ -1,59 +1,34 @@
 """Estimators that know the device's past: a constant, the last calibration, empirical Bayes."""
 
-from typing import ClassVar, Self
-
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from gyro_pipeline.conventions import BIAS, RECORDING_MEAN, TEST_IMU
-from gyro_pipeline.estimators.base import (
-    Estimates,
-    check_target,
-    duration_s,
-    known_imus,
-    labels_of,
-)
+from gyro_pipeline.conventions import BIAS, RECORDING_MEAN
+from gyro_pipeline.estimators.base import FittedEstimator, Windows, known_imus, labels_of
 from gyro_pipeline.estimators.noise import white_noise
 from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, guarded_spread
 
 
-class TrainingMean:
+class TrainingMean(FittedEstimator):
     """The mean of the training recordings' means: a constant that ignores the window.
 
     For an unseen device it is the mean of the others, which is worth nothing; that is the point.
     """
 
-    recommended: ClassVar[bool] = False
-    uses_prior: ClassVar[bool] = True
+    uses_prior = True
 
-    def fit(self, recordings: xr.Dataset, imu: int = TEST_IMU) -> Self:
-        """See :class:`~gyro_pipeline.estimators.FittedEstimator`."""
-        self._learn(recordings, imu)
+    def _fit(self, recordings: xr.Dataset, imu: int) -> None:
         self._noise = white_noise(recordings, imu)
-        self._recording_s = duration_s(recordings)
-        return self
-
-    def _learn(self, recordings: xr.Dataset, imu: int) -> None:
         known = [labels_of(recordings, one) for one in known_imus(recordings, imu)]
         self._numbers = np.concatenate([numbers for numbers, _ in known])
         self._labels = np.concatenate([means for _, means in known])
 
-    def estimate(
-        self,
-        windows: NDArray[np.floating],
-        target: str = BIAS,
-        start_s: ArrayLike = 0.0,
-        recording: int | None = None,
-    ) -> Estimates:
-        """See :class:`~gyro_pipeline.estimators.Estimator`."""
-        check_target(target)
-        biases, of_estimate = self.constant(recording)
+    def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
+        biases, of_estimate = self.constant(windows.recording)
         scatter = self._labels.var(axis=0, ddof=1) if len(self._labels) > 1 else np.nan
-        own = self._noise**2 / self._recording_s if target == BIAS else 0.0
-        sigma = np.sqrt(np.maximum(scatter - own, 0.0) + of_estimate * scatter)
-        shape = len(windows), self._labels.shape[1]
-        return np.broadcast_to(biases, shape), np.broadcast_to(sigma, shape)
+        own = self._noise**2 / self._recording_s if windows.target == BIAS else 0.0
+        return biases, np.sqrt(np.maximum(scatter - own, 0.0) + of_estimate * scatter)
 
     def constant(self, recording: int | None) -> tuple[NDArray[np.float64], float]:
         """The estimate (3,), and its own variance in units of the scatter of the labels."""
@@ -68,8 +43,8 @@ class LastCalibration(TrainingMean):
     training mean of the others.
     """
 
-    def _learn(self, recordings: xr.Dataset, imu: int) -> None:
-        super()._learn(recordings, imu)
+    def _fit(self, recordings: xr.Dataset, imu: int) -> None:
+        super()._fit(recordings, imu)
         if known_imus(recordings, imu) != [imu]:
             self._numbers = np.full(self._numbers.shape, np.inf)
 
@@ -81,7 +56,7 @@ class LastCalibration(TrainingMean):
         return self._labels[past][-1], 1.0
 
 
-class EmpiricalBayes:
+class EmpiricalBayes(FittedEstimator):
     """The posterior mean of the bias under a prior learned from training recordings.
 
     The bias of a power-on is Normal(mu, tau^2) and the noise white. With N from the Allan fit, mu
@@ -103,22 +78,18 @@ class EmpiricalBayes:
             alike, worse where they are not, as on the public Memsense recordings.
     """
 
-    uses_prior: ClassVar[bool] = True
+    uses_prior = True
 
     def __init__(self, pooled: bool = False) -> None:
         self.recommended = not pooled
         self._pooled = pooled
 
-    def fit(self, recordings: xr.Dataset, imu: int = TEST_IMU) -> Self:
-        """See :class:`~gyro_pipeline.estimators.FittedEstimator`."""
+    def _fit(self, recordings: xr.Dataset, imu: int) -> None:
         self._noise = white_noise(recordings, imu)
-        self._rate_hz = float(recordings.attrs["rate_hz"])
-        self._recording_s = duration_s(recordings)
         labels, averaging = self._labels(recordings, imu)
         self._mean = labels.mean(axis=0)
         scatter = self._spread(recordings, labels, averaging) ** 2
         self._prior = scatter + (scatter + averaging) / len(labels)
-        return self
 
     def _labels(
         self, recordings: xr.Dataset, imu: int
@@ -153,22 +124,14 @@ class EmpiricalBayes:
             return np.inf
         return guarded_spread(*map(np.concatenate, (scatter, freedom, averaging)))
 
-    def estimate(
-        self,
-        windows: NDArray[np.floating],
-        target: str = BIAS,
-        start_s: ArrayLike = 0.0,
-        recording: int | None = None,
-    ) -> Estimates:
-        """See :class:`~gyro_pipeline.estimators.Estimator`."""
-        check_target(target)
-        means = windows.mean(axis=-1, dtype=np.float64)
-        window_s = windows.shape[-1] / self._rate_hz
+    def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
+        means = windows.samples.mean(axis=-1, dtype=np.float64)
+        window_s = windows.samples.shape[-1] / self._rate_hz
         averaging = self._noise**2 / window_s
         beta = 1 / (1 + averaging / self._prior)
-        r = window_s / self._recording_s if target == RECORDING_MEAN else 0.0
+        r = window_s / self._recording_s if windows.target == RECORDING_MEAN else 0.0
         variance = (1 - r) ** 2 * beta * averaging
-        if target == RECORDING_MEAN:  # and what the rest of the recording is off from the bias
+        if windows.target == RECORDING_MEAN:  # and what the rest is off from the bias
             variance += (1 - r) * self._noise**2 / self._recording_s
         biases = r * means + (1 - r) * (self._mean + beta * (means - self._mean))
-        return biases, np.broadcast_to(np.sqrt(variance), biases.shape)
+        return biases, np.sqrt(variance)
