@@ -515,7 +515,10 @@ SMALL = {"sparkfun": ("sf", 4), "dot": ("dots", 4), "ng": ("ng", 2), "memsense":
 def made_up(server, new_project):
     """A project whose environment ``published`` asks for the blob ids of small files."""
     project = new_project(with_store=False)
-    catalog = project.folder / "conf/published/catalog.yml"
+    conf = project.folder / "conf/published"
+    sensors = dict.fromkeys(SMALL, {"samples": 1300})  # a tenth of the rate
+    (conf / "globals.yml").write_text(f"source: published_all\nsensors: {sensors}\n")
+    catalog = conf / "catalog.yml"
     text = catalog.read_text()
     for name, imus in SMALL.values():
         for split, recordings, gyroscopes in (("train", 5, 3 * imus), ("test", 2, 3)):
