@@ -116,7 +116,13 @@ def _part_of(path: Path) -> Path:
 def _say(state: RetryCallState) -> None:
     error = state.outcome.exception() if state.outcome else None
     wait_s = state.next_action.sleep if state.next_action else 0
-    _LOG.warning("%s; trying again in %.0f s", error, wait_s)
+    _LOG.warning("%s; trying again in %.0f s", _reason(error), wait_s)
+
+
+def _reason(error: BaseException | None) -> object:
+    """What went wrong, without the address and the count of tries that urllib3 wraps it in."""
+    inner = error.args[0] if error is not None and error.args else error
+    return getattr(inner, "reason", error)
 
 
 @retry(
@@ -172,7 +178,7 @@ def _no_answer(url: str, path: Path, error: requests.RequestException) -> str:
     part = _part_of(path)
     kept = part.stat().st_size if part.exists() else 0
     return (
-        f"cannot fetch {path.name} from {url}: {error}. "
+        f"cannot fetch {path.name} from {url}: {_reason(error)}. "
         + (f"{kept} bytes are kept, and the next run goes on from there. " if kept else "")
         + "Check the network and published_address (conf/base/globals.yml), or put the file at "
         f"{path} by hand: it is then verified and not fetched"
