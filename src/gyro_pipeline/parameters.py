@@ -293,6 +293,9 @@ class Parameters(Parameter):
     """All of it, as one tree."""
 
     source: str = Field(pattern=r"^[a-z0-9_]+$", description="where the logs come from")
+    published_address: str = Field(
+        pattern="^https?://", description="base address of the authors' files; the catalog reads it"
+    )
     sensors: dict[str, Sensor]
     ground_truth: GroundTruth
     virtual_gyros: VirtualGyros
