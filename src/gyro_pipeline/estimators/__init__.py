@@ -8,10 +8,10 @@ from gyro_pipeline.estimators.base import (
     Estimates,
     Estimator,
     FittedEstimator,
-    duration_s,
 )
 from gyro_pipeline.estimators.linear import BestLinear, Ridge
 from gyro_pipeline.estimators.shrinkage import EmpiricalBayes, LastCalibration, TrainingMean
+from gyro_pipeline.estimators.training import TrainingRecordings
 
 __all__ = [
     "DEFAULT",
@@ -27,8 +27,8 @@ __all__ = [
     "Ridge",
     "RunningMean",
     "TrainingMean",
+    "TrainingRecordings",
     "TrimmedMean",
-    "duration_s",
 ]
 
 ESTIMATORS: Mapping[str, Callable[[], FittedEstimator]] = {

@@ -8,7 +8,13 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from gyro_pipeline.conventions import BIAS, TEST, InputError
-from gyro_pipeline.estimators import ESTIMATORS, Estimates, Estimator, FittedEstimator
+from gyro_pipeline.estimators import (
+    ESTIMATORS,
+    Estimates,
+    Estimator,
+    FittedEstimator,
+    TrainingRecordings,
+)
 
 
 class Fitted:
@@ -21,7 +27,7 @@ class Fitted:
 
     def __init__(self, recordings: xr.Dataset, roles: pd.DataFrame) -> None:
         self._recordings, self._roles = recordings[["angular_rate"]], roles
-        self._samples: dict[int, xr.Dataset] = {}
+        self._training: dict[int, TrainingRecordings] = {}
         self._folds: dict[tuple[str, int], FittedEstimator] = {}
 
     def estimator(self, name: str) -> "OfFolds":
@@ -34,10 +40,11 @@ class Fitted:
         if (name, fold) not in self._folds:
             roles = self._roles[self._roles.fold == fold]
             numbers = sorted(roles.recording[roles.role != TEST].tolist())
-            if fold not in self._samples:
-                self._samples = {fold: self._recordings.sel(recording=numbers).load()}
+            if fold not in self._training:
+                chosen = self._recordings.sel(recording=numbers).load()
+                self._training = {fold: TrainingRecordings(chosen)}
             try:
-                self._folds[name, fold] = ESTIMATORS[name]().fit(self._samples[fold])
+                self._folds[name, fold] = ESTIMATORS[name]().fit(self._training[fold])
             except InputError as error:
                 sensor = self._recordings.attrs["sensor"]
                 raise InputError(

@@ -13,8 +13,8 @@ from gyro_pipeline.estimators import (
     averages,
     base,
     linear,
-    noise,
     shrinkage,
+    training,
 )
 from gyro_pipeline.fingerprints import code_hash, fingerprint
 from gyro_pipeline.learning.jobs import NetworkEstimator
@@ -48,7 +48,7 @@ logger = logging.getLogger(__name__)
 
 _CODE = (
     *(allan_module, ceiling, recording_model, reml, history),
-    *(averages, base, linear, noise, shrinkage),
+    *(averages, base, linear, shrinkage, training),
     *(bench_module, folds, scores, truths, windows),
 )
 
