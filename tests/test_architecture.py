@@ -21,7 +21,7 @@ ALLOWED = {
     "logs": {"conventions"},
     "tracking": {"conventions"},
     "physics": {"conventions", "logs"},
-    "estimators": {"conventions", "physics"},
+    "estimators": {"conventions", "learning", "physics"},
     "protocol": {"conventions", "parameters"},
     "learning": {"conventions", "parameters", "protocol"},
     "datasets": {"conventions", "parameters", "fingerprints", "logs", "tracking", "physics"},

@@ -417,7 +417,9 @@ def test_it_is_fitted_to_all_recordings_but_those_that_test(world, all_judged):
 
 def test_coverage_is_that_of_the_stated_deviations(all_judged):
     stated = {name for name, run in all_judged.items() if "coverage_1sigma_all" in run.metrics}
-    assert set(all_judged) - stated == {"median", "trimmed_mean", "ridge", "ridge_same_time"}
+    assert set(all_judged) - stated == {
+        *("median", "trimmed_mean", "ridge", "ridge_same_time", "window_mean_network")
+    }
     for name in stated:
         errors = all_judged[name].artifacts[ERRORS].query("truth == 'paper'")
         within = (errors.error_dps.abs() < 2 * errors.sigma_dps).mean()
@@ -454,7 +456,7 @@ def test_an_estimator_never_sees_the_drawn_values(simulated, world, monkeypatch)
             return self
 
     monkeypatch.setitem(ESTIMATORS, "mean", Spy)
-    Fitted(simulated, world.roles).estimator("mean")
+    Fitted(simulated, world.roles).estimator("mean", 1, 0)
     assert len(seen) == 1  # once for all recordings
     assert set(seen[0].recordings.data_vars) == {"angular_rate"}
     assert seen[0].recordings.recording.to_numpy().tolist() == list(range(1, 11))
@@ -469,3 +471,24 @@ def test_too_few_recordings_are_an_error_that_says_so(world, as_stored, make_rol
 def test_an_estimate_that_is_none_is_refused(bench):
     with pytest.raises(InputError, match="recording 11: expected an estimate for every window"):
         bench.errors(Off(bench, np.nan))
+
+
+def test_a_residual_network_learns_from_the_imus_of_its_cell(world, monkeypatch):
+    seen = []
+
+    class Spy(RunningMean):
+        def fit(self, recordings, imu=1):
+            seen.append(recordings)
+            return self
+
+    monkeypatch.setitem(ESTIMATORS, "residual_network", Spy)
+    fitted = Fitted(world.recordings, world.roles, world.virtual)
+    for real, virtual in ((1, 0), (2, 3), (2, 3)):
+        fitted.estimator("residual_network", real, virtual)
+    alone, together = seen  # fitted once for each
+    assert alone.imu.to_numpy().tolist() == [1]
+    assert together.imu.to_numpy().tolist() == [1, 2, 3, 4, 5]
+    drawn = together.angular_rate.sel(imu=slice(3, 5), recording=slice(1, 5)).to_numpy()
+    np.testing.assert_array_equal(drawn, world.virtual.angular_rate.to_numpy()[:3, :5])
+    # virtual recordings beyond those that train are not there
+    assert np.isnan(together.angular_rate.sel(imu=3, recording=slice(6, 10))).all()

@@ -764,3 +764,40 @@ def test_their_figure_has_a_line_for_each_and_the_ceiling(estimators, nothing):
         assert labels == ["mean", *best, "ceiling"]
     elsewhere = results.assign(source="published", simulated=False)
     assert len(sparkfun(results, elsewhere).axes) == 4
+
+
+def test_the_papers_network_is_compared_at_its_last_and_its_best_epoch(
+    estimators, make_run, settings, parameters, nothing
+):
+    _, runs = estimators
+    recordings = range(1, 9)
+    table = errors(recordings, 0.004)  # at the best epoch, 9 deg/s
+    network = make_run("network", recordings, table, study="estimators")
+    study = Study(
+        experiment="estimators",
+        estimators=["mean", "best_linear", CNN],
+        windows_s=[WINDOW_S],
+        sensors={"sparkfun": Grid(method=2, real_gyros=[3])},
+    )
+    given = (study, "simulated", [WINDOW_S], [0], *settings, parameters().evaluation)
+    results = pool_results(*given, [*runs, network])[0].set_index("estimator")
+    assert results.index.tolist() == ["mean", "best_linear", "cnn", "cnn_best"]
+    assert results.test_rmse_dps_all["cnn"] == pytest.approx(rmse([table]))
+    assert results.test_rmse_dps_all["cnn_best"] == pytest.approx(9)
+    assert results.less_best_linear_dps["cnn_best"] > results.less_best_linear_dps["cnn"] > 0
+    assert comparison(results.reset_index(), nothing)["Recommended"].tolist()[2:] == ["no", "no"]
+
+
+def test_the_residual_network_has_columns_beside_the_papers(whole, published):
+    results, _, _ = whole
+    residual = results[results.estimator == CNN].assign(
+        estimator="residual_network", method=0, accuracy_gain_pct_all=61.0, run_ids="residual-run"
+    )
+    both = pd.concat([results, residual], ignore_index=True)
+    table = three_gyroscopes(both, published)
+    assert [text.split(" ")[0] for text in table["Residual network A %"]] == ["61", "61"]
+    assert table["Runs"].tolist() == ["3+0-0123 residual", "3+24-012 residual"]
+    assert table["A %"].tolist() == three_gyroscopes(results, published)["A %"].tolist()
+    assert set(three_gyroscopes(results, published)["Residual network A %"]) == {"–"}
+    both.loc[both.estimator == "residual_network", "missing"] = "make it"
+    assert three_gyroscopes(both, published) == Missing(("make it", "make it"))

@@ -1,7 +1,6 @@
 """Linear estimators on block means: the best linear predictor, and ridge regression."""
 
 from dataclasses import replace
-from typing import Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,7 +17,7 @@ from gyro_pipeline.physics.recording_model import (
     block_edges,
     block_means,
 )
-from gyro_pipeline.physics.reml import FEWEST_RECORDINGS
+from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, fit_recording_model
 
 _FLAT = 1e6
 """Prior standard deviation that tells nothing, in units of the noise of a whole recording."""
@@ -57,7 +56,7 @@ class _Linear(FittedEstimator):
         means = block_means(samples, lines[0].edges)
         return np.sum(means * weights[which], axis=-1) + constants[which], sigma[which]
 
-    def _remembered(self, *place: Unpack[_Place]) -> LinearEstimate:
+    def _remembered(self, *place: *_Place) -> LinearEstimate:
         if place not in self._lines:
             self._lines[place] = self._line(*place)
         return self._lines[place]
@@ -85,7 +84,7 @@ class BestLinear(_Linear):
     then that from unit to unit. Where fewer than three devices are known, the prior is flat.
 
     Args:
-        warm_up: Whether the sensor warms up.
+        warm_up: Whether the sensor warms up; None: if its recordings say so.
         noise: ``"reml"``: N, B and K fitted together with the prior; ``"allan"``: from the Allan
             fit, which does not know of warm-up.
         history: Whether the prior of a recording follows from the device's calibrations before
@@ -97,7 +96,9 @@ class BestLinear(_Linear):
 
     uses_prior = True
 
-    def __init__(self, warm_up: bool = False, noise: str = "reml", history: bool = False) -> None:
+    def __init__(
+        self, warm_up: bool | None = False, noise: str = "reml", history: bool = False
+    ) -> None:
         if noise not in ("reml", "allan"):
             raise InputError(f"noise: expected 'reml' or 'allan', got {noise!r}")
         self.recommended = noise == "reml"  # the Allan fit knows nothing of warm-up
@@ -105,13 +106,19 @@ class BestLinear(_Linear):
 
     def _fit(self, training: TrainingRecordings) -> None:
         super()._fit(training)
-        self._models = training.models(self._warm_up, self._allan)
+        axes = training.rates.swapaxes(0, 1)
+        noise = training.noise_figures if self._allan else [None] * len(axes)
+        self.models = [
+            fit_recording_model(rates, training.rate_hz, self._warm_up, figures)
+            for rates, figures in zip(axes, noise, strict=True)
+        ]
+        """What was fitted, one for each axis."""
         self._histories: list[BiasHistory] = []
         if not training.seen:
-            self._models = [_of_unseen(model, len(training.known)) for model in self._models]
+            self.models = [_of_unseen(model, len(training.known)) for model in self.models]
         elif self._by_recording:
             numbers, labels = training.labels
-            of_axes = zip(labels.T, self._models, strict=True)
+            of_axes = zip(labels.T, self.models, strict=True)
             self._histories = [BiasHistory.fit(numbers, *one) for one in of_axes]
         self._priors: dict[tuple[int, int | None], RecordingModel] = {}
         self._windows: dict[tuple[int, int, int, str], WindowModel] = {}
@@ -129,9 +136,9 @@ class BestLinear(_Linear):
     def _prior(self, axis: int, recording: int | None) -> RecordingModel:
         """What is known before a window of this recording is seen."""
         if not self._histories:
-            return self._models[axis]
+            return self.models[axis]
         if (axis, recording) not in self._priors:
-            prior = self._histories[axis].prior(self._models[axis], recording)
+            prior = self._histories[axis].prior(self.models[axis], recording)
             self._priors[axis, recording] = prior
         return self._priors[axis, recording]
 

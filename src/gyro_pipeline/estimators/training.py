@@ -14,8 +14,6 @@ from gyro_pipeline.physics.allan import (
     averaging_times_s,
     fit_noise,
 )
-from gyro_pipeline.physics.recording_model import RecordingModel
-from gyro_pipeline.physics.reml import fit_recording_model
 
 
 class TrainingRecordings:
@@ -41,7 +39,6 @@ class TrainingRecordings:
         self.seen = imu in self.imus
         self.known = [imu] if self.seen else self.imus
         self._others: dict[int, TrainingRecordings] = {}
-        self._models: dict[tuple[bool, bool], list[RecordingModel]] = {}
 
     def of(self, imu: int) -> "TrainingRecordings":
         """The same about another of the IMUs."""
@@ -85,24 +82,6 @@ class TrainingRecordings:
     def white_noise(self) -> NDArray[np.float64]:
         """N of each axis, (axes,), deg/s sqrt(s)."""
         return np.array([figures.white for figures in self.noise_figures])
-
-    def models(self, warm_up: bool, allan: bool) -> list[RecordingModel]:
-        """The model of a recording for each axis, fitted to all of ``rates`` alike.
-
-        Args:
-            warm_up: Whether the sensor warms up.
-            allan: Whether N, B and K are from :attr:`noise_figures`, else fitted with the rest.
-
-        Raises:
-            InputError: Fewer than three recordings.
-        """
-        if (warm_up, allan) not in self._models:
-            noise = self.noise_figures if allan else [None] * self.rates.shape[1]
-            self._models[warm_up, allan] = [
-                fit_recording_model(rows, self.rate_hz, warm_up, known)
-                for rows, known in zip(self.rates.swapaxes(0, 1), noise, strict=True)
-            ]
-        return self._models[warm_up, allan]
 
     @property
     def _present(self) -> NDArray[np.bool_]:

@@ -92,6 +92,33 @@ class LinearEstimate:
         return self.constant + block_means(windows, self.edges) @ self.weights
 
 
+def innovations(
+    model: RecordingModel,
+    start: int,
+    windows: NDArray[np.floating],
+    block_s: float = BLOCK_S,
+) -> NDArray[np.float64]:
+    """What each block of a window adds to the blocks before it, in units of its own scatter.
+
+    If the model holds these are independent and normal, with mean 0 and variance 1, and independent
+    of the error of :func:`best_linear`: there is nothing left to learn from them.
+
+    Args:
+        model: What is known before.
+        start: First sample of the windows, counted from power-on.
+        windows: (n, samples), deg/s.
+        block_s: See :func:`best_linear`.
+
+    Returns:
+        (n, m).
+    """
+    window = WindowModel.of(model, start, windows.shape[-1], PAPER, block_s)
+    deviations = block_means(windows, window.edges) - window.design @ model.mean
+    prior = window.design @ model.covariance @ window.design.T
+    root = np.linalg.cholesky(window.covariance + prior)
+    return np.asarray(linalg.solve_triangular(root, deviations.T, lower=True).T)
+
+
 def best_linear(
     model: RecordingModel, start: int, size: int, truth: str, block_s: float = BLOCK_S
 ) -> LinearEstimate:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gyro_pipeline.conventions import ALL, FIRST, HOLD_OUT, LAST, PAPER
+from gyro_pipeline.conventions import ALL, BEST, FIRST, HOLD_OUT, LAST, PAPER
 from gyro_pipeline.estimators import DEFAULT
 from gyro_pipeline.parameters import Evaluation
 from gyro_pipeline.protocol.scores import (
@@ -20,11 +20,14 @@ from gyro_pipeline.protocol.scores import (
     score,
     squared_errors,
 )
-from gyro_pipeline.studies import CNN, MEAN, Cell, run_params
+from gyro_pipeline.studies import CNN, MEAN, RESIDUAL_NETWORK, Cell, run_params
 from gyro_pipeline.tracking import CURVE, ERRORS, StoredRun, metric_name
 
 ROW = ["sensor", "source", "estimator", "method", "real_gyros", "virtual_gyros", "window_s"]
 """What names a result."""
+
+CNN_BEST = "cnn_best"
+"""In a comparison of estimators: the paper's network at its best validation epoch."""
 
 COVERAGES = [metric_name(f"coverage_{sigmas}sigma", ALL) for sigmas in (1, 2)]
 
@@ -79,14 +82,26 @@ def pool(
         row["folds"] = int(found[0].params["folds"])
         row["run_ids"] = " ".join(run.run_id for run in found)
         results.append(row)
+        if key in defaults and cell.estimator == CNN:
+            best = [best_epoch(run) for run in found]
+            scores = network_row(best, means[key], cell.window_s, evaluation)
+            less = differences(best, references, evaluation)
+            results.append(row | scores | less | {"estimator": CNN_BEST})
     return results, {sensor: mean for (sensor, _), mean in reversed(means.items())}
+
+
+def best_epoch(run: StoredRun) -> StoredRun:
+    """The run as if its weights at the best validation epoch had been its last ones."""
+    errors = run.load(ERRORS)
+    errors = errors[errors.weights == BEST].assign(weights=LAST)
+    return replace(run, load={ERRORS: errors}.__getitem__)
 
 
 def command_for(cells: Sequence[Cell]) -> str:
     """The command that makes the runs of a row."""
     cell = cells[0]
     only = {"sensor": cell.sensor, "window_s": f"{cell.window_s:g}"}
-    if cell.estimator == CNN:
+    if cell.estimator in (CNN, RESIDUAL_NETWORK):
         only |= {"real_gyros": str(cell.real_gyros), "virtual_gyros": str(cell.virtual_gyros)}
     if len(cells) == 1 and cell.estimator == CNN:
         only["seed"] = str(cell.seed)
