@@ -452,14 +452,14 @@ def test_an_estimator_never_sees_the_drawn_values(simulated, world, monkeypatch)
 
     class Spy(RunningMean):
         def fit(self, recordings, imu=1):
-            seen.append(recordings)
+            seen.append(recordings.recordings)
             return self
 
     monkeypatch.setitem(ESTIMATORS, "mean", Spy)
     Fitted(simulated, world.roles).estimator("mean", 1, 0)
     assert len(seen) == 1  # once for all recordings
-    assert set(seen[0].recordings.data_vars) == {"angular_rate"}
-    assert seen[0].recordings.recording.to_numpy().tolist() == list(range(1, 11))
+    assert set(seen[0].data_vars) == {"angular_rate"}
+    assert seen[0].recording.to_numpy().tolist() == list(range(1, 11))
 
 
 def test_too_few_recordings_are_an_error_that_says_so(world, as_stored, make_roles):
@@ -478,7 +478,7 @@ def test_a_residual_network_learns_from_the_imus_of_its_cell(world, monkeypatch)
 
     class Spy(RunningMean):
         def fit(self, recordings, imu=1):
-            seen.append(recordings)
+            seen.append(recordings.recordings)
             return self
 
     monkeypatch.setitem(ESTIMATORS, "residual_network", Spy)
