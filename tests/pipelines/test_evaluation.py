@@ -534,7 +534,7 @@ def test_an_estimator_never_sees_the_drawn_values(simulated, world, monkeypatch)
 
     class Spy(RunningMean):
         def fit(self, recordings, imu=1):
-            seen.append(recordings)
+            seen.append(recordings.recordings)
             return self
 
     monkeypatch.setitem(ESTIMATORS, "mean", Spy)
@@ -560,7 +560,7 @@ def test_a_residual_network_learns_from_the_imus_of_its_cell(world, monkeypatch)
 
     class Spy(RunningMean):
         def fit(self, recordings, imu=1):
-            seen.append(recordings)
+            seen.append(recordings.recordings)
             return self
 
     monkeypatch.setitem(ESTIMATORS, "residual_network", Spy)

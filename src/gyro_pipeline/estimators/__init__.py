@@ -8,11 +8,11 @@ from gyro_pipeline.estimators.base import (
     Estimates,
     Estimator,
     FittedEstimator,
-    duration_s,
 )
 from gyro_pipeline.estimators.linear import BestLinear, Ridge
 from gyro_pipeline.estimators.networks import ResidualNetwork, WindowMeanNetwork
 from gyro_pipeline.estimators.shrinkage import EmpiricalBayes, LastCalibration, TrainingMean
+from gyro_pipeline.estimators.training import TrainingRecordings
 
 __all__ = [
     "DEFAULT",
@@ -29,9 +29,9 @@ __all__ = [
     "Ridge",
     "RunningMean",
     "TrainingMean",
+    "TrainingRecordings",
     "TrimmedMean",
     "WindowMeanNetwork",
-    "duration_s",
 ]
 
 ESTIMATORS: Mapping[str, Callable[[], FittedEstimator]] = {

@@ -3,13 +3,12 @@
 from typing import ClassVar
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from gyro_pipeline.conventions import RECORDING_MEAN
 from gyro_pipeline.estimators.base import FittedEstimator, Windows
-from gyro_pipeline.estimators.noise import white_noise
+from gyro_pipeline.estimators.training import TrainingRecordings
 
 
 class RunningMean(FittedEstimator):
@@ -21,8 +20,8 @@ class RunningMean(FittedEstimator):
 
     _noise: NDArray[np.float64] | float = np.nan
 
-    def _fit(self, recordings: xr.Dataset, imu: int) -> None:
-        self._noise = white_noise(recordings, imu)
+    def _fit(self, training: TrainingRecordings) -> None:
+        self._noise = training.white_noise
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
         window_s = windows.samples.shape[-1] / self._rate_hz

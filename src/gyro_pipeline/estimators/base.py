@@ -8,6 +8,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from gyro_pipeline.conventions import BIAS, RECORDING_MEAN, TEST_IMU, InputError
+from gyro_pipeline.estimators.training import TrainingRecordings
 
 Estimates = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Biases (n, 3) and their standard deviations (n, 3), deg/s; NaN where a method has none."""
@@ -82,20 +83,22 @@ class FittedEstimator:
     _rate_hz = np.nan
     _recording_s = np.nan
 
-    def fit(self, recordings: xr.Dataset, imu: int = TEST_IMU) -> Self:
+    def fit(self, recordings: xr.Dataset | TrainingRecordings, imu: int = TEST_IMU) -> Self:
         """Learn from training recordings, and from nothing else.
 
         Args:
-            recordings: As in :mod:`gyro_pipeline.conventions`.
+            recordings: As in :mod:`gyro_pipeline.conventions`; or with the device, to share what
+                is learned with other estimators.
             imu: Whose windows will be seen. A device that is not among the recordings is an unseen
                 one: its prior is the spread from unit to unit.
 
         Returns:
             Itself.
         """
-        self._rate_hz = float(recordings.attrs["rate_hz"])
-        self._recording_s = duration_s(recordings)
-        self._fit(recordings, imu)
+        if isinstance(recordings, xr.Dataset):
+            recordings = TrainingRecordings(recordings, imu)
+        self._rate_hz, self._recording_s = recordings.rate_hz, recordings.recording_s
+        self._fit(recordings)
         return self
 
     def estimate(
@@ -117,7 +120,7 @@ class FittedEstimator:
         shape = windows.shape[:2]
         return np.broadcast_to(biases, shape), np.broadcast_to(sigma, shape)
 
-    def _fit(self, recordings: xr.Dataset, imu: int) -> None:
+    def _fit(self, training: TrainingRecordings) -> None:
         """Nothing to learn."""
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
@@ -128,30 +131,3 @@ class FittedEstimator:
 ORIENTATION_NOTE = (
     "uses a stored prior, which holds only in the orientation and at the latitude it was learned in"
 )
-
-
-def samples_of(recordings: xr.Dataset, imu: int) -> NDArray[np.floating]:
-    """Recordings of one IMU that it has, (recordings, axes, samples), deg/s."""
-    rates = recordings.angular_rate.sel(imu=imu).transpose("recording", "axis", "sample").to_numpy()
-    return rates[np.isfinite(rates[..., 0]).all(axis=-1)]
-
-
-def labels_of(recordings: xr.Dataset, imu: int) -> tuple[NDArray[np.integer], NDArray[np.float64]]:
-    """Numbers (n,) and means (n, axes), deg/s, of the recordings that an IMU has, in order."""
-    chosen = recordings.angular_rate.sel(imu=imu).transpose("recording", "axis", "sample")
-    means = chosen.mean("sample", dtype=np.float64, skipna=False).to_numpy()
-    present = np.isfinite(means).all(axis=1)
-    numbers = chosen.recording.to_numpy()[present]
-    order = np.argsort(numbers)
-    return numbers[order], means[present][order]
-
-
-def known_imus(recordings: xr.Dataset, imu: int) -> list[int]:
-    """Where to learn about a device: from itself, or from all others if it is an unseen one."""
-    numbers = [int(number) for number in recordings.imu]
-    return [imu] if imu in numbers else numbers
-
-
-def duration_s(recordings: xr.Dataset) -> float:
-    """T, seconds."""
-    return float(recordings.sizes["sample"] / recordings.attrs["rate_hz"])

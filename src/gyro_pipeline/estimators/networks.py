@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from gyro_pipeline.conventions import BIAS, RECORDING_MEAN
-from gyro_pipeline.estimators.base import FittedEstimator, Windows, known_imus, samples_of
+from gyro_pipeline.estimators.base import FittedEstimator, Windows
 from gyro_pipeline.estimators.linear import BestLinear
+from gyro_pipeline.estimators.training import TrainingRecordings
 from gyro_pipeline.learning.perceptrons import Perceptrons, train_perceptrons
 from gyro_pipeline.physics.recording_model import innovations
 
@@ -69,12 +69,12 @@ class ResidualNetwork(FittedEstimator):
     def __init__(self, warm_up: bool | None = None) -> None:
         self._linear = BestLinear(warm_up=warm_up)
 
-    def _fit(self, recordings: xr.Dataset, imu: int) -> None:
-        self._linear.fit(recordings, imu)
+    def _fit(self, training: TrainingRecordings) -> None:
+        self._linear.fit(training)
         self._rates = []
-        if known_imus(recordings, imu) == [imu]:
-            others = [int(one) for one in recordings.imu if one != imu]
-            self._rates = [samples_of(recordings, one) for one in (imu, *others)]
+        if training.seen:
+            others = [one for one in training.imus if one != training.imu]
+            self._rates = [training.of(one).rates for one in (training.imu, *others)]
         self._corrections: dict[int, _Correction | None] = {}
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
@@ -164,9 +164,8 @@ class WindowMeanNetwork(FittedEstimator):
 
     uses_prior = True
 
-    def _fit(self, recordings: xr.Dataset, imu: int) -> None:
-        known = [samples_of(recordings, one) for one in known_imus(recordings, imu)]
-        self._rates = np.concatenate(known)
+    def _fit(self, training: TrainingRecordings) -> None:
+        self._rates = training.rates
         self._means = self._rates.mean(axis=-1, dtype=np.float64)
         self._centre = self._means.mean(axis=0)
         self._networks: dict[int, tuple[Perceptrons, float]] = {}

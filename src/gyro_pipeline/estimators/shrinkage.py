@@ -1,12 +1,11 @@
 """Estimators that know the device's past: a constant, the last calibration, empirical Bayes."""
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from gyro_pipeline.conventions import BIAS, RECORDING_MEAN
-from gyro_pipeline.estimators.base import FittedEstimator, Windows, known_imus, labels_of
-from gyro_pipeline.estimators.noise import white_noise
+from gyro_pipeline.estimators.base import FittedEstimator, Windows
+from gyro_pipeline.estimators.training import TrainingRecordings
 from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, guarded_spread
 
 
@@ -18,11 +17,9 @@ class TrainingMean(FittedEstimator):
 
     uses_prior = True
 
-    def _fit(self, recordings: xr.Dataset, imu: int) -> None:
-        self._noise = white_noise(recordings, imu)
-        known = [labels_of(recordings, one) for one in known_imus(recordings, imu)]
-        self._numbers = np.concatenate([numbers for numbers, _ in known])
-        self._labels = np.concatenate([means for _, means in known])
+    def _fit(self, training: TrainingRecordings) -> None:
+        self._noise = training.white_noise
+        self._numbers, self._labels = training.labels
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
         biases, of_estimate = self.constant(windows.recording)
@@ -43,9 +40,9 @@ class LastCalibration(TrainingMean):
     training mean of the others.
     """
 
-    def _fit(self, recordings: xr.Dataset, imu: int) -> None:
-        super()._fit(recordings, imu)
-        if known_imus(recordings, imu) != [imu]:
+    def _fit(self, training: TrainingRecordings) -> None:
+        super()._fit(training)
+        if not training.seen:
             self._numbers = np.full(self._numbers.shape, np.inf)
 
     def constant(self, recording: int | None) -> tuple[NDArray[np.float64], float]:
@@ -84,42 +81,44 @@ class EmpiricalBayes(FittedEstimator):
         self.recommended = not pooled
         self._pooled = pooled
 
-    def _fit(self, recordings: xr.Dataset, imu: int) -> None:
-        self._noise = white_noise(recordings, imu)
-        labels, averaging = self._labels(recordings, imu)
+    def _fit(self, training: TrainingRecordings) -> None:
+        self._noise = training.white_noise
+        labels, averaging = self._labels(training)
         self._mean = labels.mean(axis=0)
-        scatter = self._spread(recordings, labels, averaging) ** 2
+        scatter = self._spread(training, labels, averaging) ** 2
         self._prior = scatter + (scatter + averaging) / len(labels)
 
     def _labels(
-        self, recordings: xr.Dataset, imu: int
+        self, training: TrainingRecordings
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Labels (n, 3) of the prior and their averaging noise (3,): recordings or devices."""
-        known = known_imus(recordings, imu)
-        if known == [imu]:
-            return labels_of(recordings, imu)[1], self._noise**2 / self._recording_s
-        means = [labels_of(recordings, one)[1].mean(axis=0) for one in known]
+        if training.seen:
+            return training.labels[1], self._noise**2 / self._recording_s
+        means = [training.of(imu).labels[1].mean(axis=0) for imu in training.known]
         return np.stack(means), np.zeros(len(self._noise))
 
     def _spread(
-        self, recordings: xr.Dataset, labels: NDArray[np.float64], averaging: NDArray[np.float64]
+        self,
+        training: TrainingRecordings,
+        labels: NDArray[np.float64],
+        averaging: NDArray[np.float64],
     ) -> NDArray[np.float64]:
         """The tau of each axis, (3,)."""
         if self._pooled and averaging.any():
-            return np.full(averaging.shape, self._pooled_spread(recordings))
+            return np.full(averaging.shape, self._pooled_spread(training))
         if len(labels) < FEWEST_RECORDINGS:
             return np.full(averaging.shape, np.inf)
         scatter, freedom = labels.var(axis=0) * len(labels), len(labels) - 1
         groups = zip(scatter, averaging, strict=True)
         return np.array([guarded_spread(square, freedom, v) for square, v in groups])
 
-    def _pooled_spread(self, recordings: xr.Dataset) -> float:
+    def _pooled_spread(self, training: TrainingRecordings) -> float:
         scatter, freedom, averaging = [], [], []
-        for imu in recordings.imu.to_numpy():
-            labels = labels_of(recordings, imu)[1]
+        for one in map(training.of, training.imus):
+            labels = one.labels[1]
             scatter.append(labels.var(axis=0) * len(labels))
             freedom.append(np.full(labels.shape[1], len(labels) - 1))
-            averaging.append(white_noise(recordings, imu) ** 2 / self._recording_s)
+            averaging.append(one.white_noise**2 / self._recording_s)
         if np.sum(freedom) < FEWEST_RECORDINGS - 1:
             return np.inf
         return guarded_spread(*map(np.concatenate, (scatter, freedom, averaging)))

@@ -46,8 +46,9 @@ from gyro_pipeline.physics.recording_model import (
 )
 from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, fit_recording_model
 from gyro_pipeline.protocol.scores import (
-    Curve,
     Estimate,
+    ResampledCurve,
+    SquaredErrors,
     beats_oracle,
     coverage,
     curve_errors,
@@ -60,8 +61,9 @@ from gyro_pipeline.protocol.scores import (
 from gyro_pipeline.protocol.truths import (
     CURVE_STEP_S,
     TestRecording,
-    error_table,
+    error_columns,
     running_mean_curve,
+    stacked,
 )
 from gyro_pipeline.protocol.windows import cut_windows, window_size
 from gyro_pipeline.tracking import metric_name
@@ -232,7 +234,7 @@ class Bench:
             InputError: If it gives no estimate for some window.
         """
         seen = self.recordings.angular_rate.sel(imu=slice(TEST_IMU, TEST_IMU + imus - 1))
-        tables = []
+        parts = []
         for recording in self.tested:
             samples = (
                 recording.samples
@@ -242,12 +244,18 @@ class Bench:
             windows = cut_windows(samples, self.size)
             windows = windows.transpose(1, 0, 2)
             start_s = np.arange(len(windows)) * self.size / self.recordings.attrs["rate_hz"]
-            for target in (RECORDING_MEAN, BIAS):
-                given = estimator.estimate(windows, target, start_s, recording.number)
-                judged = (values[:, : len(AXES)] for values in given)
-                table = error_table(recording, self.size, *judged)
-                tables.append(table[table.truth.map(TARGET_OF) == target])
-        errors = pd.concat(tables, ignore_index=True)
+            judged = {
+                target: [
+                    values[:, : len(AXES)]
+                    for values in estimator.estimate(windows, target, start_s, recording.number)
+                ]
+                for target in (RECORDING_MEAN, BIAS)
+            }
+            parts += [
+                error_columns(recording, self.size, truth, *judged[TARGET_OF[truth]])
+                for truth in recording.truths(self.size)
+            ]
+        errors = stacked(parts)
         for number in errors.recording[errors.error_dps.isna()].unique():
             raise InputError(
                 f"{self.recordings.attrs['sensor']} recording {number}: expected an estimate for "
@@ -262,29 +270,45 @@ class Bench:
         return self.errors(RunningMean())
 
     @cached_property
+    def _means(self) -> dict[tuple[str, str], SquaredErrors]:
+        """Squares of the running mean's errors by truth and windows."""
+        return _by_view(self.mean_errors)
+
+    @cached_property
+    def _oracles(self) -> dict[tuple[str, str], SquaredErrors]:
+        """The same of the best possible estimator; empty where it is not known."""
+        return {} if self.oracle_errors is None else _by_view(self.oracle_errors)
+
+    @cached_property
+    def _resampled(self) -> np.ndarray:
+        """Weights of the recordings in each resample."""
+        drawn = self.evaluation.resamples, self.evaluation.bootstrap_seed
+        return resampled_weights(len(self.numbers), *drawn)
+
+    @cached_property
     def curve(self) -> pd.DataFrame:
         """The running-mean curve of every test recording."""
         curves = [running_mean_curve(recording, self.size) for recording in self.tested]
         return pd.concat(curves, ignore_index=True)
 
     @cached_property
-    def curves(self) -> dict[tuple[str, str], Curve]:
-        """The same by truth and windows."""
+    def curves(self) -> dict[tuple[str, str], ResampledCurve]:
+        """The same by truth and windows, for every resample."""
         views = product(self.curve.truth.unique(), (FIRST, ALL))
-        return {view: curve_errors(self.curve, *view) for view in views}
+        return {view: curve_errors(self.curve, *view).of(self._resampled) for view in views}
 
     @cached_property
     def oracle_errors(self) -> pd.DataFrame | None:
         """Errors of the best possible estimator for each truth; None where it is not known."""
         if self.device.unit_bias is None:
             return None
-        tables = []
+        parts = []
         for recording in self.tested:
-            for truth in (PAPER, DISJOINT, TRUE):
+            for truth in recording.truths(self.size):
                 best = self._best(recording, truth)
-                table = error_table(recording, self.size, best)
-                tables.append(table[table.truth == truth])
-        return pd.concat(tables, ignore_index=True)
+                sigma = np.full(best.shape, np.nan)
+                parts.append(error_columns(recording, self.size, truth, best, sigma))
+        return stacked(parts)
 
     def _best(self, recording: TestRecording, truth: str) -> np.ndarray:
         """Estimates by one who knows what was drawn, (windows, 3), deg/s."""
@@ -381,9 +405,6 @@ class Bench:
             errors: From :meth:`errors`.
             weights: ``last`` or ``best``; part of the names.
         """
-        resampled = resampled_weights(
-            len(self.numbers), self.evaluation.resamples, self.evaluation.bootstrap_seed
-        )
         metrics: dict[str, float] = {}
         for truth in errors.truth.unique():
             if truth != DISJOINT and errors.sigma_dps.notna().any():
@@ -391,13 +412,9 @@ class Bench:
                     name = metric_name(f"coverage_{sigmas}sigma", ALL, weights, truth)
                     metrics[name] = coverage(errors, truth, sigmas)
             for windows in (FIRST, ALL):
-                scores = score(
-                    squared_errors(errors, truth, windows),
-                    squared_errors(self.mean_errors, truth, windows),
-                    self.curves[truth, windows],
-                    self.window_s,
-                    resampled,
-                )
+                own, mean = squared_errors(errors, truth, windows), self._means[truth, windows]
+                curve = self.curves[truth, windows]
+                scores = score(own, mean, curve, self.window_s, self._resampled)
                 if weights == LAST:
                     scores |= self.ceilings(truth, windows)
                 for base, estimate in scores.items():
@@ -407,13 +424,15 @@ class Bench:
                         for bound, value in named.items()
                         if value is not None and np.isfinite(value)
                     }
-                if self.oracle_errors is not None and len(self.numbers) > 1:
-                    p = beats_oracle(
-                        squared_errors(errors, truth, windows),
-                        squared_errors(self.oracle_errors, truth, windows),
-                    )
+                if self._oracles and len(self.numbers) > 1:
+                    p = beats_oracle(own, self._oracles[truth, windows])
                     metrics[metric_name("beats_oracle_p", windows, weights, truth)] = p
         return metrics
+
+
+def _by_view(errors: pd.DataFrame) -> dict[tuple[str, str], SquaredErrors]:
+    views = product(errors.truth.unique(), (FIRST, ALL))
+    return {view: squared_errors(errors, *view) for view in views}
 
 
 def off_the_curve(metrics: Mapping[str, float]) -> dict[str, str]:

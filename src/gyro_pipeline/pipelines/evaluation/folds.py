@@ -8,7 +8,13 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from gyro_pipeline.conventions import BIAS, TEST, TEST_IMU, InputError
-from gyro_pipeline.estimators import ESTIMATORS, Estimates, Estimator, FittedEstimator
+from gyro_pipeline.estimators import (
+    ESTIMATORS,
+    Estimates,
+    Estimator,
+    FittedEstimator,
+    TrainingRecordings,
+)
 from gyro_pipeline.studies import RESIDUAL_NETWORK
 
 
@@ -25,7 +31,7 @@ class Fitted:
         self, recordings: xr.Dataset, roles: pd.DataFrame, virtual: xr.Dataset | None = None
     ) -> None:
         self._recordings, self._roles, self._virtual = recordings[["angular_rate"]], roles, virtual
-        self._samples: dict[int, xr.Dataset] = {}
+        self._training: dict[tuple[int, int, int], TrainingRecordings] = {}
         self._folds: dict[tuple[str, int, int, int], FittedEstimator] = {}
 
     def estimator(self, name: str, real_imus: int, virtual_imus: int) -> "OfFolds":
@@ -46,15 +52,8 @@ class Fitted:
         if key not in self._folds:
             roles = self._roles[self._roles.fold == fold]
             numbers = sorted(roles.recording[roles.role != TEST].tolist())
-            if fold not in self._samples:
-                self._samples = {fold: self._recordings.sel(recording=numbers).load()}
-            samples = self._samples[fold]
-            if real_imus:
-                samples = samples.sel(imu=slice(TEST_IMU, TEST_IMU + real_imus - 1))
-            if virtual_imus:
-                samples = self._with_virtual(samples, virtual_imus)
             try:
-                self._folds[key] = ESTIMATORS[name]().fit(samples)
+                self._folds[key] = ESTIMATORS[name]().fit(self._samples(key[1:], numbers))
             except InputError as error:
                 sensor = self._recordings.attrs["sensor"]
                 raise InputError(
@@ -63,13 +62,26 @@ class Fitted:
                 ) from error
         return self._folds[key]
 
+    def _samples(self, key: tuple[int, int, int], numbers: list[int]) -> TrainingRecordings:
+        """Recordings of a fold with so many real and virtual IMUs; 0 real ones are all of them."""
+        fold, real_imus, virtual_imus = key
+        if key not in self._training:
+            self._training = {k: known for k, known in self._training.items() if k[0] == fold}
+            samples = self._recordings.sel(recording=numbers)
+            if real_imus:
+                samples = samples.sel(imu=slice(TEST_IMU, TEST_IMU + real_imus - 1))
+            if virtual_imus:
+                samples = self._with_virtual(samples, virtual_imus)
+            self._training[key] = TrainingRecordings(samples.load())
+        return self._training[key]
+
     def _with_virtual(self, samples: xr.Dataset, imus: int) -> xr.Dataset:
         """Real recordings, and those of virtual IMUs that train, numbered after all real IMUs."""
         if self._virtual is None:
             raise InputError("virtual gyroscopes asked of a pipeline that makes none")
         last = self._virtual.attrs["train_recordings"]
         drawn = self._virtual[["angular_rate"]].sel(imu=slice(1, imus), recording=slice(1, last))
-        drawn = drawn.load().assign_coords(imu=drawn.imu + int(self._recordings.imu.max()))
+        drawn = drawn.assign_coords(imu=drawn.imu + int(self._recordings.imu.max()))
         return xr.concat([samples, drawn], "imu", join="outer").assign_attrs(samples.attrs)
 
 

@@ -14,8 +14,8 @@ from gyro_pipeline.estimators import (
     base,
     linear,
     networks,
-    noise,
     shrinkage,
+    training,
 )
 from gyro_pipeline.fingerprints import code_hash, fingerprint
 from gyro_pipeline.learning import perceptrons
@@ -50,7 +50,7 @@ logger = logging.getLogger(__name__)
 
 _CODE = (
     *(allan_module, ceiling, recording_model, reml, history),
-    *(averages, base, linear, networks, noise, perceptrons, shrinkage),
+    *(averages, base, linear, networks, perceptrons, shrinkage, training),
     *(bench_module, folds, scores, truths, windows),
 )
 

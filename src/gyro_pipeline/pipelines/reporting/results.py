@@ -209,7 +209,7 @@ def network_row(
             return score(
                 squared_errors(table, PAPER, windows),
                 squared_errors(mean_errors, PAPER, windows),
-                curve_errors(curve, PAPER, windows),
+                curve_errors(curve, PAPER, windows).of(weights),
                 window_s,
                 weights,
             )
