@@ -22,7 +22,7 @@ ALLOWED = {
     "tracking": {"conventions"},
     "physics": {"conventions", "logs"},
     "estimators": {"conventions", "physics"},
-    "protocol": {"conventions", "parameters"},
+    "protocol": {"conventions", "logs", "parameters", "physics"},
     "learning": {"conventions", "parameters", "protocol"},
     "datasets": {"conventions", "parameters", "fingerprints", "logs", "tracking", "physics"},
     **{

@@ -54,6 +54,19 @@ class Sensor(Parameter):
         return self
 
 
+class Quality(Parameter):
+    """What quality control asks of a recording."""
+
+    length_s: float | None = Field(
+        gt=0,
+        description="to which recordings are cut, at the expected rate, and without which they are "
+        "rejected, seconds; null: to the shortest one that is kept",
+    )
+    needed_pct: float = Field(
+        gt=0, le=100, description="of a sensor's recordings that must remain, percent"
+    )
+
+
 class GroundTruth(Parameter):
     """How the bias of a recording and the noise of a gyroscope are measured."""
 
@@ -282,6 +295,7 @@ class Parameters(Parameter):
 
     source: str = Field(pattern=r"^[a-z0-9_]+$", description="where the logs come from")
     sensors: dict[str, Sensor]
+    quality: Quality
     ground_truth: GroundTruth
     virtual_gyros: VirtualGyros
     splits: Splits

@@ -54,6 +54,7 @@ def run_jobs(
     execution: Execution,
     label: str,
     what: str = "trainings",
+    as_given: bool = False,
 ) -> Iterator[tuple[J, R]]:
     """Run ``function(job, report)`` for every job and yield results as they finish.
 
@@ -66,11 +67,12 @@ def run_jobs(
         execution: ``serial``, or else processes; how many workers.
         label: Names the work in progress lines.
         what: What the jobs are, for the same lines.
+        as_given: Start them in the order given, whatever their work.
 
     Yields:
         A job and its result. However slowly they are asked for, no more than a few wait in memory.
     """
-    ordered = sorted(jobs, key=lambda job: job.work, reverse=True)
+    ordered = list(jobs) if as_given else sorted(jobs, key=lambda job: job.work, reverse=True)
     if not ordered:
         return
     serial = execution.executor == "serial"
@@ -186,9 +188,7 @@ class _Progress:
         self._bar.close()
         if self._finished:
             seconds = time.monotonic() - self._started
-            logger.info(
-                "%s: %d %s in %s", self._label, self._finished, self._what, _clock(seconds)
-            )
+            logger.info("%s: %d %s in %s", self._label, self._finished, self._what, _clock(seconds))
 
     def seconds_left(self) -> float | None:
         """At the pace so far; None before there is one."""
