@@ -24,7 +24,10 @@ ALLOWED = {
     "estimators": {"conventions", "physics"},
     "protocol": {"conventions", "logs", "parameters", "physics"},
     "learning": {"conventions", "parameters", "protocol"},
-    "datasets": {"conventions", "parameters", "fingerprints", "logs", "tracking", "physics"},
+    "readers": {"conventions", "logs", "parameters"},
+    "datasets": {
+        *("conventions", "parameters", "fingerprints", "logs", "tracking", "physics", "readers"),
+    },
     **{
         f"pipelines.{stage}": {
             "conventions",

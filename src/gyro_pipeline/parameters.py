@@ -54,6 +54,12 @@ class Sensor(Parameter):
         return self
 
 
+class ReaderOptions(Parameter):
+    """Stand-in."""
+
+    format: str = "auto"
+
+
 class Quality(Parameter):
     """What quality control asks of a recording."""
 

@@ -156,7 +156,7 @@ def _labelled(
         "sensor": files.sensor,
         "source": files.source,
         "simulated": 0,
-        "rate_hz": float(np.median(measured)) if measured else files.rate_hz,
+        "rate_hz": _rounded(np.median(measured)) if measured else files.rate_hz,
     }
     labels = {str(name): label.values.tolist() for name, label in logs.coords.items()}
     # of the measured samples alone, as runs in the store know it
@@ -182,9 +182,14 @@ def _described(sensor: str, row: Row, length: int) -> dict[str, Any]:
         "rows": judged.rows,
         "start": judged.start if used else None,
         "stop": judged.start + length if used else None,
-        "rate_hz": judged.rate_hz,
+        "rate_hz": None if judged.rate_hz is None else _rounded(judged.rate_hz),
         "findings": "; ".join(f"{one.check}: {one.detail}" for one in judged.findings) or None,
     }
+
+
+def _rounded(rate_hz: np.floating | float) -> float:
+    """To a millionth, which is better than any logger's clock."""
+    return float(f"{rate_hz:.6g}")
 
 
 def _named(rejected: pd.DataFrame) -> list[str]:
