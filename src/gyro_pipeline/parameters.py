@@ -13,6 +13,7 @@ from gyro_pipeline.conventions import AXES
 
 PerAxis = tuple[float, float, float]
 Precision = Literal["float32", "bfloat16"]
+LEAST_BLOCKS = 10
 Gyroscopes = Annotated[int, Field(ge=0, multiple_of=len(AXES), description="a count of axes")]
 
 
@@ -51,6 +52,43 @@ class Sensor(Parameter):
     def _some_recordings_are_for_testing(self) -> Self:
         if self.train_recordings >= self.recordings:
             raise ValueError("train_recordings must leave at least one recording for testing")
+        return self
+
+
+class Quality(Parameter):
+    """What quality control asks of a recording (gyro_pipeline.protocol.quality).
+
+    Its thresholds are multiples of the recording's own noise, chosen by ``false_alarm``.
+    """
+
+    least_s: float = Field(gt=0, description="shortest stretch that is kept, seconds")
+    least_share: float = Field(
+        gt=0,
+        le=1,
+        description="of a recording's rows, in the stretch that is kept of it: all of a sensor's "
+        "recordings are cut to the shortest one",
+    )
+    false_alarm: float = Field(
+        gt=0, lt=0.5, description="probability of an alarm, for each check of a recording at rest"
+    )
+    block_s: float = Field(gt=0, description="of the blocks whose means are compared, seconds")
+    lags_s: list[Annotated[float, Field(gt=0)]] = Field(
+        min_length=1, description="between compared blocks, seconds; long ones see slow onsets"
+    )
+    shock_s: float = Field(gt=0, description="a burst at least so long, in seconds, is a motion")
+    stuck_s: float = Field(ge=0, description="values may repeat for less than this, seconds")
+    coarse_step: float = Field(gt=0, description="quantisation step over noise that is reported")
+    largest_step: float = Field(gt=0, description="the same, of a mean that can be trusted")
+    drift_mdps: float = Field(ge=0, description="least warm-up drift that is reported, mdps")
+    largest_noise_dps: float = Field(gt=0, description="of a sample at rest, deg/s")
+
+    @model_validator(mode="after")
+    def _lengths_hold_blocks(self) -> Self:
+        if self.least_s < LEAST_BLOCKS * self.block_s:
+            raise ValueError(
+                f"least_s: {self.least_s:g} s; expected at least {LEAST_BLOCKS} blocks of block_s, "
+                f"{self.block_s:g} s, whose scatter is compared"
+            )
         return self
 
 
@@ -282,6 +320,7 @@ class Parameters(Parameter):
 
     source: str = Field(pattern=r"^[a-z0-9_]+$", description="where the logs come from")
     sensors: dict[str, Sensor]
+    quality: Quality
     ground_truth: GroundTruth
     virtual_gyros: VirtualGyros
     splits: Splits
