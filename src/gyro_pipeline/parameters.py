@@ -13,6 +13,7 @@ from gyro_pipeline.conventions import AXES
 
 PerAxis = tuple[float, float, float]
 Precision = Literal["float32", "bfloat16"]
+LEAST_BLOCKS = 10
 Gyroscopes = Annotated[int, Field(ge=0, multiple_of=len(AXES), description="a count of axes")]
 
 
@@ -61,16 +62,49 @@ class ReaderOptions(Parameter):
 
 
 class Quality(Parameter):
-    """What quality control asks of a recording."""
+    """What quality control asks of a recording (gyro_pipeline.protocol.quality).
 
+    Its thresholds are multiples of the recording's own noise, chosen by ``false_alarm``.
+    """
+
+    least_s: float = Field(gt=0, description="shortest stretch that is kept, seconds")
+    least_share: float = Field(
+        gt=0,
+        le=1,
+        description="of a recording's rows, in the stretch that is kept of it: all of a sensor's "
+        "recordings are cut to the shortest one",
+    )
+    false_alarm: float = Field(
+        gt=0, lt=0.5, description="probability of an alarm, for each check of a recording at rest"
+    )
+    block_s: float = Field(gt=0, description="of the blocks whose means are compared, seconds")
+    lags_s: list[Annotated[float, Field(gt=0)]] = Field(
+        min_length=1, description="between compared blocks, seconds; long ones see slow onsets"
+    )
+    shock_s: float = Field(gt=0, description="a burst at least so long, in seconds, is a motion")
+    stuck_s: float = Field(ge=0, description="values may repeat for less than this, seconds")
+    coarse_step: float = Field(gt=0, description="quantisation step over noise that is reported")
+    largest_step: float = Field(gt=0, description="the same, of a mean that can be trusted")
+    drift_mdps: float = Field(ge=0, description="least warm-up drift that is reported, mdps")
+    largest_noise_dps: float = Field(gt=0, description="of a sample at rest, deg/s")
     length_s: float | None = Field(
+        None,
         gt=0,
         description="to which recordings are cut, at the expected rate, and without which they are "
         "rejected, seconds; null: to the shortest one that is kept",
     )
     needed_pct: float = Field(
-        gt=0, le=100, description="of a sensor's recordings that must remain, percent"
+        90.0, gt=0, le=100, description="of a sensor's recordings that must remain, percent"
     )
+
+    @model_validator(mode="after")
+    def _lengths_hold_blocks(self) -> Self:
+        if self.least_s < LEAST_BLOCKS * self.block_s:
+            raise ValueError(
+                f"least_s: {self.least_s:g} s; expected at least {LEAST_BLOCKS} blocks of block_s, "
+                f"{self.block_s:g} s, whose scatter is compared"
+            )
+        return self
 
 
 class GroundTruth(Parameter):
