@@ -24,9 +24,6 @@ WHOLE = "all"
 _DOMINANCE = 4
 """So many times more samples than recordings or gyroscopes tell the sample axis from the others."""
 
-_BYTES = 8
-"""Of a sample, at most."""
-
 Order = tuple[str, ...]
 
 
@@ -166,16 +163,17 @@ class ArrayLogs(AbstractDataset[Logs, Logs]):
         self, split: str, name: str, order: Order, count: Mapping[str, int], first: int
     ) -> list[LogEntry]:
         """The recordings of one file, IMU by IMU, numbered from ``first`` on."""
+        path, imus = self._path / name, count["gyroscope"] // len(AXES)
         return [
             LogEntry(
                 imu + 1,
                 first + recording,
                 f"{name} recording {recording + 1}",
-                partial(_read, self._path / name, order, imu, recording),
-                size=_BYTES * len(AXES) * count["sample"],
+                partial(_read, path, order, imu, recording),
+                size=path.stat().st_size // (imus * count["recording"]),
                 split=None if split == WHOLE else split,
             )
-            for imu in range(count["gyroscope"] // len(AXES))
+            for imu in range(imus)
             for recording in range(count["recording"])
         ]
 
