@@ -1,6 +1,6 @@
 """What quality control finds, what it wrongly rejects, and how long it takes.
 
-    python benchmarks/quality.py                # everything, about 3 min
+    python benchmarks/quality.py                # everything, half a minute
     python benchmarks/quality.py --repeat 10    # a tenth of the recordings
 
 Noise is that of the four embedded sensors (conf/base/globals.yml) at their rates, 13,000 samples a

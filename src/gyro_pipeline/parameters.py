@@ -13,8 +13,10 @@ from gyro_pipeline.conventions import AXES
 
 PerAxis = tuple[float, float, float]
 Precision = Literal["float32", "bfloat16"]
-LEAST_BLOCKS = 10
 Gyroscopes = Annotated[int, Field(ge=0, multiple_of=len(AXES), description="a count of axes")]
+
+LEAST_BLOCKS = 10
+"""Whose means quality control compares: the scatter of fewer is not known well enough."""
 
 
 class Parameter(BaseModel):

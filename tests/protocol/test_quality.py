@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import signal
 
 from gyro_pipeline.conventions import AXES, InputError
 from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding, Log
@@ -187,6 +188,28 @@ def test_what_is_no_gyroscope_at_rest_is_refused_for_its_noise(samples, quality)
     assert "quality.largest_noise_dps" in detail(inspected, "noise level")
 
 
+def test_a_sensor_behind_a_narrow_low_pass_filter_is_at_rest(quality):
+    filtered = signal.butter(2, 5, fs=250, output="sos")
+    for seed in range(5):
+        rates = signal.sosfilt(filtered, np.random.default_rng(seed).normal(0, 1, (13_000, 3)), 0)
+        assert inspect(Log(rates[500:]), 250.0, quality).outcome == KEPT
+
+
+@pytest.mark.parametrize("rate_hz", [0.1, 2.0])
+def test_a_rate_too_low_for_blocks_asks_for_rows(samples, quality, rate_hz):
+    assert checks(inspect(Log(samples[:49]), rate_hz, quality)) == {"too short": REJECTED}
+    assert inspect(Log(samples[:50]), rate_hz, quality).outcome == KEPT
+
+
+@pytest.mark.filterwarnings("error")
+def test_knocks_all_the_time_leave_no_stretch(samples, quality):
+    samples[::70] += 5
+    assert checks(inspect(Log(samples), RATE_HZ, quality)) == {
+        "shocks": REPAIRED,
+        "too short": REJECTED,
+    }
+
+
 def test_samples_that_are_not_three_columns_are_refused(quality):
     with pytest.raises(InputError, match=r"expected samples of 3 axes, \(n, 3\), got shape \(3, 9"):
         inspect(Log(np.zeros((3, 900))), RATE_HZ, quality)
@@ -272,7 +295,7 @@ def test_of_100_disturbances_at_least_99_are_found(parameters, disturb, check):
 
 @pytest.mark.parametrize("colour", ["white", "lag 1", "flicker", "warm-up"])
 def test_of_1000_recordings_at_rest_at_most_10_are_not_kept(parameters, colour):
-    """A tenth of them here; all of them in benchmarks/quality.py."""
+    """About a tenth of them here; all of them in benchmarks/quality.py."""
     p, generator = parameters("base"), np.random.default_rng(10)
     noise = {"lag 1": {"lag1_correlation": -0.15}, "flicker": {"flicker_dps": 3e-3}}
     lost = 0

@@ -34,20 +34,24 @@ from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding, Log
-from gyro_pipeline.parameters import Quality
+from gyro_pipeline.parameters import LEAST_BLOCKS, Quality
 from gyro_pipeline.physics import damage, stationarity
 
 _NO_NUMBER = 1e12
 """Garbage bytes read as a number can be as large as 1e308, which overflows when it is squared."""
 
 _NOISE_RISE = 2
-"""Of a block over the recording, for motion. At rest it is below 1.4 on the public DOT files, whose
-noise is coloured, and in white noise; with 7 samples to a block as well."""
+"""Of a block over the recording, for motion. At rest it is below 1.4 on the public files, whose
+noise is partly coloured; in white noise 2 has a probability of 4e-6 per recording even at 7 samples
+per block, and far less with more."""
 
-_COLOUR = 5
+_COLOUR = 8
 """Scatter of block means over what white noise of the same samples has, for motion throughout. At
-rest it is 0.7 to 1.2 on the public files, and 3 behind a low-pass filter at a tenth of the
-bandwidth; of a sensor that is carried about, 10 and more."""
+rest it is 0.7 to 1.2 on the public files, and up to 7 behind a low-pass filter of 5 Hz at 250 Hz;
+of a sensor that is carried about, 13 to 29."""
+
+_LEAST_BLOCK = 5
+"""Samples. The noise of shorter blocks is known too badly for a median of them."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +162,8 @@ def _check_length(
     start: int, stop: int, rows: int, rate_hz: float, quality: Quality
 ) -> list[Finding]:
     """Whether a stretch of a log of so many rows is worth keeping."""
-    needed = max(quality.least_s * rate_hz, quality.least_share * rows)
+    for_blocks = LEAST_BLOCKS * _block_size(rate_hz, quality)
+    needed = max(quality.least_s * rate_hz, quality.least_share * rows, for_blocks)
     if stop - start >= needed:
         return []
     detail = (
@@ -169,12 +174,16 @@ def _check_length(
     return [Finding("too short", REJECTED, detail)]
 
 
+def _block_size(rate_hz: float, quality: Quality) -> int:
+    return max(round(quality.block_s * rate_hz), _LEAST_BLOCK)
+
+
 def _check_rest(
     rates: NDArray[np.float64], first_row: int, rate_hz: float, quality: Quality
 ) -> tuple[NDArray[np.bool_], list[Finding]]:
     """Which rows of a stretch the gyroscope was at rest in, (n,), and what else its noise says."""
     at_rest = np.ones(rates.shape[1], bool)
-    blocks = stationarity.Blocks.of(rates, max(round(quality.block_s * rate_hz), 2))
+    blocks = stationarity.Blocks.of(rates, _block_size(rate_hz, quality))
     findings = _check_steps(rates, blocks, quality) + _check_noise(blocks, quality)
     if _rejects(findings):
         return at_rest, findings
@@ -274,6 +283,8 @@ def _shocks(
 def _check_drift(
     blocks: stationarity.Blocks, calm: NDArray[np.bool_], rate_hz: float, quality: Quality
 ) -> list[Finding]:
+    if np.count_nonzero(calm) < LEAST_BLOCKS:
+        return []
     least_dps = quality.drift_mdps * MDPS
     drifts = stationarity.drifts(blocks, calm, rate_hz, quality.false_alarm, least_dps)
     details = [
