@@ -87,8 +87,8 @@ class ArrayLogs(AbstractDataset[Logs, Logs]):
         for (split, name), count in zip(self._files.items(), counts, strict=True):
             entries += self._entries(split, name, order, count, first)
             first += count["recording"]
-        rate_hz = self.entry.rate_hz
-        return Logs(self._sensor, self._source, False, rate_hz, entries)
+        entries.sort(key=lambda entry: (entry.imu, entry.recording))
+        return Logs(self._sensor, self._source, False, self.entry.rate_hz, entries)
 
     def save(self, data: Logs) -> None:
         """Refuse: logs are read only."""
