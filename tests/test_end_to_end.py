@@ -36,6 +36,7 @@ REPORTED = {
     *(f"tables/augmentation_{name}.{kind}"
       for name in ("results", "three_gyroscopes", "multiple_gyroscopes")
       for kind in ("csv", "md", "tex")),
+    *(f"tables/recording_quality.{kind}" for kind in ("csv", "md", "tex")),
     *(f"figures/augmentation_{sensor}_{real}_real.{kind}"
       for sensor in ("sparkfun", "dot") for real in (3, 12) for kind in ("png", "svg")),
 }  # fmt: skip
@@ -47,6 +48,7 @@ TABLES = {
     "real2real_generalization",
     "sensor_specifications",
     "dataset_hours",
+    "recording_quality",
 }
 RESULTS = {"augmentation_results", "real2real_results", "input_channels_results"}
 FIGURES = {

@@ -64,7 +64,8 @@ def inspect_logs(
     length = min((judged.stop - judged.start for _, judged in used), default=0)
     there = _there(used, *numbers)
     recordings = _labelled(files, used, rates.cut(there, length), warmth.cut(there, length))
-    return recordings, pd.DataFrame(_described(files.sensor, row, length) for row in rows)
+    table = pd.DataFrame(_described(files.sensor, row, length) for row in rows)
+    return recordings, table.astype({"start": "Int64", "stop": "Int64"})
 
 
 def require_enough(recordings: xr.Dataset, table: pd.DataFrame, quality: Quality) -> xr.Dataset:
