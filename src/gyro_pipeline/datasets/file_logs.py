@@ -28,6 +28,7 @@ _NAMED = 5
 _BINARY = {".npy", ".npz", ".mat", ".parquet"}
 """What is read as fast as anything that could be kept of it."""
 
+_HIDDEN = re.compile(r"(^|/)\.")
 _PART = re.compile(r"\{(imu|recording)(:name)?\}|(\*)")
 
 Numbers = dict[str, tuple[int, int]]
@@ -114,20 +115,7 @@ class FileLogs(AbstractDataset[Logs, Logs]):
 
     def _matching(self) -> dict[str, re.Match[str]]:
         """Paths in the folder that the pattern describes, in their order."""
-        where = f"{self._sensor} {self._path}"
-        if not self._path.is_dir():
-            raise InputError(
-                f"{where}: no such folder; put the files there, or name another path in the catalog"
-            )
-        names = sorted(
-            (
-                path.relative_to(self._path).as_posix()
-                for path in self._path.rglob("*")
-                if path.is_file()
-            ),
-            key=_natural,
-        )
-        names = [name for name in names if not re.search(r"(^|/)\.", name)]
+        where, names = f"{self._sensor} {self._path}", self._names()
         matches = {name: match for name in names if (match := self._regex.fullmatch(name))}
         others = [name for name in names if name not in matches]
         if not matches:
@@ -141,6 +129,17 @@ class FileLogs(AbstractDataset[Logs, Logs]):
                 *(where, len(others), self._pattern, _listed(others)),
             )
         return matches
+
+    def _names(self) -> list[str]:
+        """Paths of all files in the folder but hidden ones, 2 before 10."""
+        if not self._path.is_dir():
+            raise InputError(
+                f"{self._sensor} {self._path}: no such folder; put the files there, or name "
+                "another path in the catalog"
+            )
+        files = (path for path in self._path.rglob("*") if path.is_file())
+        names = (path.relative_to(self._path).as_posix() for path in files)
+        return sorted((name for name in names if not _HIDDEN.search(name)), key=_natural)
 
     def _readings(self, names: Iterable[str]) -> dict[str, Reading]:
         """How each file is read, and where its reading is kept."""
@@ -195,7 +194,7 @@ def _numbered(sensor: str, pattern: str, found: Mapping[str, re.Match[str]]) -> 
     for name in found:
         imu = imus.get(name, 1)
         counts[imu] += 1
-        number = imu, recordings.get(name, counts[imu])
+        number = imu, recordings.get(name, counts[imu] if "*" in pattern else 1)
         other = taken.setdefault(number, name)
         if other != name:
             raise InputError(
