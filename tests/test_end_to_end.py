@@ -348,7 +348,9 @@ def test_reporting_makes_what_it_can_and_names_what_is_missing(repeated, incompl
     assert incomplete.code != 0
     assert "Traceback" not in incomplete.output
     gone = {name for name in REPORTED if "multiple_gyroscopes" in name or "dot_12_real" in name}
-    kept = {name for name in incomplete.report if name.startswith(("tables/aug", "figures/aug"))}
+    kept = {
+        name for name in incomplete.report if re.match("(tables|figures)/(aug|recording)", name)
+    }
     assert kept == REPORTED - gone
     three = "tables/augmentation_three_gyroscopes.md"
     assert incomplete.report[three] == repeated.report[three]
