@@ -19,12 +19,21 @@ ALLOWED = {
     "parameters": {"conventions"},
     "studies": {"conventions", "parameters"},
     "logs": {"conventions"},
+    "readers": {"conventions", "logs", "parameters"},
     "tracking": {"conventions"},
     "physics": {"conventions", "logs"},
     "estimators": {"conventions", "physics"},
     "protocol": {"conventions", "parameters"},
     "learning": {"conventions", "parameters", "protocol"},
-    "datasets": {"conventions", "parameters", "fingerprints", "logs", "tracking", "physics"},
+    "datasets": {
+        "conventions",
+        "parameters",
+        "fingerprints",
+        "logs",
+        "readers",
+        "tracking",
+        "physics",
+    },
     **{
         f"pipelines.{stage}": {
             "conventions",
