@@ -308,6 +308,16 @@ CASES = {
         lines(columns_lost),
         Refused("got 30 of 60 that are not: row 30 .line 32."),
     ),
+    "a comma too many in the header": (
+        ARTEMIS,
+        lambda text: f",{text}",
+        Refused("as many columns as the rows, 14, got 15"),
+    ),
+    "a comma too many in a header that rows outdo by one": (
+        ANGLES,
+        headers("psi,f_x,f_y,f_z,w_x,w_y,w_z,", "psi,,f_x,f_y,f_z,w_x,w_y,w_z"),
+        Refused("as many columns as the rows, 11, got 11"),
+    ),
     "a header of fewer columns": (
         ANGLES,
         headers("phi,theta,", ""),

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from gyro_pipeline.conventions import AXES, InputError
 from gyro_pipeline.readers.fields import DELIMITERS, is_clock, is_date, is_number, split
+from gyro_pipeline.readers.headers import listed
 from gyro_pipeline.readers.text import TextTable
 
 _HEAD = 1 << 14
@@ -147,19 +148,24 @@ def _above(lines: list[_Line], rows: _Rows) -> _Line | None:
 
 
 def _names(path: Path, above: _Line | None, rows: _Rows) -> tuple[str, ...]:
-    """The header, as long as the rows; a delimiter at the end of either does not count."""
+    """The header, as long as the rows; a delimiter at the end of one alone does not count.
+
+    A header with a delimiter too many or too few elsewhere would shift the names: it is refused.
+    """
     names = split(above.text, rows.delimiter) if above else []
     width = len(rows.fields)
     if len(names) < len(AXES):
         return ("",) * width
-    if len(names) == width + 1 and not names[-1]:
-        names.pop()
-    elif len(names) == width - 1 and not rows.fields[-1]:
-        names.append("")
-    if len(names) != width:
+    ends = bool(names[-1]), bool(rows.fields[-1])
+    if ends == (False, True) and len(names) == width + 1:
+        return tuple(names[:-1])
+    if ends == (True, False) and len(names) == width - 1:
+        return (*names, "")
+    if len(names) != width or (ends[0] != ends[1] and "" in names):
         raise InputError(
             f"{path} line {above.number if above else 0}: expected a header of as many columns as "
-            f"the rows, {width}, got {len(names)}; which is which cannot be told: correct it"
+            f"the rows, {width}, got {len(names)}, {listed(names)}; which is which cannot be told: "
+            "correct it"
         )
     return tuple(names)
 
