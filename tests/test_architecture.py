@@ -19,14 +19,20 @@ ALLOWED = {
     "parameters": {"conventions"},
     "studies": {"conventions", "parameters"},
     "logs": {"conventions"},
+    "readers": {"conventions", "logs", "parameters"},
     "tracking": {"conventions"},
     "physics": {"conventions"},
     "estimators": {"conventions", "physics"},
     "protocol": {"conventions", "logs", "parameters", "physics"},
     "learning": {"conventions", "parameters", "protocol"},
-    "readers": {"conventions", "logs", "parameters"},
     "datasets": {
-        *("conventions", "parameters", "fingerprints", "logs", "tracking", "physics", "readers"),
+        "conventions",
+        "parameters",
+        "fingerprints",
+        "logs",
+        "readers",
+        "tracking",
+        "physics",
     },
     **{
         f"pipelines.{stage}": {

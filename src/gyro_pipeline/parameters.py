@@ -57,10 +57,40 @@ class Sensor(Parameter):
         return self
 
 
-class ReaderOptions(Parameter):
-    """Stand-in."""
+RateUnits = Literal["deg/s", "rad/s", "mdps", "raw"]
+TimeUnits = Literal["s", "ms", "us"]
+Column = Annotated[str | Annotated[int, Field(ge=0)], Field(description="a name, or from 0")]
 
-    format: str = "auto"
+
+class ReaderOptions(Parameter):
+    """How the files of a logger are read; what is null comes from the header or the format."""
+
+    format: str = Field(
+        "auto", description="name in gyro_pipeline.readers.READERS; auto: told by the header"
+    )
+    columns: tuple[Column, Column, Column] | None = Field(
+        None, description="of the angular rates about x, y, z"
+    )
+    units: RateUnits | None = Field(None, description="of the angular rates")
+    scale_dps: float | None = Field(
+        None, gt=0, allow_inf_nan=False, description="deg/s in one count; with units: raw only"
+    )
+    time_column: Column | None = None
+    time_units: TimeUnits | None = Field(None, description="of the time column")
+    temperature_column: Column | None = Field(None, description="degrees Celsius")
+    counter_column: Column | None = Field(None, description="counts packets, one a row")
+    counter_bits: int | None = Field(
+        None, ge=2, le=32, description="after which the counter starts anew; null: 16"
+    )
+    rate_tolerance_pct: float = Field(
+        2.0, gt=0, description="that a measured sample rate may differ from the expected one"
+    )
+
+    @model_validator(mode="after")
+    def _raw_counts_have_a_scale(self) -> Self:
+        if (self.units == "raw") != (self.scale_dps is not None):
+            raise ValueError("units: raw and scale_dps go together: give both or none")
+        return self
 
 
 class Quality(Parameter):
