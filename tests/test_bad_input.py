@@ -129,14 +129,15 @@ def test_an_only_that_matches_nothing(new_project, pipeline, only):
     ("array", "words"),
     [
         (good()[0], ["expected 3 axes", "got shape (3, 1300)"]),
-        (with_one((2, 1, 5), np.nan), ["recording 3, IMU 1, axis y", "NaN", "remove"]),
-        (with_one((4, 0, 0), np.inf), ["recording 5, IMU 1, axis x", "infinite", "remove"]),
-        (with_one((6, 2), 0.25), ["recording 7, IMU 1, axis z", "zero variance", "remove"]),
+        (with_one((2, 1, 650), np.nan), ["IMU 1 recording 3", "non-finite", "too short", "remove"]),
+        (with_one((4, 0, 650), np.inf), ["IMU 1 recording 5", "non-finite", "too short", "remove"]),
+        (with_one((6, 2), 0.25), ["IMU 1 recording 7", "mine.npy recording 7", "stuck", "axis z"]),
         (np.array([{"a": 1}]), ["pickled objects", "never loaded", "delete"]),
         (good()[:, :2], ["(7, 2, 1300)", "divisible by 3"]),
-        (good()[..., :200], ["window of 10 s is 250 samples", "has 200", "windows_s"]),
+        (good()[..., :200], ["0 of 7 recordings", "too short", "8 s", "quality.least_s"]),
+        (good()[..., :300], ["window of 30 s is 750 samples", "has 300", "windows_s"]),
     ],
-    ids=["rank", "nan", "infinite", "constant", "pickled", "gyroscopes", "short"],
+    ids=["rank", "nan", "infinite", "constant", "pickled", "gyroscopes", "short", "window"],
 )
 def test_files(mine, array, words):
     output = refused(mine(array))
@@ -245,7 +246,7 @@ class Case:
 
 CASES = {
     "key": Case(("--env=mine", "--params=trainin.epochs=3"), ("trainin: unknown key",)),
-    "constant": Case(("--env=mine",), ("recording 7, IMU 1, axis z",), with_one((6, 2), 0.25)),
+    "constant": Case(("--env=mine",), ("IMU 1 recording 7", "axis z"), with_one((6, 2), 0.25)),
     "pickled": Case(("--env=mine",), ("never loaded",), np.array([{"a": 1}])),
     "foreign": Case(("--env=mine",), ("expected an MLflow store",), spoil=foreign),
 }

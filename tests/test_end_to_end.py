@@ -36,6 +36,7 @@ REPORTED = {
     *(f"tables/augmentation_{name}.{kind}"
       for name in ("results", "three_gyroscopes", "multiple_gyroscopes")
       for kind in ("csv", "md", "tex")),
+    *(f"tables/recording_quality.{kind}" for kind in ("csv", "md", "tex")),
     *(f"figures/augmentation_{sensor}_{real}_real.{kind}"
       for sensor in ("sparkfun", "dot") for real in (3, 12) for kind in ("png", "svg")),
 }  # fmt: skip
@@ -47,6 +48,7 @@ TABLES = {
     "real2real_generalization",
     "sensor_specifications",
     "dataset_hours",
+    "recording_quality",
 }
 RESULTS = {"augmentation_results", "real2real_results", "input_channels_results"}
 FIGURES = {
@@ -346,7 +348,9 @@ def test_reporting_makes_what_it_can_and_names_what_is_missing(repeated, incompl
     assert incomplete.code != 0
     assert "Traceback" not in incomplete.output
     gone = {name for name in REPORTED if "multiple_gyroscopes" in name or "dot_12_real" in name}
-    kept = {name for name in incomplete.report if name.startswith(("tables/aug", "figures/aug"))}
+    kept = {
+        name for name in incomplete.report if re.match("(tables|figures)/(aug|recording)", name)
+    }
     assert kept == REPORTED - gone
     three = "tables/augmentation_three_gyroscopes.md"
     assert incomplete.report[three] == repeated.report[three]

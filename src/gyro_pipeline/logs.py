@@ -60,6 +60,7 @@ class LogEntry:
         recording: From 1.
         where: For messages: the file, and where in it.
         read: Reads it; can be pickled. Raises InputError where the file cannot be used.
+        size: Bytes to read, about: what reading and inspecting it costs.
         split: ``train`` or ``test``, where the source came split.
     """
 
@@ -67,6 +68,7 @@ class LogEntry:
     recording: int
     where: str
     read: Callable[[], Log]
+    size: int
     split: str | None = None
 
 

@@ -15,6 +15,9 @@ PerAxis = tuple[float, float, float]
 Precision = Literal["float32", "bfloat16"]
 Gyroscopes = Annotated[int, Field(ge=0, multiple_of=len(AXES), description="a count of axes")]
 
+LEAST_BLOCKS = 10
+"""Whose means quality control compares: the scatter of fewer is not known well enough."""
+
 
 class Parameter(BaseModel):
     """Base of all groups: no unknown keys, no change after loading."""
@@ -63,6 +66,88 @@ class Sensor(Parameter):
     def _some_recordings_are_for_testing(self) -> Self:
         if self.train_recordings >= self.recordings:
             raise ValueError("train_recordings must leave at least one recording for testing")
+        return self
+
+
+RateUnits = Literal["deg/s", "rad/s", "mdps", "raw"]
+TimeUnits = Literal["s", "ms", "us"]
+Column = Annotated[str | Annotated[int, Field(ge=0)], Field(description="a name, or from 0")]
+
+
+class ReaderOptions(Parameter):
+    """How the files of a logger are read; what is null comes from the header or the format."""
+
+    format: str = Field(
+        "auto", description="name in gyro_pipeline.readers.READERS; auto: told by the header"
+    )
+    columns: tuple[Column, Column, Column] | None = Field(
+        None, description="of the angular rates about x, y, z"
+    )
+    units: RateUnits | None = Field(None, description="of the angular rates")
+    scale_dps: float | None = Field(
+        None, gt=0, allow_inf_nan=False, description="deg/s in one count; with units: raw only"
+    )
+    time_column: Column | None = None
+    time_units: TimeUnits | None = Field(None, description="of the time column")
+    temperature_column: Column | None = Field(None, description="degrees Celsius")
+    counter_column: Column | None = Field(None, description="counts packets, one a row")
+    counter_bits: int | None = Field(
+        None, ge=2, le=32, description="after which the counter starts anew; null: 16"
+    )
+    rate_tolerance_pct: float = Field(
+        2.0, gt=0, description="that a measured sample rate may differ from the expected one"
+    )
+
+    @model_validator(mode="after")
+    def _raw_counts_have_a_scale(self) -> Self:
+        if (self.units == "raw") != (self.scale_dps is not None):
+            raise ValueError("units: raw and scale_dps go together: give both or none")
+        return self
+
+
+class Quality(Parameter):
+    """What quality control asks of a recording (gyro_pipeline.protocol.quality).
+
+    Its thresholds are multiples of the recording's own noise, chosen by ``false_alarm``.
+    """
+
+    least_s: float = Field(gt=0, description="shortest stretch that is kept, seconds")
+    least_share: float = Field(
+        gt=0,
+        le=1,
+        description="of a recording's rows, in the stretch that is kept of it: all of a sensor's "
+        "recordings are cut to the shortest one",
+    )
+    false_alarm: float = Field(
+        gt=0, lt=0.5, description="probability of an alarm, for each check of a recording at rest"
+    )
+    block_s: float = Field(gt=0, description="of the blocks whose means are compared, seconds")
+    lags_s: list[Annotated[float, Field(gt=0)]] = Field(
+        min_length=1, description="between compared blocks, seconds; long ones see slow onsets"
+    )
+    shock_s: float = Field(gt=0, description="a burst at least so long, in seconds, is a motion")
+    stuck_s: float = Field(ge=0, description="values may repeat for less than this, seconds")
+    coarse_step: float = Field(gt=0, description="quantisation step over noise that is reported")
+    largest_step: float = Field(gt=0, description="the same, of a mean that can be trusted")
+    drift_mdps: float = Field(ge=0, description="least warm-up drift that is reported, mdps")
+    largest_noise_dps: float = Field(gt=0, description="of a sample at rest, deg/s")
+    length_s: float | None = Field(
+        None,
+        gt=0,
+        description="to which recordings are cut, at the expected rate, and without which they are "
+        "rejected, seconds; null: to the shortest one that is kept",
+    )
+    needed_pct: float = Field(
+        90.0, gt=0, le=100, description="of a sensor's recordings that must remain, percent"
+    )
+
+    @model_validator(mode="after")
+    def _lengths_hold_blocks(self) -> Self:
+        if self.least_s < LEAST_BLOCKS * self.block_s:
+            raise ValueError(
+                f"least_s: {self.least_s:g} s; expected at least {LEAST_BLOCKS} blocks of block_s, "
+                f"{self.block_s:g} s, whose scatter is compared"
+            )
         return self
 
 
@@ -297,6 +382,7 @@ class Parameters(Parameter):
         pattern="^https?://", description="base address of the authors' files; the catalog reads it"
     )
     sensors: dict[str, Sensor]
+    quality: Quality
     ground_truth: GroundTruth
     virtual_gyros: VirtualGyros
     splits: Splits

@@ -39,7 +39,7 @@ def register_pipelines() -> dict[str, Pipeline]:
     wanted = parameters.only.sensor
     pipelines = {
         study: _runs(parameters, {study: sensors[study]})
-        + reporting.create_pipeline({study: every_sensor[study]})
+        + reporting.create_pipeline({study: every_sensor[study]}, inspected=[*parameters.sensors])
         for study in parameters.studies
     }
     known = [sensor for sensor in parameters.sensors if wanted in (None, sensor)]
@@ -53,6 +53,7 @@ def register_pipelines() -> dict[str, Pipeline]:
         {study: every_sensor[study] for study in default},
         sensors=[row.sensor for row in published.specifications],
         virtual=[row.sensor for row in published.hours if row.virtual],
+        inspected=[*parameters.sensors],
     )
     pipelines[LEAKAGE] = _leakage(parameters)
     runs = _runs(parameters, {study: sensors[study] for study in default})

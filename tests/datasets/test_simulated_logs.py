@@ -10,6 +10,7 @@ from kedro.io import DatasetError
 from gyro_pipeline.datasets import simulated_logs
 from gyro_pipeline.datasets.recordings import Recordings
 from gyro_pipeline.datasets.simulated_logs import SimulatedLogs
+from gyro_pipeline.logs import Logs
 
 SENSORS = {
     "dot": {
@@ -34,6 +35,17 @@ def simulated(folder, seed=1, sensor="dot", **changes):
     return SimulatedLogs(sensor, sensors, "simulated", str(folder), seed)
 
 
+def recordings(source):
+    """What was drawn, and all samples, of which no IMU lacks any."""
+    logs = source.load()
+    rates = np.array([entry.read().samples.T for entry in logs.entries], dtype=np.float32)
+    shape = (logs.drawn.sizes["imu"], logs.drawn.sizes["recording"], *rates.shape[1:])
+    labelled = (("imu", "recording", "axis", "sample"), rates.reshape(shape))
+    splits = "recording", [entry.split for entry in logs.entries[: shape[1]]]
+    drawn = logs.drawn.assign_coords(split=splits).assign_attrs(rate_hz=logs.rate_hz)
+    return drawn.assign(angular_rate=labelled)
+
+
 def stamps(folder):
     return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in folder.iterdir()}
 
@@ -44,18 +56,19 @@ def test_files_have_the_published_layout_and_give_what_was_read(tmp_path):
     train, test = np.load(tmp_path / "dot_train.npy"), np.load(tmp_path / "dot_test.npy")
     assert (train.shape, test.shape) == ((30, 6, 400), (10, 6, 400))
     assert train.dtype == test.dtype == np.float32
-    rate = logs.angular_rate
+    rate = recordings(simulated(tmp_path)).angular_rate
     np.testing.assert_array_equal(rate.sel(imu=2, recording=30, axis="x"), train[29, 3])
     np.testing.assert_array_equal(rate.sel(imu=2, recording=31, axis="z"), test[0, 5])
     assert not np.isnan(rate).any()
-    assert logs.given_split.values.tolist() == ["train"] * 30 + ["test"] * 10
-    assert logs.simulated == 1
+    splits = [entry.split for entry in logs.entries]
+    assert splits == 2 * [*["train"] * 30, *["test"] * 10]
+    assert logs.simulated
     assert logs.source == "simulated"
     assert logs.rate_hz == 100
 
 
 def test_truth_has_the_stated_model(tmp_path):
-    logs = simulated(tmp_path).load()
+    logs = simulated(tmp_path).load().drawn
     assert logs.true_bias.dims == ("imu", "recording", "axis")
     assert logs.true_bias.dtype == np.float64
     np.testing.assert_allclose(logs.true_noise, [3e-3, 6e-3, 12e-3], rtol=1e-12)
@@ -69,7 +82,7 @@ def test_truth_has_the_stated_model(tmp_path):
 
 
 def test_samples_are_the_bias_plus_noise_of_the_stated_level(tmp_path):
-    logs = simulated(tmp_path).load()
+    logs = recordings(simulated(tmp_path))
     noise = logs.angular_rate - logs.true_bias
     sigma = logs.true_noise * np.sqrt(logs.rate_hz)
     # 32,000 samples an axis: 1 standard error is 0.4 %
@@ -81,41 +94,42 @@ def test_samples_are_the_bias_plus_noise_of_the_stated_level(tmp_path):
 
 def test_colour_reaches_the_noise(tmp_path):
     model = SENSORS["dot"]["simulated"]
-    correlated = simulated(tmp_path / "a", simulated=model | {"lag1_correlation": -0.3}).load()
+    changed = model | {"lag1_correlation": -0.3}
+    correlated = recordings(simulated(tmp_path / "a", simulated=changed))
     noise = (correlated.angular_rate - correlated.true_bias).values
     lag1 = (noise[..., 1:] * noise[..., :-1]).mean() / (noise**2).mean()
     assert lag1 == pytest.approx(-0.3, abs=0.02)
-    flicker = simulated(tmp_path / "b", simulated=model | {"flicker_mdps": 100}).load()
+    flicker = recordings(simulated(tmp_path / "b", simulated=model | {"flicker_mdps": 100}))
     means = (flicker.angular_rate - flicker.true_bias).mean("sample")
     assert float(means.std()) > 0.02  # white noise alone gives 0.004
 
 
 def test_a_second_load_only_reads(tmp_path):
-    first = simulated(tmp_path).load()
+    first = recordings(simulated(tmp_path))
     before = stamps(tmp_path)
-    second = simulated(tmp_path).load()
+    second = recordings(simulated(tmp_path))
     assert stamps(tmp_path) == before
     xr.testing.assert_identical(first, second)
 
 
 def test_the_seed_and_the_sensor_alone_decide_the_draws(tmp_path):
-    one = simulated(tmp_path / "one").load()
-    again = simulated(tmp_path / "again").load()
+    one = recordings(simulated(tmp_path / "one"))
+    again = recordings(simulated(tmp_path / "again"))
     xr.testing.assert_identical(one, again)
     for other in (simulated(tmp_path / "two", seed=2), simulated(tmp_path / "ng", sensor="ng")):
-        assert (other.load().true_unit_bias != one.true_unit_bias).all()
+        assert (other.load().drawn.true_unit_bias != one.true_unit_bias).all()
 
 
 @pytest.mark.parametrize("changes", [{"seed": 2}, {"train_recordings": 20}, {"recording_s": 8}])
 def test_other_settings_are_written_anew_and_said(tmp_path, caplog, changes):
     caplog.set_level(logging.INFO, "gyro_pipeline")
-    old = simulated(tmp_path).load()
+    old = recordings(simulated(tmp_path))
     caplog.clear()
-    new = simulated(tmp_path, **changes).load()
-    assert new.data_hash != old.data_hash
+    new = recordings(simulated(tmp_path, **changes))
+    assert not new.identical(old)
     assert len(caplog.records) == 1
     assert "writing simulated dot logs anew, since their settings have changed" in caplog.text
-    xr.testing.assert_identical(new, simulated(tmp_path / "fresh", **changes).load())
+    xr.testing.assert_identical(new, recordings(simulated(tmp_path / "fresh", **changes)))
 
 
 def interrupt(*_, **__):
@@ -132,27 +146,35 @@ def test_interrupted_while_writing_samples_leaves_nothing(tmp_path, monkeypatch)
 
 
 def test_interrupted_before_the_mark_is_written_anew(tmp_path, monkeypatch):
-    expected = simulated(tmp_path).load()
+    expected = recordings(simulated(tmp_path))
     with monkeypatch.context() as patch:
         patch.setattr(Recordings, "save", interrupt)
         with pytest.raises(KeyboardInterrupt):
             simulated(tmp_path, seed=2).load()
     # the arrays of seed 2 are there: the mark of seed 1 must not vouch for them
     assert not simulated(tmp_path).exists()
-    xr.testing.assert_identical(simulated(tmp_path).load(), expected)
+    xr.testing.assert_identical(recordings(simulated(tmp_path)), expected)
 
 
 @pytest.mark.parametrize("name", ["dot_train.npy", "dot_test.npy", "dot_truth.nc"])
 def test_a_missing_file_is_made_again(tmp_path, name):
-    expected = simulated(tmp_path).load()
+    expected = recordings(simulated(tmp_path))
     (tmp_path / name).unlink()
-    xr.testing.assert_identical(simulated(tmp_path).load(), expected)
+    xr.testing.assert_identical(recordings(simulated(tmp_path)), expected)
 
 
 def test_a_damaged_mark_is_no_mark(tmp_path):
-    expected = simulated(tmp_path).load()
+    expected = recordings(simulated(tmp_path))
     (tmp_path / "dot_truth.nc").write_bytes(b"damaged")
-    xr.testing.assert_identical(simulated(tmp_path).load(), expected)
+    xr.testing.assert_identical(recordings(simulated(tmp_path)), expected)
+
+
+def test_a_mark_of_an_older_version_is_no_mark(tmp_path):
+    expected = recordings(simulated(tmp_path))
+    truth = xr.load_dataset(tmp_path / "dot_truth.nc")
+    truth.attrs["data_hash"] = truth.attrs.pop("files_hash")
+    truth.to_netcdf(tmp_path / "dot_truth.nc")
+    xr.testing.assert_identical(recordings(simulated(tmp_path)), expected)
 
 
 def test_samples_that_are_not_those_of_the_truth_are_refused(tmp_path):
@@ -173,4 +195,4 @@ def test_a_file_in_place_of_the_folder_is_named(tmp_path):
 
 def test_logs_are_read_only(tmp_path):
     with pytest.raises(DatasetError, match="read only"):
-        simulated(tmp_path).save(xr.Dataset())
+        simulated(tmp_path).save(Logs("dot", "simulated", True, 100, []))

@@ -110,7 +110,8 @@ def sentence(content, words):
 
 def test_every_table_and_figure_of_the_paper_has_a_caption():
     studies = ("augmentation", "real2real", "input_channels", "estimators")
-    made = create_pipeline({study: [] for study in studies}, sensors=["sparkfun"]).all_outputs()
+    asked = {"sensors": ["sparkfun"], "inspected": ["sparkfun"]}
+    made = create_pipeline({study: [] for study in studies}, **asked).all_outputs()
     places = {
         f"{kind}/{study.replace('.', '_')}{name}"
         for study, _, rest in (address.partition("reporting.") for address in made)
@@ -120,7 +121,10 @@ def test_every_table_and_figure_of_the_paper_has_a_caption():
     assert places == CAPTIONS.keys()
     for place, caption in CAPTIONS.items():
         name = place.split("/")[1]
-        assert name.startswith(caption.pipeline) or caption.pipeline == "reporting"
+        assert name.startswith(caption.pipeline) or caption.pipeline in (
+            "reporting",
+            "ground_truth",
+        )
 
 
 def test_of_a_study_without_networks_it_says_how_many_estimators(write, rows):

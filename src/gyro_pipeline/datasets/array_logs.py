@@ -1,18 +1,18 @@
 """Logs in the array layout of the published authors' files."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import permutations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from kedro.io import AbstractDataset, DatasetError
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from gyro_pipeline.conventions import AXES, DIMENSIONS, InputError
-from gyro_pipeline.fingerprints import data_hash
+from gyro_pipeline.conventions import AXES, InputError
+from gyro_pipeline.logs import Log, LogEntry, Logs
 from gyro_pipeline.parameters import Sensor
 
 LAYOUT = ("recording", "gyroscope", "sample")
@@ -27,12 +27,11 @@ _DOMINANCE = 4
 Order = tuple[str, ...]
 
 
-class ArrayLogs(AbstractDataset[xr.Dataset, xr.Dataset]):
-    """Reads 3-D ``.npy`` files of recordings, gyroscopes and samples, in any axis order, deg/s.
+class ArrayLogs(AbstractDataset[Logs, Logs]):
+    """Lists what 3-D ``.npy`` files hold: recordings, gyroscopes, samples, in any order, deg/s.
 
     Gyroscopes come three to an IMU, IMU by IMU, in the order x, y, z. Counts are read from the
-    files, never required. An IMU that only one of the two files holds is NaN in the recordings
-    of the other one.
+    files, never required. Samples are judged by the quality control, where they are read.
 
     Args:
         sensor: Name of the sensor the files are of.
@@ -67,30 +66,31 @@ class ArrayLogs(AbstractDataset[xr.Dataset, xr.Dataset]):
         self._axes_order = None if axes_order is None else tuple(axes_order)
         self.metadata = metadata
 
-    def load(self) -> xr.Dataset:
-        """Read all files into one set of labelled recordings.
+    def load(self) -> Logs:
+        """List the recordings of all files; their samples are read later, one at a time.
 
         Returns:
-            ``angular_rate`` as :mod:`gyro_pipeline.conventions` describes it; recordings of the
-            train file come first and those of the test file are numbered on.
+            Recordings of the train file come first and those of the test file are numbered on.
 
         Raises:
             InputError: As the cause of Kedro's ``DatasetError``, a file that cannot be used.
         """
-        arrays = {name: self._open(name) for name in self._files.values()}
-        shapes = {name: array.shape for name, array in arrays.items()}
+        shapes = {name: self._open(name).shape for name in self._files.values()}
         order = self._order(shapes)
-        parts = [_by_imu(array, order) for array in arrays.values()]
-        if len({part.shape[-1] for part in parts}) > 1:
+        counts = [dict(zip(order, shape, strict=True)) for shape in shapes.values()]
+        if len({count["sample"] for count in counts}) > 1:
             raise InputError(
                 f"{self._sensor} {self._path}: expected as many samples in the test file as in the "
                 f"train file, got {' and '.join(_shapes(shapes))}; cut the longer one"
             )
-        rates = _merged(parts)
-        self._check_values(rates, [part.shape[:2] for part in parts])
-        return self._labelled(rates, [part.shape[1] for part in parts])
+        entries, first = list[LogEntry](), 1
+        for (split, name), count in zip(self._files.items(), counts, strict=True):
+            entries += self._entries(split, name, order, count, first)
+            first += count["recording"]
+        entries.sort(key=lambda entry: (entry.imu, entry.recording))
+        return Logs(self._sensor, self._source, False, self.entry.rate_hz, entries)
 
-    def save(self, data: xr.Dataset) -> None:
+    def save(self, data: Logs) -> None:
         """Refuse: logs are read only."""
         raise DatasetError(f"{self._sensor}: logs are read only, {self._path} is not written to")
 
@@ -159,46 +159,23 @@ class ArrayLogs(AbstractDataset[xr.Dataset, xr.Dataset]):
             f"least {_DOMINANCE} times more samples than recordings or gyroscopes: {found}"
         )
 
-    def _check_values(self, rates: NDArray[np.float32], counts: Sequence[tuple[int, ...]]) -> None:
-        """Refuse recordings with NaN or infinity, or with an axis that never changes."""
-        first = 0
-        for name, (imus, recordings) in zip(self._files.values(), counts, strict=True):
-            part = rates[:imus, first : first + recordings]
-            low, high = part.min(axis=-1), part.max(axis=-1)  # NaN and infinity show up in these
-            for problem, found in (
-                ("NaN or infinite samples", ~np.isfinite(low) | ~np.isfinite(high)),
-                ("zero variance, all samples are the same", low == high),
-            ):
-                if found.any():
-                    imu, recording, axis = np.argwhere(found)[0]
-                    raise InputError(
-                        f"{self._sensor} {name} recording {recording + 1}, IMU {imu + 1}, axis "
-                        f"{AXES[axis]}: {problem}; remove this recording from the file (affected "
-                        f"recordings: {_numbers(found.any(axis=(0, 2)))})"
-                    )
-            first += recordings
-
-    def _labelled(self, rates: NDArray[np.float32], counts: Sequence[int]) -> xr.Dataset:
-        """Name the dimensions and say where the recordings come from."""
-        imus, recordings = rates.shape[:2]
-        coordinates: dict[str, Any] = {
-            "imu": np.arange(1, imus + 1),
-            "recording": np.arange(1, recordings + 1),
-            "axis": list(AXES),
-        }
-        if WHOLE not in self._files:
-            coordinates["given_split"] = ("recording", np.repeat(list(self._files), counts))
-        logs = xr.Dataset(
-            {"angular_rate": (DIMENSIONS, rates, {"units": "deg/s"})}, coords=coordinates
-        )
-        logs.attrs = {
-            "sensor": self._sensor,
-            "source": self._source,
-            "simulated": 0,
-            "rate_hz": self.entry.rate_hz,
-        }
-        labels = {str(name): label.values.tolist() for name, label in logs.coords.items()}
-        return logs.assign_attrs(data_hash=data_hash(rates, [labels, logs.attrs]))
+    def _entries(
+        self, split: str, name: str, order: Order, count: Mapping[str, int], first: int
+    ) -> list[LogEntry]:
+        """The recordings of one file, IMU by IMU, numbered from ``first`` on."""
+        path, imus = self._path / name, count["gyroscope"] // len(AXES)
+        return [
+            LogEntry(
+                imu + 1,
+                first + recording,
+                f"{name} recording {recording + 1}",
+                partial(_read, path, order, imu, recording),
+                size=path.stat().st_size // (imus * count["recording"]),
+                split=None if split == WHOLE else split,
+            )
+            for imu in range(imus)
+            for recording in range(count["recording"])
+        ]
 
 
 def sensor_entry(sensor: str, sensors: Mapping[str, Mapping[str, Any]]) -> Sensor:
@@ -249,26 +226,12 @@ def _in_threes(order: Order, shape: tuple[int, ...]) -> bool:
     return shape[order.index("gyroscope")] % len(AXES) == 0
 
 
-def _by_imu(array: NDArray[Any], order: Order) -> NDArray[Any]:
-    """View a file as (imu, recording, axis, sample)."""
+def _read(path: Path, order: Order, imu: int, recording: int) -> Log:
+    """One recording of one IMU, out of a file that was found to be in order."""
+    array = np.lib.format.open_memmap(path, mode="r")
     recordings_first = array.transpose([order.index(name) for name in LAYOUT])
-    recordings, gyroscopes, samples = recordings_first.shape
-    imus = gyroscopes // len(AXES)
-    split = recordings_first.reshape(recordings, imus, len(AXES), samples)
-    return split.swapaxes(0, 1)
-
-
-def _merged(parts: Sequence[NDArray[Any]]) -> NDArray[np.float32]:
-    """Put parts one after the other along the recordings; IMUs that a part lacks are NaN."""
-    imus = max(part.shape[0] for part in parts)
-    recordings = sum(part.shape[1] for part in parts)
-    rates = np.full((imus, recordings, *parts[0].shape[2:]), np.nan, dtype=np.float32)
-    first = 0
-    with np.errstate(over="ignore"):  # becomes infinite, and is refused as such
-        for part in parts:
-            rates[: part.shape[0], first : first + part.shape[1]] = part
-            first += part.shape[1]
-    return rates
+    gyroscopes = slice(len(AXES) * imu, len(AXES) * (imu + 1))
+    return Log(recordings_first[recording, gyroscopes].T.astype(np.float64))
 
 
 def _shapes(shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
@@ -277,7 +240,3 @@ def _shapes(shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
 
 def _listed(order: Order) -> str:
     return f"[{', '.join(order)}]"
-
-
-def _numbers(found: NDArray[np.bool_]) -> str:
-    return ", ".join(str(number) for number in np.flatnonzero(found) + 1)

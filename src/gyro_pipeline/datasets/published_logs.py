@@ -11,6 +11,7 @@ from pydantic import Field, ValidationError
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.array_logs import ArrayLogs
 from gyro_pipeline.datasets.download import ensure
+from gyro_pipeline.logs import Logs
 from gyro_pipeline.parameters import Parameter
 
 _LOG = logging.getLogger(__name__)
@@ -29,7 +30,7 @@ class PublishedFile(Parameter):
         return PurePosixPath(self.remote).name
 
 
-class PublishedLogs(AbstractDataset[Any, Any]):
+class PublishedLogs(AbstractDataset[Logs, Logs]):
     """Array files that are fetched once, verified at every load, and read as any such files.
 
     Args:
@@ -66,7 +67,7 @@ class PublishedLogs(AbstractDataset[Any, Any]):
         self._path = Path(path)
         self.metadata = metadata
 
-    def load(self) -> Any:
+    def load(self) -> Logs:
         """Fetch what is not there, verify all of it, and read it.
 
         Returns:
@@ -82,7 +83,7 @@ class PublishedLogs(AbstractDataset[Any, Any]):
         _LOG.info("published %s files verified: %s", self._sensor, self._path)
         return self._arrays.load()
 
-    def save(self, data: Any) -> None:
+    def save(self, data: Logs) -> None:
         """Refuse: logs are read only."""
         raise DatasetError(f"{self._sensor}: logs are read only, {self._path} is not written to")
 

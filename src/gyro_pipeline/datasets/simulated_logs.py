@@ -1,9 +1,11 @@
 """The stand-in for sensors whose logs are not at hand."""
 
+import hashlib
 import json
 import logging
 import zlib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +17,14 @@ from gyro_pipeline.conventions import AXES, MDPS, InputError
 from gyro_pipeline.datasets.array_logs import LAYOUT, ArrayLogs
 from gyro_pipeline.datasets.atomic import replacing
 from gyro_pipeline.datasets.recordings import Recordings, open_recordings
+from gyro_pipeline.logs import Logs
 from gyro_pipeline.parameters import Sensor
 from gyro_pipeline.physics.noise import simulate_noise, warm_up
 
 _LOG = logging.getLogger(__name__)
 
 
-class SimulatedLogs(AbstractDataset[xr.Dataset, xr.Dataset]):
+class SimulatedLogs(AbstractDataset[Logs, Logs]):
     """Writes simulated logs once, in the published layout, and reads them as any such files.
 
     Each gyroscope has a unit bias, uniform in plus or minus ``unit_bias_dps``; each power-on adds
@@ -58,16 +61,16 @@ class SimulatedLogs(AbstractDataset[xr.Dataset, xr.Dataset]):
         self._truth = Path(path) / f"{sensor}_truth.nc"
         self.metadata = metadata
 
-    def load(self) -> xr.Dataset:
-        """Read the logs, writing them first where they are missing or of other settings.
+    def load(self) -> Logs:
+        """List the recordings, writing them first where they are missing or of other settings.
 
         Returns:
-            Recordings as :mod:`gyro_pipeline.conventions` describes them, and what was drawn, in
-            deg/s: ``true_bias`` (imu, recording, axis), ``true_unit_bias`` (imu, axis),
-            ``true_turn_on_spread`` (axis), and ``true_noise`` (axis), N in deg/s * sqrt(s). Also
-            ``true_flicker``, B, and ``true_random_walk``, K in deg/s / sqrt(s). With a warm-up its
-            ``true_amplitude`` (imu, recording, axis), and ``true_warm_up`` (figure): the mean and
-            the spread of the amplitude, and the time constant in seconds.
+            The recordings, and what was drawn, in deg/s: ``true_bias`` (imu, recording, axis),
+            ``true_unit_bias`` (imu, axis), ``true_turn_on_spread`` (axis), and ``true_noise``
+            (axis), N in deg/s * sqrt(s). Also ``true_flicker``, B, and ``true_random_walk``, K in
+            deg/s / sqrt(s). With a warm-up its ``true_amplitude`` (imu, recording, axis), and
+            ``true_warm_up`` (figure): the mean and the spread of the amplitude, and the time
+            constant in seconds.
 
         Raises:
             InputError: As the cause of Kedro's ``DatasetError``, files that cannot be written, or
@@ -79,16 +82,15 @@ class SimulatedLogs(AbstractDataset[xr.Dataset, xr.Dataset]):
             _LOG.info("writing simulated %s logs%s: %s", self._sensor, why, self._train.parent)
             self._write()
         truth = open_recordings(self._truth).load()
-        logs = self._arrays.load()
-        if truth.attrs["data_hash"] != logs.attrs["data_hash"]:
+        if truth.attrs["files_hash"] != self._files_hash():
             raise InputError(
                 f"simulated {self._sensor}: {self._train.name} or {self._test.name} has changed "
                 f"since it was written, so {self._truth} is not its truth; delete that file and "
                 "run again. Logs of your own belong to another source"
             )
-        return logs.assign(truth.data_vars).assign_attrs(simulated=1)
+        return replace(self._arrays.load(), simulated=True, drawn=truth.drop_attrs())
 
-    def save(self, data: xr.Dataset) -> None:
+    def save(self, data: Logs) -> None:
         """Refuse: logs are read only."""
         raise DatasetError(f"{self._sensor}: logs are read only, nothing is written to them")
 
@@ -119,7 +121,9 @@ class SimulatedLogs(AbstractDataset[xr.Dataset, xr.Dataset]):
             return None
         try:
             with open_recordings(self._truth) as truth:
-                return truth.attrs.get("settings")
+                settings = truth.attrs.get("settings")
+                # older versions marked the files in another way
+                return settings if "files_hash" in truth.attrs else None
         except InputError:  # damaged: as good as not written
             return None
 
@@ -132,9 +136,16 @@ class SimulatedLogs(AbstractDataset[xr.Dataset, xr.Dataset]):
             write_logs(generator, self._arrays.entry, truth, train, test)
             # from here on the old mark would vouch for the new arrays
             self._truth.unlink(missing_ok=True)
-        data_hash = self._arrays.load().attrs["data_hash"]
-        truth.attrs = {"settings": self._settings(), "data_hash": data_hash}
+        truth.attrs = {"settings": self._settings(), "files_hash": self._files_hash()}
         Recordings(str(self._truth)).save(truth)
+
+    def _files_hash(self) -> str:
+        """Of the arrays' bytes."""
+        digests = []
+        for path in (self._train, self._test):
+            with path.open("rb") as file:
+                digests.append(hashlib.file_digest(file, "sha256").hexdigest())
+        return " ".join(digests)
 
 
 def draw_biases(generator: np.random.Generator, entry: Sensor) -> xr.Dataset:

@@ -9,7 +9,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from itertools import islice
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -22,6 +23,8 @@ logger = logging.getLogger(__name__)
 Report = Callable[[float], None]
 _POLL_S = 0.2
 _LOG_EVERY_S = 30
+_AHEAD = 4
+"""So many jobs per worker are handed out before results are taken, which bounds both."""
 
 
 class Job(Protocol):
@@ -46,7 +49,12 @@ R = TypeVar("R")
 
 
 def run_jobs(
-    jobs: Sequence[J], function: Callable[[J, Report], R], execution: Execution, label: str
+    jobs: Sequence[J],
+    function: Callable[[J, Report], R],
+    execution: Execution,
+    label: str,
+    what: str = "trainings",
+    as_given: bool = False,
 ) -> Iterator[tuple[J, R]]:
     """Run ``function(job, report)`` for every job and yield results as they finish.
 
@@ -58,17 +66,19 @@ def run_jobs(
         function: At module level; calls ``report`` with the work done since its last call.
         execution: ``serial``, or else processes; how many workers.
         label: Names the work in progress lines.
+        what: What the jobs are, for the same lines.
+        as_given: Start them in the order given, whatever their work.
 
     Yields:
-        A job and its result.
+        A job and its result. However slowly they are asked for, no more than a few wait in memory.
     """
-    ordered = sorted(jobs, key=lambda job: job.work, reverse=True)
+    ordered = list(jobs) if as_given else sorted(jobs, key=lambda job: job.work, reverse=True)
     if not ordered:
         return
     serial = execution.executor == "serial"
     workers = 1 if serial else min(execution.workers or available_cores(), len(ordered))
-    progress = _Progress(label, len(ordered), [job.work for job in ordered], workers)
-    logger.info("%s: %d trainings on %d processes", label, len(ordered), workers)
+    progress = _Progress(label, len(ordered), [job.work for job in ordered], workers, what)
+    logger.info("%s: %d %s on %d processes", label, len(ordered), what, workers)
     if serial:
         results = _run_serially(ordered, function, progress)
     else:
@@ -131,8 +141,16 @@ class _Progress:
     every preparation, which is reported only when it is done.
     """
 
-    def __init__(self, label: str, jobs: int, works: Sequence[float], workers: int) -> None:
+    def __init__(
+        self,
+        label: str,
+        jobs: int,
+        works: Sequence[float],
+        workers: int,
+        what: str = "trainings",
+    ) -> None:
         self._label, self._jobs, self._plan = label, jobs, _Plan(works, workers)
+        self._what = what
         self._finished, self._done = 0, 0.0
         self._started = self._logged = time.monotonic()
         self._paced_from: tuple[float, float] | None = None  # the clock's time and the plan's
@@ -161,7 +179,7 @@ class _Progress:
             self._log()
 
     def one_finished(self) -> None:
-        """Count a training."""
+        """Count a job."""
         self._finished += 1
         self._bar.set_description(f"{self._label} {self._finished}/{self._jobs}")
 
@@ -170,7 +188,7 @@ class _Progress:
         self._bar.close()
         if self._finished:
             seconds = time.monotonic() - self._started
-            logger.info("%s: %d trainings in %s", self._label, self._finished, _clock(seconds))
+            logger.info("%s: %d %s in %s", self._label, self._finished, self._what, _clock(seconds))
 
     def seconds_left(self) -> float | None:
         """At the pace so far; None before there is one."""
@@ -186,8 +204,8 @@ class _Progress:
 
     def _log(self) -> None:
         logger.info(
-            "%s: %d of %d trainings done, %.0f %%, %s left",
-            *(self._label, self._finished, self._jobs),
+            "%s: %d of %d %s done, %.0f %%, %s left",
+            *(self._label, self._finished, self._jobs, self._what),
             *(100 * self._plan.time(self._done) / self._plan.end, self._left()),
         )
 
@@ -222,8 +240,12 @@ def _run_in_processes(
     shared = (done, at_work)
     pool = ProcessPoolExecutor(workers, spawn, initializer=_start_worker, initargs=shared)
     try:
-        pending = {pool.submit(_call, function, job): job for job in jobs}
-        while pending:
+        waiting, pending = iter(jobs), dict[Future[R], J]()
+        while True:
+            for job in islice(waiting, _AHEAD * workers - len(pending)):
+                pending[pool.submit(_call, function, job)] = job
+            if not pending:
+                break
             finished, _ = wait(pending, timeout=_POLL_S, return_when=FIRST_COMPLETED)
             progress.advance_to(done.value, at_work.value >= workers)
             for future in finished:

@@ -1,30 +1,203 @@
 """Nodes of the raw-logs stage."""
 
+import logging
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
+import pandas as pd
 import xarray as xr
+from numpy.typing import NDArray
 
-from gyro_pipeline.conventions import DIMENSIONS, InputError
+from gyro_pipeline.conventions import AXES, DIMENSIONS, InputError
+from gyro_pipeline.fingerprints import data_hash
+from gyro_pipeline.learning.executors import run_jobs
+from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding, LogEntry, Logs
+from gyro_pipeline.parameters import Execution, Quality
+from gyro_pipeline.pipelines.raw_logs.inspection import Inspection, Judged, judge
+from gyro_pipeline.pipelines.raw_logs.stack import Stack
+
+logger = logging.getLogger(__name__)
+
+_WORTH_PROCESSES = 2 * 10**8
+"""Bytes to read; fewer are read by this process before others have started."""
+
+_NAMED = 10
+"""So many rejected recordings are named in a message; all are in the table."""
+
+Row = tuple[LogEntry, Judged]
 
 
-def label_recordings(files: xr.Dataset) -> xr.Dataset:
-    """Check what a source gives, so that later stages can rely on it.
+def inspect_logs(
+    files: Logs, quality: Quality, execution: Execution
+) -> tuple[xr.Dataset, pd.DataFrame]:
+    """Read and judge all recordings of a sensor, one at a time in each process.
 
     Args:
-        files: Recordings from any source (see :mod:`gyro_pipeline.conventions`).
+        files: The recordings that the source lists.
+        quality: How they are judged, and to what length they are cut.
+        execution: In how many processes.
 
     Returns:
-        The same, in the order of the conventions.
+        Recordings as :mod:`gyro_pipeline.conventions` describes them. All are cut to the shortest
+        one that is kept, or to ``quality.length_s``, from the first row that can be used on; none
+        is padded. One that is rejected for some IMUs is NaN for these, one that is rejected for
+        all is left out. The rate is the median of those measured from timestamps, or the expected
+        one where there are none.
+
+        And a row per IMU and recording: ``sensor, imu, recording, file, outcome``; ``rows`` of the
+        file; the rows that are used, from ``start`` to before ``stop``; ``rate_hz``, measured;
+        ``findings``.
+    """
+    numbers = _numbers(files.entries)
+    rates, warmth = Stack(*numbers, len(AXES)), Stack(*numbers, 1)
+    rows = list[Row]()
+    for entry, judged in _judge(files, quality, execution):
+        for stack, samples in ((rates, judged.samples), (warmth, judged.temperature_c)):
+            if samples is not None:
+                stack.add(entry.imu, entry.recording, samples)
+        rows.append((entry, replace(judged, samples=None, temperature_c=None)))
+    rows = _without_copies(sorted(rows, key=lambda row: (row[0].imu, row[0].recording)))
+    used = [row for row in rows if row[1].outcome != REJECTED]
+    length = min((judged.stop - judged.start for _, judged in used), default=0)
+    there = _there(used, *numbers)
+    recordings = _labelled(files, used, rates.cut(there, length), warmth.cut(there, length))
+    table = pd.DataFrame(_described(files.sensor, row, length) for row in rows)
+    return recordings, table.astype({"start": "Int64", "stop": "Int64"})
+
+
+def require_enough(recordings: xr.Dataset, table: pd.DataFrame, quality: Quality) -> xr.Dataset:
+    """Stop where too many recordings were rejected, so that a study never shrinks unseen.
+
+    Args:
+        recordings: From :func:`inspect_logs`.
+        table: Likewise.
+        quality: How many of those listed must remain.
+
+    Returns:
+        The recordings.
 
     Raises:
-        InputError: If a recording holds NaN without being absent as a whole.
+        InputError: Fewer than ``quality.needed_pct`` percent remain.
     """
-    recordings = files.transpose(*DIMENSIONS)
-    missing = np.isnan(recordings.angular_rate).sum(["axis", "sample"])
-    partly = (missing > 0) & (missing < recordings.sizes["axis"] * recordings.sizes["sample"])
-    for imu, recording in np.argwhere(partly.to_numpy()):
-        raise InputError(
-            f"{files.attrs['sensor']} IMU {int(files.imu[imu])} recording "
-            f"{int(files.recording[recording])}: expected finite samples, got "
-            f"{int(missing[imu, recording])} NaN; repair or leave out this recording"
-        )
-    return recordings
+    sensor, rejected = recordings.attrs["sensor"], table[table.outcome == REJECTED]
+    counts = Counter(table.outcome)
+    logger.info(
+        "%s: %d recordings, %s",
+        *(sensor, len(table)),
+        ", ".join(f"{counts[outcome]} {outcome}" for outcome in (KEPT, REPAIRED, REJECTED)),
+    )
+    remain = len(table) - len(rejected)
+    if 100 * remain >= quality.needed_pct * len(table):
+        return recordings
+    raise InputError(
+        f"{sensor}: {remain} of {len(table)} recordings can be used, quality.needed_pct asks for "
+        f"{quality.needed_pct:g} %. Repair or remove the others, or lower it:\n  "
+        + "\n  ".join(_named(rejected))
+    )
+
+
+def _numbers(entries: Sequence[LogEntry]) -> tuple[list[int], list[int]]:
+    """Of all IMUs, and of all recordings."""
+    return sorted({one.imu for one in entries}), sorted({one.recording for one in entries})
+
+
+def _judge(files: Logs, quality: Quality, execution: Execution) -> Iterator[Row]:
+    """All recordings, in any order, here or in several processes."""
+    # shortest first: the length of the first one is reserved for all
+    entries = sorted(files.entries, key=lambda entry: entry.size)
+    jobs = [Inspection(entry, files.rate_hz, quality) for entry in entries]
+    if sum(entry.size for entry in entries) < _WORTH_PROCESSES:
+        return ((job.entry, judge(job, lambda work: None)) for job in jobs)
+    judged = run_jobs(jobs, judge, execution, files.sensor, "recordings", as_given=True)
+    return ((job.entry, one) for job, one in judged)
+
+
+def _without_copies(rows: Sequence[Row]) -> list[Row]:
+    """Reject recordings that are there before under another number."""
+    first, found = dict[str, LogEntry](), list[Row]()
+    for entry, judged in rows:
+        if judged.outcome == REJECTED:
+            found.append((entry, judged))
+            continue
+        same = first.setdefault(judged.content, entry)
+        problem = f"the same samples as {same.where}, so one of the two is not what its name says"
+        copy = Finding("duplicate", REJECTED, problem)
+        found.append((entry, judged if same is entry else judged.rejected(copy)))
+    return found
+
+
+def _there(
+    used: Sequence[Row], imus: Sequence[int], recordings: Sequence[int]
+) -> NDArray[np.bool_]:
+    """(imu, recording), whether it is used."""
+    pairs = {(entry.imu, entry.recording) for entry, _ in used}
+    return np.array([[(imu, number) in pairs for number in recordings] for imu in imus], dtype=bool)
+
+
+def _labelled(
+    files: Logs,
+    used: Sequence[Row],
+    rates: NDArray[np.float32] | None,
+    warmth: NDArray[np.float32] | None,
+) -> xr.Dataset:
+    """Name the dimensions and say where the recordings come from."""
+    imus, recordings = _numbers([entry for entry, _ in used])
+    if rates is None:
+        rates = np.empty((0, 0, len(AXES), 0), dtype=np.float32)
+    coordinates: dict[str, Any] = {"imu": imus, "recording": recordings, "axis": list(AXES)}
+    splits = {entry.recording: entry.split for entry, _ in used}
+    if any(splits.values()):
+        coordinates["given_split"] = ("recording", [splits[number] for number in recordings])
+    logs = xr.Dataset({"angular_rate": (DIMENSIONS, rates, {"units": "deg/s"})}, coordinates)
+    measured = [judged.rate_hz for _, judged in used if judged.rate_hz is not None]
+    logs.attrs = {
+        "sensor": files.sensor,
+        "source": files.source,
+        "simulated": 0,
+        "rate_hz": _rounded(np.median(measured)) if measured else files.rate_hz,
+    }
+    labels = {str(name): label.values.tolist() for name, label in logs.coords.items()}
+    # of the measured samples alone, as runs in the store know it
+    logs.attrs["data_hash"] = data_hash(rates, [labels, logs.attrs])
+    if warmth is not None:
+        units = {"units": "degrees Celsius"}
+        logs["temperature_c"] = (("imu", "recording", "sample"), warmth[:, :, 0], units)
+    if files.drawn is not None:
+        logs = logs.assign(files.drawn.sel(imu=imus, recording=recordings).data_vars)
+    return logs.assign_attrs(simulated=int(files.simulated))
+
+
+def _described(sensor: str, row: Row, length: int) -> dict[str, Any]:
+    """A row of the table."""
+    entry, judged = row
+    used = judged.outcome != REJECTED
+    return {
+        "sensor": sensor,
+        "imu": entry.imu,
+        "recording": entry.recording,
+        "file": entry.where,
+        "outcome": judged.outcome,
+        "rows": judged.rows,
+        "start": judged.start if used else None,
+        "stop": judged.start + length if used else None,
+        "rate_hz": None if judged.rate_hz is None else _rounded(judged.rate_hz),
+        "findings": "; ".join(f"{one.check}: {one.detail}" for one in judged.findings) or None,
+    }
+
+
+def _rounded(rate_hz: np.floating | float) -> float:
+    """To a millionth, which is better than any logger's clock."""
+    return float(f"{rate_hz:.6g}")
+
+
+def _named(rejected: pd.DataFrame) -> list[str]:
+    """The first rejected recordings, and why."""
+    lines = [
+        f"IMU {row.imu} recording {row.recording}, {row.file}: {row.findings}"
+        for row in rejected.head(_NAMED).itertuples()
+    ]
+    further = len(rejected) - len(lines)
+    return [*lines, f"and {further} more, in the table of their quality"] if further else lines

@@ -68,6 +68,13 @@ CAPTIONS = {
         "seconds scatters by N/√t. B is the bias instability. Paper, section IV-A.",
         "reporting",
     ),
+    "tables/recording_quality": Caption(
+        "Recordings: kept, repaired, rejected",
+        "Quality control of the raw logs, and the recordings in which it found something. Of a "
+        "repaired one the longest stretch without a fault is kept; all recordings of a sensor are "
+        "cut to the shortest. Rows count from 0.",
+        "ground_truth",
+    ),
     "tables/dataset_hours": Caption(
         "Hours of the datasets",
         "Training recordings count for every gyroscope, test recordings for the three of IMU 1. "

@@ -13,6 +13,7 @@ from gyro_pipeline.pipelines.reporting.nodes import (
     pool_results,
     refuse_gaps,
 )
+from gyro_pipeline.pipelines.reporting.quality import recording_quality
 from gyro_pipeline.pipelines.reporting.report import write_report
 from gyro_pipeline.studies import LEAKAGE
 
@@ -55,6 +56,7 @@ def create_pipeline(
     studies: Mapping[str, Sequence[str]],
     sensors: Sequence[str] = (),
     virtual: Sequence[str] = (),
+    inspected: Sequence[str] = (),
 ) -> Pipeline:
     """Tables and figures of some studies, and of the recordings.
 
@@ -62,8 +64,9 @@ def create_pipeline(
         studies: All sensors of each study.
         sensors: Those whose recordings the report describes; none in a single study's report.
         virtual: Those that have virtual gyroscopes.
+        inspected: Those whose raw logs may have been read.
     """
-    nodes = []
+    nodes = [_quality_node(inspected)] if inspected else []
     for study, studied in studies.items():
         nodes += _study_nodes(study, studied)
     if sensors:
@@ -177,6 +180,18 @@ def _recording_nodes(sensors: Sequence[str], virtual: Sequence[str]) -> list[Nod
         _made(function, inputs, f"reporting.{kind}.{function.__name__}")
         for kind, function, inputs in made
     ]
+
+
+def _quality_node(sensors: Sequence[str]) -> Node:
+    """It shows what there is, so it is no part of :func:`_made`."""
+    name = recording_quality.__name__
+    return Node(
+        recording_quality,
+        {f"{sensor}_quality": f"{sensor}.raw_logs.quality" for sensor in sensors},
+        [f"reporting.tables.{name}", f"reporting.gaps.{name}"],
+        name=name,
+        namespace="reporting",
+    )
 
 
 def _made(

@@ -1,0 +1,154 @@
+"""A fleet's folder of CSV files: the raw-logs stage against a bare pandas loop, in one run.
+
+    python benchmarks/fleet.py [--files 2000] [--processes 2]
+
+Writes the files to a temporary folder (1.3 GB for 2,000), reads them once so that both sides find
+them in memory as far as it goes, and then, on as many processes each:
+
+* a bare loop of ``pandas.read_csv``, of which nothing is kept;
+* the source, the readers, the quality control and what is kept of files that were read, as
+  ``kedro run --pipeline=ground_truth`` calls them, until the recordings are stored;
+* the same once more, with all files read before.
+
+Prints the time of each, the ratio, and the peak memory of this process and its children.
+"""
+
+import argparse
+import logging
+import os
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import psutil
+
+CONF = Path(__file__).parents[1] / "conf"
+RATE_HZ, ROWS = 120, 13_000
+MB = 1e6
+
+
+def write_file(folder: Path, number: int) -> None:
+    """A DOT export: counter, time in us, orientation, acceleration and angular rate."""
+    generator = np.random.default_rng(number)
+    rows = np.arange(ROWS)
+    columns = {"PacketCounter": rows, "SampleTimeFine": (rows * 1e6 / RATE_HZ).astype(np.int64)}
+    for name, centre, scatter in (
+        *(("Euler_X", -0.9, 1e-3), ("Euler_Y", 2.5, 1e-3)),
+        *(("Acc_X", -0.4, 0.02), ("Acc_Y", -0.1, 0.02), ("Acc_Z", 9.9, 0.02)),
+        *((f"Gyr_{axis}", generator.uniform(-3, 3), 0.055) for axis in "XYZ"),
+    ):
+        columns[name] = generator.normal(centre, scatter, ROWS).round(6)
+    path = folder / f"imu{number // 100 + 1}" / f"{number % 100 + 1}.csv"
+    path.parent.mkdir(exist_ok=True)
+    pd.DataFrame(columns).to_csv(path, index=False)
+
+
+def parse(path: Path) -> int:
+    return len(pd.read_csv(path))
+
+
+def read_bytes(path: Path) -> int:
+    return len(path.read_bytes())
+
+
+@contextmanager
+def measured(what: str, files: int) -> Iterator[dict[str, float]]:
+    """Wall time of a block, and the peak memory of this process and its children meanwhile."""
+    found = {"s": 0.0, "rss": 0.0, "pss": 0.0}
+    stop = threading.Event()
+    watcher = threading.Thread(target=_watch, args=(found, stop))
+    watcher.start()
+    began = time.perf_counter()
+    yield found
+    found["s"] = time.perf_counter() - began
+    stop.set()
+    watcher.join()
+    print(
+        f"{what:<44} {found['s']:7.1f} s {1e3 * found['s'] / files:6.1f} ms a file "
+        f"{found['pss'] / MB:6.0f} MB peak ({found['rss'] / MB:.0f} MB with shared pages "
+        "counted in every process)"
+    )
+
+
+def _watch(found: dict[str, float], stop: threading.Event) -> None:
+    me = psutil.Process()
+    while not stop.wait(0.2):
+        sizes = {"rss": 0.0, "pss": 0.0}
+        for process in (me, *me.children(recursive=True)):
+            try:
+                memory = process.memory_full_info()
+            except psutil.Error:
+                continue
+            sizes["rss"] += memory.rss
+            sizes["pss"] += getattr(memory, "pss", memory.uss)
+        for kind, size in sizes.items():
+            found[kind] = max(found[kind], size)
+
+
+def in_processes(function: Callable[[Any], object], items: list[Any], processes: int) -> None:
+    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
+        for _ in pool.map(function, items, chunksize=4):
+            pass
+
+
+def stage(folder: Path, scratch: Path, processes: int) -> None:
+    """From the folder to stored recordings, as the pipeline does it."""
+    # here, so that the processes of the bare loop do not wait for them
+    from kedro.config import OmegaConfigLoader  # noqa: PLC0415
+
+    from gyro_pipeline.datasets.file_logs import FileLogs  # noqa: PLC0415
+    from gyro_pipeline.datasets.recordings import Recordings  # noqa: PLC0415
+    from gyro_pipeline.parameters import Execution, Parameters  # noqa: PLC0415
+    from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs, require_enough  # noqa: PLC0415
+    from gyro_pipeline.settings import CONFIG_LOADER_ARGS  # noqa: PLC0415
+
+    configuration = OmegaConfigLoader(str(CONF), env="dot_real", **CONFIG_LOADER_ARGS)
+    quality = Parameters(**configuration["parameters"]).quality
+    source = FileLogs(
+        *("dot", configuration["globals"]["sensors"], "fleet", str(folder)),
+        *("imu{imu}/{recording}.csv", None, str(scratch / "read")),
+    )
+    execution = Execution(executor="processes", workers=processes)
+    recordings, table = inspect_logs(source.load(), quality, execution)
+    recordings = require_enough(recordings, table, quality)
+    Recordings(str(scratch / "recordings.nc")).save(recordings)
+    print(f"  {dict(recordings.sizes)}, {table.outcome.value_counts().to_dict()}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--files", type=int, default=2000)
+    parser.add_argument("--processes", type=int, default=os.cpu_count())
+    arguments = parser.parse_args()
+    logging.getLogger("gyro_pipeline").setLevel(logging.INFO)
+    files, processes = arguments.files, arguments.processes
+    with tempfile.TemporaryDirectory() as temporary:
+        folder, scratch = Path(temporary) / "files", Path(temporary) / "scratch"
+        folder.mkdir()
+        in_processes(partial(write_file, folder), list(range(files)), processes)
+        paths = sorted(folder.rglob("*.csv"))
+        size = sum(path.stat().st_size for path in paths)
+        print(f"{files} files of {ROWS} rows, {size / MB:.0f} MB, on {processes} processes")
+        in_processes(read_bytes, paths, processes)
+        with measured("pandas.read_csv alone", files) as bare:
+            in_processes(parse, paths, processes)
+        with measured("source, quality control, recordings stored", files) as ours:
+            stage(folder, scratch, processes)
+        with measured("the same, all files read before", files):
+            stage(folder, scratch, processes)
+    print(f"ratio {ours['s'] / bare['s']:.2f}, peak {ours['rss'] / MB:.0f} MB")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,243 @@
+"""Logs as loggers write them: a folder of files, one a recording."""
+
+import importlib
+import logging
+import pkgutil
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from kedro.io import AbstractDataset, DatasetError
+from pydantic import ValidationError
+
+from gyro_pipeline import readers
+from gyro_pipeline.conventions import InputError
+from gyro_pipeline.datasets.array_logs import sensor_entry
+from gyro_pipeline.datasets.parse_cache import Reading
+from gyro_pipeline.fingerprints import code_hash, fingerprint
+from gyro_pipeline.logs import LogEntry, Logs
+from gyro_pipeline.parameters import ReaderOptions
+
+_LOG = logging.getLogger(__name__)
+
+_NAMED = 5
+"""So many files that do not match are named."""
+
+_BINARY = {".npy", ".npz", ".mat", ".parquet"}
+"""What is read as fast as anything that could be kept of it."""
+
+_HIDDEN = re.compile(r"(^|/)\.")
+_PART = re.compile(r"\{(imu|recording)(:name)?\}|(\*)")
+
+Numbers = dict[str, tuple[int, int]]
+
+
+class FileLogs(AbstractDataset[Logs, Logs]):
+    """Lists the files of a folder that match a pattern, each one recording of one IMU.
+
+    Args:
+        sensor: Name of the sensor the files are of.
+        sensors: All sensors, as in ``conf/base/globals.yml``.
+        source: Where the logs come from, as stored paths name it.
+        path: The folder.
+        pattern: Of the files' paths in the folder. ``{imu}`` and ``{recording}`` stand for their
+            numbers; ``{imu:name}`` and ``{recording:name}`` for names, which are numbered in
+            their order; ``*`` for anything but a slash. Without an IMU all files are of IMU 1;
+            without a recording the files of an IMU are numbered in their order.
+        reader: How the files are read (:class:`gyro_pipeline.parameters.ReaderOptions`).
+        cache: Folder for what was read of text files, so that an interrupted run goes on where it
+            was; None: nothing is kept.
+        metadata: For other tools, such as Kedro-Viz.
+
+    Raises:
+        InputError: An unknown sensor, a pattern or reader options that are not usable.
+    """
+
+    def __init__(
+        self,
+        sensor: str,
+        sensors: Mapping[str, Mapping[str, Any]],
+        source: str,
+        path: str,
+        pattern: str,
+        reader: Mapping[str, Any] | None = None,
+        cache: str | None = None,
+        metadata: dict[str, Any] | None = None,
+    ) -> None:
+        self._rate_hz = sensor_entry(sensor, sensors).rate_hz
+        self._sensor = sensor
+        self._source = source
+        self._path = Path(path)
+        self._pattern = pattern
+        self._regex = _compiled(sensor, pattern)
+        try:
+            self._options = ReaderOptions.model_validate(reader or {})
+        except ValidationError as error:
+            raise InputError(f"{sensor}: reader in the catalog entry: {error}") from error
+        self._cache = None if cache is None else Path(cache)
+        self.metadata = metadata
+
+    def load(self) -> Logs:
+        """List the recordings; their files are read later, one at a time.
+
+        Raises:
+            InputError: As the cause of Kedro's ``DatasetError``, no such folder, no file that
+                matches, or two files of one recording.
+        """
+        found = self._matching()
+        numbers = _numbered(self._sensor, self._pattern, found)
+        readings = self._readings(found)
+        self._tidy([one.kept_as for one in readings.values() if one.kept_as is not None])
+        entries = [
+            LogEntry(*numbers[name], name, reading, reading.path.stat().st_size)
+            for name, reading in readings.items()
+        ]
+        entries.sort(key=lambda entry: (entry.imu, entry.recording))
+        return Logs(self._sensor, self._source, False, self._rate_hz, entries)
+
+    def save(self, data: Logs) -> None:
+        """Refuse: logs are read only."""
+        raise DatasetError(f"{self._sensor}: logs are read only, {self._path} is not written to")
+
+    def _exists(self) -> bool:
+        return self._path.is_dir()
+
+    def _describe(self) -> dict[str, Any]:
+        return {
+            "sensor": self._sensor,
+            "source": self._source,
+            "path": str(self._path),
+            "pattern": self._pattern,
+            "reader": self._options.model_dump(exclude_defaults=True),
+        }
+
+    def _matching(self) -> dict[str, re.Match[str]]:
+        """Paths in the folder that the pattern describes, in their order."""
+        where, names = f"{self._sensor} {self._path}", self._names()
+        matches = {name: match for name in names if (match := self._regex.fullmatch(name))}
+        others = [name for name in names if name not in matches]
+        if not matches:
+            raise InputError(
+                f"{where}: expected files like {self._pattern}, got {_listed(others) or 'none'}; "
+                "correct the pattern in the catalog, or the files' names"
+            )
+        if others:
+            _LOG.info(
+                "%s: %d files are not like %s: %s",
+                *(where, len(others), self._pattern, _listed(others)),
+            )
+        return matches
+
+    def _names(self) -> list[str]:
+        """Paths of all files in the folder but hidden ones, 2 before 10."""
+        if not self._path.is_dir():
+            raise InputError(
+                f"{self._sensor} {self._path}: no such folder; put the files there, or name "
+                "another path in the catalog"
+            )
+        files = (path for path in self._path.rglob("*") if path.is_file())
+        names = (path.relative_to(self._path).as_posix() for path in files)
+        return sorted((name for name in names if not _HIDDEN.search(name)), key=_natural)
+
+    def _readings(self, names: Iterable[str]) -> dict[str, Reading]:
+        """How each file is read, and where its reading is kept."""
+        settings = [self._options.model_dump(mode="json"), self._rate_hz, _readers_hash()]
+        found = {}
+        for name in names:
+            path, kept_as = self._path / name, None
+            if self._cache is not None and path.suffix.lower() not in _BINARY:
+                state = path.stat()
+                key = fingerprint([str(path), state.st_size, state.st_mtime_ns, settings])
+                kept_as = self._cache / f"{key}.npz"
+            found[name] = Reading(path, self._options, self._rate_hz, kept_as)
+        return found
+
+    def _tidy(self, wanted: Sequence[Path]) -> None:
+        """Say what is there of an earlier run, and remove what is of other files."""
+        if self._cache is None:
+            return
+        there = set(self._cache.glob("*.npz"))
+        for path in there.difference(wanted):
+            path.unlink()
+        before = len(there.intersection(wanted))
+        if before:
+            _LOG.info("%s: %d of %d files were read before", self._sensor, before, len(wanted))
+
+
+def _compiled(sensor: str, pattern: str) -> re.Pattern[str]:
+    """The pattern as a regular expression."""
+    written, last = "", 0
+    for part in _PART.finditer(pattern):
+        name, named, _ = part.groups()
+        written += re.escape(pattern[last : part.start()])
+        last = part.end()
+        if f"<{name}>" in written:
+            raise InputError(f"{sensor}: pattern {pattern}: {{{name}}} is there twice")
+        text = "[^/]+?" if named else "[0-9]+"
+        written += f"(?P<{name}>{text})" if name else "[^/]*"
+    rest = pattern[last:]
+    if set("{}") & set(_PART.sub("", pattern)):
+        raise InputError(
+            f"{sensor}: pattern {pattern}: expected {{imu}}, {{recording}}, {{imu:name}}, "
+            "{recording:name} and * as its parts"
+        )
+    return re.compile(written + re.escape(rest))
+
+
+def _numbered(sensor: str, pattern: str, found: Mapping[str, re.Match[str]]) -> Numbers:
+    """IMU and recording of each path."""
+    imus = _numbers(sensor, pattern, "imu", found)
+    recordings = _numbers(sensor, pattern, "recording", found)
+    counts, taken = Counter[int](), dict[tuple[int, int], str]()
+    for name in found:
+        imu = imus.get(name, 1)
+        counts[imu] += 1
+        number = imu, recordings.get(name, counts[imu] if "*" in pattern else 1)
+        other = taken.setdefault(number, name)
+        if other != name:
+            raise InputError(
+                f"{sensor}: {other} and {name} are both recording {number[1]} of IMU {imu} by the "
+                f"pattern {pattern}; remove one of them, or correct the pattern in the catalog"
+            )
+    return {name: number for number, name in taken.items()}
+
+
+def _numbers(
+    sensor: str, pattern: str, part: str, found: Mapping[str, re.Match[str]]
+) -> dict[str, int]:
+    """What one part of each path says, as a number; nothing where the pattern lacks the part."""
+    texts = {name: match[part] for name, match in found.items() if part in match.groupdict()}
+    if f"{{{part}:name}}" in pattern:
+        order = {text: place for place, text in enumerate(dict.fromkeys(texts.values()), 1)}
+        named = ", ".join(f"{text} is {place}" for text, place in list(order.items())[:_NAMED])
+        _LOG.info("%s: %d %ss by name: %s", sensor, len(order), part, named)
+        return {name: order[text] for name, text in texts.items()}
+    numbers = {name: int(text) for name, text in texts.items()}
+    for name in (name for name, number in numbers.items() if number < 1):
+        raise InputError(
+            f"{sensor}: {name}: expected numbers from 1 on for {{{part}}}, got 0; write "
+            f"{{{part}:name}} to have them numbered in their order"
+        )
+    return numbers
+
+
+def _natural(path: str) -> list[tuple[int, int | str]]:
+    """Sorts 2 before 10."""
+    return [
+        (0, int(text)) if text.isdigit() else (1, text) for text in re.findall(r"\d+|\D+", path)
+    ]
+
+
+def _listed(names: Sequence[str]) -> str:
+    """The first of them."""
+    return ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")
+
+
+def _readers_hash() -> str:
+    """Of the code that reads: what another version has read does not count."""
+    names = [
+        module.name for module in pkgutil.walk_packages(readers.__path__, f"{readers.__name__}.")
+    ]
+    return code_hash([readers, *map(importlib.import_module, names)])

@@ -1,0 +1,319 @@
+"""Quality control of one recording: what is kept of it, what is cut, and what it is rejected for.
+
+| check | what is found | how it ends |
+|---|---|---|
+| zero rows | first or last rows that are zero on every axis: the logger's start | cut, and kept |
+| non-finite values | NaN, infinity, or too large a number for any sensor or counter | repaired |
+| dropouts | a row beside a non-finite one, or of zeros, that is beyond the noise | repaired |
+| stuck values | an axis that repeats a value for longer than chance allows | repaired |
+| saturation | the largest or smallest value recurs as no tail of noise does | repaired |
+| gaps | samples missing or out of order between two rows, as the reader says | repaired |
+| too short | what remains is too short, or too little of the recording | rejected |
+| coarse quantisation | a step beside the noise; one too large to trust the mean | kept; rejected |
+| noise level | more noise than a gyroscope at rest has | rejected |
+| motion | the rate, or the noise, changes as neither noise nor a drift does | rejected |
+| shocks | a rate beyond the noise for an instant | repaired |
+| warm-up drift | the bias settles after power-on | kept |
+
+*Repaired* means that those rows go and the longest stretch without any such row or gap is kept;
+where that is too short, the finding *too short* rejects the recording. A recording ends as its
+worst finding does. A constant axis, and a log of zeros, leave no stretch.
+
+Motion rejects all of a recording: rates alone do not tell which part was at rest, and after a turn
+the Earth's rate falls differently on the axes. What cannot be seen at all is a rotation that is as
+steady as a bias, from the first sample to the last.
+
+Thresholds are multiples of the recording's own noise, so neither a bias nor a scale factor changes
+how it ends. The exceptions are zeros, and the largest noise of a sensor at rest.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyro_pipeline.conventions import AXES, MDPS, InputError
+from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding, Log
+from gyro_pipeline.parameters import LEAST_BLOCKS, Quality
+from gyro_pipeline.physics import damage, stationarity
+
+_NO_NUMBER = 1e12
+"""Garbage bytes read as a number can be as large as 1e308, which overflows when it is squared."""
+
+_NOISE_RISE = 2
+"""Of a block over the recording, for motion. At rest it is below 1.4 on the public files, whose
+noise is partly coloured; in white noise 2 has a probability of 4e-6 per recording even at 7 samples
+per block, and far less with more."""
+
+_COLOUR = 8
+"""Scatter of block means over what white noise of the same samples has, for motion throughout. At
+rest it is 0.7 to 1.2 on the public files, and up to 7 behind a low-pass filter of 5 Hz at 250 Hz;
+of a sensor that is carried about, 13 to 29."""
+
+_LEAST_BLOCK = 5
+"""Samples. The noise of shorter blocks is known too badly for a median of them."""
+
+
+@dataclass(frozen=True)
+class Inspected:
+    """What quality control says about a recording.
+
+    Attributes:
+        outcome: KEPT, REPAIRED or REJECTED, the worst that a finding ends in.
+        start: First row of the longest usable stretch, 0-based.
+        stop: The row after its last; equal to ``start`` if there is none.
+        findings: Of the reading, then of the checks.
+    """
+
+    outcome: str
+    start: int
+    stop: int
+    findings: tuple[Finding, ...]
+
+
+def inspect(log: Log, rate_hz: float, quality: Quality) -> Inspected:
+    """Find what is wrong with a recording, and the longest stretch of it that can be used.
+
+    The checks of values come first. Those of noise, motion, shocks and drift look at the longest
+    stretch that these leave.
+
+    Args:
+        log: One recording.
+        rate_hz: Samples per second.
+        quality: Lengths and the false-alarm probability.
+
+    Raises:
+        InputError: If the samples are not three columns.
+    """
+    if log.samples.ndim != 2 or log.samples.shape[1] != len(AXES):  # noqa: PLR2004 - a table
+        raise InputError(
+            f"expected samples of {len(AXES)} axes, (n, {len(AXES)}), got shape {log.samples.shape}"
+        )
+    rates = np.ascontiguousarray(log.samples.T, dtype=np.float64)  # an axis at a time is 20x faster
+    usable, findings = _check_values(rates, rate_hz, quality)
+    findings += _check_gaps(log)
+    start, stop = damage.longest_stretch(usable, log.gap_rows)
+    findings += _check_length(start, stop, usable.size, rate_hz, quality)
+    if not _rejects(findings):
+        at_rest, more = _check_rest(rates[:, start:stop], start, rate_hz, quality)
+        findings += more
+        if not at_rest.all():
+            first, last = damage.longest_stretch(at_rest, np.empty(0, np.intp))
+            start, stop = start + first, start + last
+            findings += _check_length(start, stop, usable.size, rate_hz, quality)
+    every = (*log.findings, *findings)
+    return Inspected(_worst(every), start, stop, every)
+
+
+def _worst(findings: tuple[Finding, ...]) -> str:
+    """The outcome that decides."""
+    return max((f.outcome for f in findings), key=(KEPT, REPAIRED, REJECTED).index, default=KEPT)
+
+
+def _rejects(findings: list[Finding]) -> bool:
+    return any(finding.outcome == REJECTED for finding in findings)
+
+
+def _check_values(
+    rates: NDArray[np.float64], rate_hz: float, quality: Quality
+) -> tuple[NDArray[np.bool_], list[Finding]]:
+    """Which rows hold what was measured, (n,), and what the others hold."""
+    first, last = damage.rows_between_zeros(rates)
+    usable = np.zeros(rates.shape[1], bool)
+    usable[first:last] = True
+    findings = []
+    if not usable.all():
+        findings.append(Finding("zero rows", KEPT, f"{_rows(np.flatnonzero(~usable))}, cut"))
+    for check, samples in _damaged(rates[:, first:last], rate_hz, quality).items():
+        rows = samples.any(axis=0)
+        if rows.any():
+            where = f"{_axes(samples)}{_rows(first + np.flatnonzero(rows))}"
+            findings.append(Finding(check, REPAIRED, f"{where}, cut"))
+            usable[first:last] &= ~rows
+    return usable, findings
+
+
+def _damaged(
+    rates: NDArray[np.float64], rate_hz: float, quality: Quality
+) -> dict[str, NDArray[np.bool_]]:
+    """Samples to cut, (axis, n) or (1, n), by what is wrong with them."""
+    if not rates.size:
+        return {}
+    finite = np.abs(rates) < _NO_NUMBER  # neither NaN nor infinity is
+    if not finite.all():
+        rates = np.where(finite, rates, np.nan)
+    least = max(round(quality.stuck_s * rate_hz), 2)
+    return {
+        "non-finite values": ~finite,
+        "dropouts": damage.dropouts(rates, quality.false_alarm)[None],
+        "stuck values": damage.stuck(rates, least, quality.false_alarm),
+        "saturation": damage.saturated(rates),
+    }
+
+
+def _check_gaps(log: Log) -> list[Finding]:
+    if not log.gap_rows.size:
+        return []
+    where = f"samples are missing or out of order before {_rows(log.gap_rows)}"
+    return [Finding("gaps", REPAIRED, where)]
+
+
+def _check_length(
+    start: int, stop: int, rows: int, rate_hz: float, quality: Quality
+) -> list[Finding]:
+    """Whether a stretch of a log of so many rows is worth keeping."""
+    for_blocks = LEAST_BLOCKS * _block_size(rate_hz, quality)
+    needed = max(quality.least_s * rate_hz, quality.least_share * rows, for_blocks)
+    if stop - start >= needed:
+        return []
+    detail = (
+        f"the longest usable stretch is {stop - start} of {rows} rows, "
+        f"{(stop - start) / rate_hz:.4g} s; expected at least {needed / rate_hz:.4g} s "
+        f"(quality.least_s, quality.least_share)"
+    )
+    return [Finding("too short", REJECTED, detail)]
+
+
+def _block_size(rate_hz: float, quality: Quality) -> int:
+    return max(round(quality.block_s * rate_hz), _LEAST_BLOCK)
+
+
+def _check_rest(
+    rates: NDArray[np.float64], first_row: int, rate_hz: float, quality: Quality
+) -> tuple[NDArray[np.bool_], list[Finding]]:
+    """Which rows of a stretch the gyroscope was at rest in, (n,), and what else its noise says."""
+    at_rest = np.ones(rates.shape[1], bool)
+    blocks = stationarity.Blocks.of(rates, _block_size(rate_hz, quality))
+    findings = _check_steps(rates, blocks, quality) + _check_noise(blocks, quality)
+    if _rejects(findings):
+        return at_rest, findings
+    rows = stationarity.excursions(blocks, quality.false_alarm)
+    bursts = stationarity.bursts(rows, blocks.size)
+    calm = blocks.apart_from(bursts)
+    moved = _movements(blocks, bursts, calm, first_row, rate_hz, quality)
+    if moved:
+        return at_rest, [*findings, Finding("motion", REJECTED, "; ".join(moved))]
+    for first, last in bursts:  # and a block on either side, where it may still ring
+        at_rest[max(first - blocks.size, 0) : last + 1 + blocks.size] = False
+    if len(bursts):
+        findings.append(_shocks(rates, rows, bursts, first_row))
+    return at_rest, findings + _check_drift(blocks, calm, rate_hz, quality)
+
+
+def _check_steps(
+    rates: NDArray[np.float64], blocks: stationarity.Blocks, quality: Quality
+) -> list[Finding]:
+    """The coarsest axis, if its step is not small beside the noise."""
+    steps = damage.quantisation_steps(rates)
+    # rounding to a step adds step^2 / 12 to the variance (Sheppard)
+    noise = np.sqrt(np.maximum(blocks.noise**2 - steps**2 / 12, 0))
+    coarse = np.flatnonzero(steps > quality.coarse_step * noise)
+    if not coarse.size:
+        return []
+    axis = coarse[np.argmax(steps[coarse] - quality.largest_step * noise[coarse])]
+    detail = (
+        f"axis {AXES[axis]} has a step of {steps[axis] / MDPS:.4g} mdps beside a noise of "
+        f"{noise[axis] / MDPS:.4g} mdps"
+    )
+    if steps[axis] <= quality.largest_step * noise[axis]:
+        return [Finding("coarse quantisation", KEPT, detail)]
+    detail += f"; its mean can be trusted up to {quality.largest_step:g} times the noise"
+    return [Finding("coarse quantisation", REJECTED, detail)]
+
+
+def _check_noise(blocks: stationarity.Blocks, quality: Quality) -> list[Finding]:
+    axis = int(np.argmax(blocks.noise))
+    if blocks.noise[axis] <= quality.largest_noise_dps:
+        return []
+    detail = (
+        f"axis {AXES[axis]} has a noise of {blocks.noise[axis]:.3g} deg/s; expected at most "
+        f"{quality.largest_noise_dps:g} of a gyroscope at rest (check the unit; "
+        "quality.largest_noise_dps)"
+    )
+    return [Finding("noise level", REJECTED, detail)]
+
+
+def _movements(  # noqa: PLR0917 - a stretch, what was found in it, and where it is
+    blocks: stationarity.Blocks,
+    bursts: NDArray[np.integer],
+    calm: NDArray[np.bool_],
+    first_row: int,
+    rate_hz: float,
+    quality: Quality,
+) -> list[str]:
+    """What shows that the gyroscope moved; nothing at rest."""
+    found = []
+    long = bursts[np.diff(bursts)[:, 0] >= quality.shock_s * rate_hz]
+    if len(long):
+        found.append(f"the rate is beyond the noise {_span(first_row + long[0], rate_hz)}")
+    scatter = stationarity.mean_noise(blocks, calm) / (blocks.noise / np.sqrt(blocks.size))
+    if scatter.max() > _COLOUR:
+        axis = int(np.argmax(scatter))
+        found.append(f"means scatter {scatter[axis]:.2g} times more than noise, axis {AXES[axis]}")
+    lags = [max(round(lag_s / quality.block_s), 1) for lag_s in quality.lags_s]
+    changed = stationarity.changes(blocks, calm, lags, quality.false_alarm)
+    if changed.any():
+        spread = np.ptp(blocks.means[:, calm], axis=1)
+        axis = int(np.argmax(spread / stationarity.mean_noise(blocks, calm)))
+        about = _span(first_row + blocks.span(changed), rate_hz)
+        found.append(f"the rate changes by {spread[axis]:.2g} deg/s, axis {AXES[axis]}, {about}")
+    noisy = calm & blocks.noisier_than(_NOISE_RISE)
+    if noisy.any():
+        found.append(f"the noise rises {_span(first_row + blocks.span(noisy), rate_hz)}")
+    return found
+
+
+def _shocks(
+    rates: NDArray[np.float64],
+    rows: NDArray[np.integer],
+    bursts: NDArray[np.integer],
+    first_row: int,
+) -> Finding:
+    """Rows beyond the noise in bursts too short for a movement."""
+    peaks = np.abs(rates[:, rows] - np.median(rates, axis=1, keepdims=True)).max(axis=1)
+    axis = int(np.argmax(peaks))
+    times = f" in {len(bursts)} bursts" if len(bursts) > 1 else ""
+    detail = (
+        f"up to {peaks[axis]:.3g} deg/s from the median, axis {AXES[axis]}, "
+        f"{_rows(first_row + rows)}{times}, cut with what is about them"
+    )
+    return Finding("shocks", REPAIRED, detail)
+
+
+def _check_drift(
+    blocks: stationarity.Blocks, calm: NDArray[np.bool_], rate_hz: float, quality: Quality
+) -> list[Finding]:
+    if np.count_nonzero(calm) < LEAST_BLOCKS:
+        return []
+    least_dps = quality.drift_mdps * MDPS
+    drifts = stationarity.drifts(blocks, calm, rate_hz, quality.false_alarm, least_dps)
+    details = [
+        f"axis {AXES[one.axis]} by {one.size_dps / MDPS:+.3g} mdps"
+        f" (time constant about {one.time_constant_s:.3g} s)"
+        for one in drifts
+    ]
+    return [Finding("warm-up drift", KEPT, ", ".join(details))] if details else []
+
+
+def _axes(samples: NDArray[np.bool_]) -> str:
+    """Which axes a mask of (axis, n) names; nothing where it is of whole rows."""
+    if len(samples) != len(AXES):
+        return ""
+    names = [AXES[axis] for axis in np.flatnonzero(samples.any(axis=1))]
+    return f"{'axis' if len(names) == 1 else 'axes'} {', '.join(names)}, "
+
+
+def _rows(rows: NDArray[np.integer]) -> str:
+    """Increasing rows, for a person."""
+    if len(rows) == 1:
+        return f"row {rows[0]}"
+    if rows[-1] - rows[0] == len(rows) - 1:
+        return f"rows {rows[0]} to {rows[-1]}"
+    return f"{len(rows)} rows from {rows[0]} to {rows[-1]}"
+
+
+def _span(rows: NDArray[np.integer], rate_hz: float) -> str:
+    """First and last row, for a person."""
+    return (
+        f"from row {rows[0]} to {rows[-1]} ({rows[0] / rate_hz:.4g} to {rows[-1] / rate_hz:.4g} s)"
+    )

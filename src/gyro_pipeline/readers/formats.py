@@ -1,0 +1,285 @@
+"""What loggers call their columns, and what they mean by them.
+
+A new format is a subclass of :class:`Reader` that says so, and an entry in :data:`READERS`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from gyro_pipeline.conventions import AXES, InputError
+from gyro_pipeline.logs import KEPT, Finding
+from gyro_pipeline.parameters import Column, RateUnits, ReaderOptions, TimeUnits
+from gyro_pipeline.readers.headers import (
+    DEG_PER_S,
+    RATE_UNITS,
+    SECONDS,
+    TIME_UNITS,
+    axes,
+    find,
+    listed,
+    matching,
+    rate_unit,
+    split_unit,
+)
+from gyro_pipeline.readers.tables import Table
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which columns of a table are what, by number.
+
+    Attributes:
+        rates: Angular rates about x, y, z.
+        scale_dps: deg/s in one unit of them.
+        time: Timestamps.
+        time_s: Seconds in one unit of them.
+        temperature: Degrees Celsius.
+        counter: Packets, one more each row.
+        counter_bits: The counter starts anew after ``2**counter_bits``.
+        findings: What could not be used.
+    """
+
+    rates: tuple[int, ...]
+    scale_dps: float
+    time: int | None
+    time_s: float
+    temperature: int | None
+    counter: int | None
+    counter_bits: int
+    findings: tuple[Finding, ...]
+
+
+class Reader:
+    """A format: names of columns, and units where the header has none.
+
+    A column that is not of the rates may be absent from a file.
+    """
+
+    rates: ClassVar[tuple[str, str, str]]
+    units: ClassVar[RateUnits | None] = None
+    time: ClassVar[str | None] = None
+    time_units: ClassVar[TimeUnits | None] = None
+    temperature: ClassVar[str | None] = None
+    counter: ClassVar[str | None] = None
+    counter_bits: ClassVar[int] = 16
+
+    def claims(self, table: Table) -> bool:
+        """Whether a table is of this format: it has the rates and the time."""
+        needed = [*self.rates, *([self.time] if self.time else [])]
+        return all(matching(table.names, name) for name in needed)
+
+    def rate_columns(self, table: Table, where: str) -> Sequence[Column]:
+        """The three columns of the rates."""
+        del table, where
+        return self.rates
+
+    def time_column(self, table: Table) -> Column | None:
+        """The column of the timestamps, if there is one."""
+        return self._if_there(table, self.time)
+
+    def temperature_column(self, table: Table) -> Column | None:
+        """The column of the temperature, if there is one."""
+        return self._if_there(table, self.temperature)
+
+    def layout(self, table: Table, options: ReaderOptions, where: str) -> Layout:
+        """Find the columns and their units: what options say, the header, the format, in turn.
+
+        Raises:
+            InputError: A column is missing or ambiguous, or a unit is unknown or contradicts
+                the header.
+        """
+        names = table.names
+
+        def number(given: Column | None, own: Column | None) -> int | None:
+            column = own if given is None else given
+            return None if column is None else find(names, column, where)
+
+        columns = options.columns or self.rate_columns(table, where)
+        rates = tuple(find(names, column, where) for column in columns)
+        if len(set(rates)) < len(AXES):
+            raise InputError(f"{where}: expected three columns of rates, got {list(columns)}")
+        time = number(options.time_column, self.time_column(table))
+        time_s, findings = self._time_unit(table, time, options, where)
+        return Layout(
+            rates=rates,
+            scale_dps=self._scale([names[n] for n in rates], options, where),
+            time=None if findings else time,
+            time_s=time_s,
+            temperature=number(options.temperature_column, self.temperature_column(table)),
+            counter=number(options.counter_column, self._if_there(table, self.counter)),
+            counter_bits=options.counter_bits or self.counter_bits,
+            findings=findings,
+        )
+
+    @staticmethod
+    def _if_there(table: Table, name: str | None) -> str | None:
+        return name if name and matching(table.names, name) else None
+
+    def _scale(self, headers: Sequence[str], options: ReaderOptions, where: str) -> float:
+        """deg/s in one unit of the rates."""
+        said = {split_unit(header, RATE_UNITS)[1] for header in headers}
+        found = {rate_unit(header) for header in headers}
+        if len(found) > 1:
+            raise InputError(
+                f"{where}: expected one unit of all rates, got {listed(headers)}; correct the "
+                "header"
+            )
+        unit = found.pop()
+        if unit and options.units and unit != options.units:
+            raise InputError(
+                f"{where}: the header says {unit}, {listed(headers)}, and units of the options "
+                f"{options.units}; correct the one that is wrong"
+            )
+        unknown = next(iter(said)) if unit is None else None
+        unit = unit or options.units or (None if unknown else self.units)
+        if unit == "raw" and options.scale_dps is None:
+            raise InputError(f"{where}: raw counts: give units: raw and scale_dps, deg/s a count")
+        if unit is None:
+            raise InputError(
+                f"{where}: expected a unit of the rates, got {listed(headers)}; give units: "
+                f"{', '.join(DEG_PER_S)} or raw (with scale_dps)"
+            )
+        return options.scale_dps or DEG_PER_S[unit]
+
+    def _time_unit(
+        self, table: Table, time: int | None, options: ReaderOptions, where: str
+    ) -> tuple[float, tuple[Finding, ...]]:
+        """Seconds in one unit of the timestamps; a finding if there are none to use."""
+        if time is None:
+            return 1.0, (Finding("timestamps", KEPT, "no time column: the rate is not checked"),)
+        if time in table.in_seconds:
+            return 1.0, ()
+        header = table.names[time]
+        said = split_unit(header, TIME_UNITS)[1]
+        unit = TIME_UNITS.get(said or "")
+        if said and unit is None and options.time_units is None:
+            raise InputError(
+                f"{where}: expected a time in {', '.join(SECONDS)}, got {header!r}; give time_units"
+            )
+        if unit and options.time_units and unit != options.time_units:
+            raise InputError(
+                f"{where}: the header says {unit}, {header!r}, and time_units of the options "
+                f"{options.time_units}; correct the one that is wrong"
+            )
+        unit = unit or options.time_units or self.time_units
+        if unit:
+            return SECONDS[unit], ()
+        if options.time_column is not None:
+            raise InputError(f"{where}: {header!r} has no unit; give time_units: s, ms or us")
+        text = f"{header!r} has no unit and is not used; give time_units to have the rate checked"
+        return 1.0, (Finding("timestamps", KEPT, text),)
+
+
+class MovellaDot(Reader):
+    """Export of the Movella (Xsens) DOT app.
+
+    Source: Xsens DOT User Manual XD0502P, section 4.2: angular velocity in deg/s; SampleTimeFine
+    in microseconds; it and PacketCounter wrap at 2**32.
+    """
+
+    rates = ("Gyr_X", "Gyr_Y", "Gyr_Z")
+    units = "deg/s"
+    time = "SampleTimeFine"
+    time_units = "us"
+    counter = "PacketCounter"
+    counter_bits = 32
+
+    def claims(self, table: Table) -> bool:
+        """Whether it is; MT Manager writes the same names and rad/s, below lines of ``//``."""
+        return super().claims(table) and "//" not in table.preamble
+
+
+class MovellaDotAngles(Reader):
+    """DOT recordings as published with ``Multiple-MEMS-IMUs-Estimation``: angles and seconds."""
+
+    rates = ("w_x", "w_y", "w_z")
+    units = "deg/s"
+    time = "Time"
+    time_units = "s"
+
+    def claims(self, table: Table) -> bool:
+        """Whether it is: the rates alone are common names."""
+        marks = ("phi", "theta", "psi", "f_x", "f_y", "f_z")
+        return super().claims(table) and {*marks} <= {*table.names}
+
+
+class OpenLogArtemis(Reader):
+    """SparkFun OpenLog Artemis with its ICM-20948.
+
+    Source: its documentation of sensor units: gX, gY, gZ in degrees per second, imu_degC in
+    degrees Celsius; rtcTime is ``HH:MM:SS`` with hundredths.
+    """
+
+    rates = ("gX", "gY", "gZ")
+    units = "deg/s"
+    time = "rtcTime"
+    temperature = "imu_degC"
+
+
+class Ngimu(Reader):
+    """``sensors.csv`` of x-io's NGIMU software, which has all units in its header."""
+
+    rates = ("Gyroscope X", "Gyroscope Y", "Gyroscope Z")
+    time = "Time"
+
+
+class General(Reader):
+    """Any table; rates are the columns of the options, or those whose headers say so."""
+
+    def claims(self, table: Table) -> bool:
+        """Every table."""
+        del table
+        return True
+
+    def rate_columns(self, table: Table, where: str) -> Sequence[Column]:
+        """Three columns with units of angular rate that differ in x, y, z; or all of three."""
+        rates = [n for n, name in enumerate(table.names) if rate_unit(name) not in (None, "raw")]
+        if not rates and len(table.names) == len(AXES):
+            return range(len(AXES))
+        stems = [split_unit(table.names[n], RATE_UNITS)[0] for n in rates]
+        if len(rates) != len(AXES) or (order := axes(stems)) is None:
+            raise InputError(
+                f"{where}: expected columns of angular rate about x, y, z with their unit, got "
+                f"{listed(table.names)}; give columns"
+            )
+        return [rates[number] for number in order]
+
+    def time_column(self, table: Table) -> Column | None:
+        """The first column that is named time or timestamp."""
+        stems = [split_unit(name, TIME_UNITS)[0].lower() for name in table.names]
+        return next((n for n, stem in enumerate(stems) if stem in ("time", "timestamp", "t")), None)
+
+    def temperature_column(self, table: Table) -> Column | None:
+        """The one column that is named a temperature, in degrees Celsius."""
+        named = [(n, *split_unit(name, ("degc", "°c"))) for n, name in enumerate(table.names)]
+        found = [n for n, stem, unit in named if "temp" in stem.lower() and unit in _CELSIUS]
+        return found[0] if len(found) == 1 else None
+
+
+_CELSIUS = ("°c", "ºc", "c", "degc", "celsius")
+
+READERS: dict[str, Reader] = {
+    "movella_dot": MovellaDot(),
+    "movella_dot_angles": MovellaDotAngles(),
+    "openlog_artemis": OpenLogArtemis(),
+    "ngimu": Ngimu(),
+    "general": General(),
+}
+"""Formats by the name that ``format`` of the options has; the first that claims a file reads it."""
+
+
+def reader_of(table: Table, options: ReaderOptions, path: Path) -> Reader:
+    """The format that the options name, or the first that claims the table.
+
+    Raises:
+        InputError: There is no format of that name.
+    """
+    if options.format == "auto":
+        return next(reader for reader in READERS.values() if reader.claims(table))
+    if options.format not in READERS:
+        raise InputError(
+            f"{path}: expected format auto, {', '.join(READERS)}, got {options.format!r}"
+        )
+    return READERS[options.format]

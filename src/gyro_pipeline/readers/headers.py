@@ -1,0 +1,112 @@
+"""Column headers: names and units."""
+
+import re
+from collections.abc import Iterable, Sequence
+from itertools import permutations
+from math import pi
+
+from gyro_pipeline.conventions import AXES, MDPS, InputError
+from gyro_pipeline.parameters import Column
+
+DEG_PER_S = {"deg/s": 1.0, "rad/s": 180 / pi, "mdps": MDPS}
+"""deg/s in one of each unit of angular rate but raw counts."""
+
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
+"""Seconds in one of each unit of time."""
+
+_SPELLINGS = {
+    "deg/s": "deg/s dps °/s º/s deg/sec degree/s degrees/s degrees/sec deg_s deg·s-1 deg.s-1",
+    "rad/s": "rad/s rad/sec radian/s radians/s radians/sec rad_s rad·s-1 rad.s-1",
+    "mdps": "mdps mdeg/s m°/s mdeg/sec mdeg_s",
+    "raw": "raw lsb count counts",
+    "s": "s sec secs second seconds",
+    "ms": "ms msec millisecond milliseconds",
+    "us": "us µs μs usec microsecond microseconds",  # two different signs for micro
+}
+RATE_UNITS = {text: unit for unit in (*DEG_PER_S, "raw") for text in _SPELLINGS[unit].split()}
+TIME_UNITS = {text: unit for unit in SECONDS for text in _SPELLINGS[unit].split()}
+
+_BRACKETED = re.compile(r"\s*[(\[]([^()\[\]]*)[)\]]\s*$")
+_AXIS = re.compile(r"\.[xyz]$")  # of an array of three columns
+
+
+def split_unit(header: str, spellings: Iterable[str]) -> tuple[str, str | None]:
+    """Part a header into its name and its unit as written.
+
+    Args:
+        header: Such as ``Gyroscope X (deg/s)``, ``w_x [rad/s]``, ``gx_dps`` or ``w_x``.
+        spellings: Units to look for where there are no brackets.
+
+    Returns:
+        The name, and what is in brackets at the end, else a spelling behind a space, dot or
+        underscore at the end, in lower case without spaces; None if there is neither.
+    """
+    axis = match[0] if (match := _AXIS.search(header)) else ""
+    text = header.removesuffix(axis)
+    if found := _BRACKETED.search(text):
+        return text[: found.start()] + axis, re.sub(r"\s|\^", "", found[1].lower())
+    for unit in sorted(spellings, key=len, reverse=True):
+        name = text[: -len(unit)]
+        if text.lower().endswith(unit) and name.endswith((" ", "_", ".")):
+            return name.rstrip(" _.") + axis, unit
+    return header, None
+
+
+def rate_unit(header: str) -> str | None:
+    """Unit of an angular rate as its header has it; None if it says none or an unknown one."""
+    return RATE_UNITS.get(split_unit(header, RATE_UNITS)[1] or "")
+
+
+def find(names: Sequence[str], column: Column, where: str) -> int:
+    """Look up a column by its name, with or without the unit behind it, or by its number.
+
+    Args:
+        names: The header.
+        column: Name or number, from 0.
+        where: For messages.
+
+    Raises:
+        InputError: There is no such column, or more than one.
+    """
+    if isinstance(column, int):
+        if column < len(names):
+            return column
+        raise InputError(f"{where}: expected a column {column} (from 0), got {len(names)} columns")
+    found = matching(names, column)
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise InputError(
+            f"{where}: expected one column {column!r}, got {len(found)}, numbers "
+            f"{', '.join(map(str, found))} (from 0): two sensors in one file? Give the columns' "
+            "numbers"
+        )
+    raise InputError(
+        f"{where}: expected a column {column!r}, got {listed(names)}; correct the name, or give "
+        "columns of the options"
+    )
+
+
+def matching(names: Sequence[str], column: str) -> list[int]:
+    """Numbers of the columns with a name, as a whole or else without the unit behind it."""
+    exact = [number for number, name in enumerate(names) if name == column]
+    known = {*RATE_UNITS, *TIME_UNITS}
+    return exact or [n for n, name in enumerate(names) if split_unit(name, known)[0] == column]
+
+
+def axes(names: Sequence[str]) -> list[int] | None:
+    """Numbers of three columns whose names differ only in the letters x, y, z, in that order."""
+    for order in permutations(range(len(names)), len(AXES)):
+        stems = [
+            {name[:at] + name[at + 1 :] for at, letter in enumerate(name.lower()) if letter == axis}
+            for name, axis in zip([names[number] for number in order], AXES, strict=True)
+        ]
+        if set.intersection(*stems):
+            return list(order)
+    return None
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names for a message, the first thirty of them."""
+    shown = ", ".join(repr(name[:40]) for name in names[:30])
+    return (shown + (", …" if len(names) > 30 else "")) if names else "no header"  # noqa: PLR2004

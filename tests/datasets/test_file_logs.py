@@ -1,0 +1,246 @@
+import logging
+import os
+import pickle
+
+import numpy as np
+import pytest
+from kedro.io import DatasetError
+
+from gyro_pipeline.conventions import InputError
+from gyro_pipeline.datasets import parse_cache
+from gyro_pipeline.datasets.file_logs import FileLogs
+from gyro_pipeline.logs import KEPT, Finding, Log, Logs
+
+SENSORS = {
+    "dot": {
+        "imus": 5,
+        "recordings": 100,
+        "train_recordings": 80,
+        "samples": 1200,
+        "recording_s": 10,
+        "simulated": {
+            "noise_mdps_rts": [5.4, 5.4, 5.4],
+            "turn_on_spread_mdps": [0.3, 0.3, 0.3],
+            "unit_bias_dps": 3,
+        },
+    }
+}
+
+
+def file_logs(folder, pattern, **options):
+    options = {"sensor": "dot", "sensors": SENSORS, "source": "mine"} | options
+    return FileLogs(path=str(folder), pattern=pattern, **options)
+
+
+def put(folder, *names):
+    """Files of ten rows; the first rate is the file's place among the names."""
+    for place, name in enumerate(names):
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        rows = (f"{row / 120:.6f},{place},{row},0.5\n" for row in range(10))
+        path.write_text("Time,w_x,w_y,w_z\n" + "".join(rows))
+
+
+def numbers(logs):
+    return {entry.where: (entry.imu, entry.recording) for entry in logs.load().entries}
+
+
+def refusal(logs):
+    with pytest.raises(DatasetError) as caught:
+        logs.load()
+    assert isinstance(caught.value.__cause__, InputError)
+    return str(caught.value.__cause__)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "expected"),
+    [
+        ("{imu}/{recording}.csv", {"1/2.csv": (1, 2), "1/10.csv": (1, 10), "3/2.csv": (3, 2)}),
+        ("dot_{imu}.csv", {"dot_4.csv": (4, 1), "dot_05.csv": (5, 1)}),
+        ("run{recording}.csv", {"run7.csv": (1, 7)}),
+        ("only.csv", {"only.csv": (1, 1)}),
+        # in the order of their names, 2 before 10
+        ("{imu}_*.csv", {"1_b2.csv": (1, 1), "1_b10.csv": (1, 2), "2_a.csv": (2, 1)}),
+        ("*/log*.csv", {"1/log2.csv": (1, 1), "1/log10.csv": (1, 2), "2/log1.csv": (1, 3)}),
+        ("D{imu:name}.csv", {"D2A.csv": (1, 1), "D10.csv": (2, 1), "DAF.csv": (3, 1)}),
+        (
+            "{recording:name}/{imu}.csv",
+            {"mon/1.csv": (1, 1), "mon/2.csv": (2, 1), "tue/2.csv": (2, 2)},
+        ),
+    ],
+)
+def test_the_pattern_gives_imu_and_recording(tmp_path, pattern, expected):
+    put(tmp_path, *expected, ".hidden_1.csv", "notes.txt")
+    assert numbers(file_logs(tmp_path, pattern)) == expected
+
+
+def test_entries_are_in_the_order_of_imu_and_recording_and_read_their_own_file(tmp_path):
+    put(tmp_path, "2_1.csv", "1_10.csv", "1_9.csv")
+    logs = file_logs(tmp_path, "{imu}_{recording}.csv").load()
+    assert (logs.sensor, logs.source, logs.simulated, logs.rate_hz) == ("dot", "mine", False, 120)
+    assert [entry.where for entry in logs.entries] == ["1_9.csv", "1_10.csv", "2_1.csv"]
+    assert [entry.size for entry in logs.entries] == [
+        (tmp_path / entry.where).stat().st_size for entry in logs.entries
+    ]
+    first = pickle.loads(pickle.dumps(logs.entries[0])).read()
+    np.testing.assert_array_equal(first.samples, [[2, row, 0.5] for row in range(10)])
+    assert first.rate_hz == pytest.approx(120, rel=1e-3)
+
+
+def test_files_that_do_not_match_are_named(tmp_path, caplog):
+    put(tmp_path, "dot_1.csv", "dot_x.csv", "readme.txt", ".hidden")
+    with caplog.at_level(logging.INFO, "gyro_pipeline"):
+        file_logs(tmp_path, "dot_{imu}.csv").load()
+    assert caplog.messages == [
+        f"dot {tmp_path}: 2 files are not like dot_{{imu}}.csv: dot_x.csv, readme.txt"
+    ]
+
+
+def test_names_that_became_numbers_are_said(tmp_path, caplog):
+    put(tmp_path, "D2A.csv", "D10.csv")
+    with caplog.at_level(logging.INFO, "gyro_pipeline"):
+        file_logs(tmp_path, "D{imu:name}.csv").load()
+    assert caplog.messages == ["dot: 2 imus by name: 2A is 1, 10 is 2"]
+
+
+@pytest.mark.parametrize(
+    ("names", "pattern", "words"),
+    [
+        (["a.csv"], "dot_{imu}.csv", ["files like dot_{imu}.csv, got a.csv;", "pattern"]),
+        ([f"{n}.txt" for n in range(9)], "{imu}.csv", ["got 0.txt, 1.txt, 2.txt, 3.txt, 4.txt, …"]),
+        ([], "{imu}.csv", ["got none"]),
+        (["1.csv", "01.csv"], "{imu}.csv", ["01.csv and 1.csv", "recording 1 of IMU 1", "remove"]),
+        (["1/2_a.csv", "1/2_b.csv"], "{imu}/{recording}_*.csv", ["1/2_a.csv and 1/2_b.csv"]),
+        (["0.csv"], "{imu}.csv", ["0.csv", "from 1 on for {imu}", "{imu:name}"]),
+    ],
+)
+def test_files_that_cannot_be_told_apart_are_refused(tmp_path, names, pattern, words):
+    put(tmp_path, *names)
+    message = refusal(file_logs(tmp_path, pattern))
+    assert message.startswith("dot")
+    for word in words:
+        assert word in message
+
+
+def test_a_missing_folder(tmp_path):
+    logs = file_logs(tmp_path / "nowhere", "{imu}.csv")
+    assert not logs.exists()
+    assert f"dot {tmp_path / 'nowhere'}: no such folder; put the files there" in refusal(logs)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"pattern": "{sensor}_{imu}.csv"}, "expected {imu}, {recording}, {imu:name}"),
+        ({"pattern": "{imu}_{imu}.csv"}, "{imu} is there twice"),
+        ({"pattern": "{imu.csv"}, "expected {imu}"),
+        ({"sensor": "dott"}, "unknown sensor 'dott'"),
+        ({"reader": {"unit": "deg/s"}}, "dot: reader in the catalog entry"),
+    ],
+)
+def test_a_wrong_entry_is_refused_before_anything_is_read(tmp_path, options, words):
+    with pytest.raises(InputError) as caught:
+        file_logs(tmp_path, **{"pattern": "{imu}.csv"} | options)
+    assert words in str(caught.value)
+
+
+def test_logs_are_read_only(tmp_path):
+    with pytest.raises(DatasetError, match="read only"):
+        file_logs(tmp_path, "{imu}.csv").save(Logs("dot", "mine", False, 120, []))
+
+
+# what is kept of files that were read
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """Names of the files that are read, and what each of them gives."""
+    names = []
+    log = Log(
+        np.array([[0.1, np.nan, np.inf]]),
+        **{"rate_hz": 120.5, "gap_rows": np.array([3, 7]), "temperature_c": np.array([21.5])},
+        findings=(Finding("time", KEPT, "jitter of 3 ms"),),
+    )
+
+    def read_log(path, *_):
+        names.append(path.name)
+        if path.read_text().startswith("bad"):
+            raise InputError(f"{path.name}: bad")
+        return log
+
+    monkeypatch.setattr(parse_cache, "read_log", read_log)
+    return names, log
+
+
+def read_all(logs):
+    read = []
+    for entry in logs.load().entries:
+        try:
+            read.append(entry.read())
+        except InputError:
+            read.append(None)
+    return read
+
+
+def test_what_was_read_before_is_not_read_again_and_the_same(tmp_path, counted, caplog):
+    names, log = counted
+    put(tmp_path, "1.csv", "2.csv")
+    logs = file_logs(tmp_path, "{imu}.csv", cache=str(tmp_path / ".read"))
+    logs.load().entries[0].read()  # and then it was interrupted
+    with caplog.at_level(logging.INFO, "gyro_pipeline"):
+        again, _ = read_all(logs)
+    assert names == ["1.csv", "2.csv"]
+    assert caplog.messages == ["dot: 1 of 2 files were read before"]
+    np.testing.assert_array_equal(again.samples, log.samples.astype(np.float32))
+    np.testing.assert_array_equal(again.gap_rows, log.gap_rows)
+    np.testing.assert_array_equal(again.temperature_c, log.temperature_c)
+    assert (again.rate_hz, again.findings) == (log.rate_hz, log.findings)
+    assert again.samples.dtype == np.float64
+
+
+def rewrite(path):
+    path.write_text(path.read_text() + "1,2,3,4\n")
+
+
+def touch(path):
+    os.utime(path, ns=(1, 1))
+
+
+@pytest.mark.parametrize("change", [rewrite, touch])
+def test_a_changed_file_is_read_anew_and_its_old_reading_removed(tmp_path, counted, change):
+    put(tmp_path, "1.csv", "2.csv")
+    logs = file_logs(tmp_path, "{imu}.csv", cache=str(tmp_path / ".read"))
+    read_all(logs)
+    change(tmp_path / "1.csv")
+    read_all(logs)
+    assert counted[0] == ["1.csv", "2.csv", "1.csv"]
+    assert len(list((tmp_path / ".read").iterdir())) == 2
+
+
+def test_other_options_and_other_readers_read_anew(tmp_path, counted, monkeypatch):
+    put(tmp_path, "1.csv")
+    cache = {"cache": str(tmp_path / ".read")}
+    read_all(file_logs(tmp_path, "{imu}.csv", **cache))
+    slow = {"dot": SENSORS["dot"] | {"recording_s": 20}}
+    read_all(file_logs(tmp_path, "{imu}.csv", **cache, sensors=slow))
+    monkeypatch.setattr("gyro_pipeline.datasets.file_logs._readers_hash", lambda: "another")
+    read_all(file_logs(tmp_path, "{imu}.csv", **cache, sensors=slow))
+    assert counted[0] == ["1.csv"] * 3
+
+
+def test_a_damaged_reading_is_none(tmp_path, counted):
+    put(tmp_path, "1.csv")
+    logs = file_logs(tmp_path, "{imu}.csv", cache=str(tmp_path / ".read"))
+    read_all(logs)
+    (kept,) = (tmp_path / ".read").iterdir()
+    kept.write_bytes(kept.read_bytes()[:-30])
+    assert read_all(logs)[0] is not None
+    assert counted[0] == ["1.csv"] * 2
+
+
+def test_files_that_cannot_be_used_and_binary_ones_are_not_kept(tmp_path, counted):
+    (tmp_path / "1.csv").write_text("bad")
+    put(tmp_path, "2.parquet")
+    logs = file_logs(tmp_path, "{imu}.*", cache=str(tmp_path / ".read"))
+    assert [log is None for log in read_all(logs)] == [True, False]
+    assert not (tmp_path / ".read").exists()

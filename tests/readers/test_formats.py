@@ -1,0 +1,220 @@
+"""Every format, every way of storing it: the same samples in deg/s."""
+
+import os
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.io
+
+from gyro_pipeline.conventions import InputError
+from gyro_pipeline.parameters import ReaderOptions
+from gyro_pipeline.readers import READERS, Reader, read_log
+from gyro_pipeline.readers.formats import reader_of
+from gyro_pipeline.readers.tables import open_table
+
+RATES_HZ = {
+    "movella_dot": 1e6 / 8333,
+    "movella_dot_angles": 120,
+    "openlog_artemis": 100,
+    "ngimu": 400,
+    "general": 100,
+}
+
+
+def checks(log):
+    return [(finding.check, finding.outcome) for finding in log.findings]
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_each_logger_is_told_by_its_header_and_read_in_deg_per_s(name, good, rates, read, tmp_path):
+    log = read(good[name], RATES_HZ[name])
+    assert reader_of(open_table(tmp_path / "log.csv"), ReaderOptions(), Path()) is READERS[name]
+    np.testing.assert_allclose(log.samples, rates, rtol=0, atol=1e-7)
+    assert log.samples.dtype == np.float64
+    assert log.rate_hz == pytest.approx(RATES_HZ[name], rel=1e-9)
+    assert not len(log.gap_rows)
+    assert not log.findings
+
+
+def test_a_temperature_column_is_kept(good, read):
+    np.testing.assert_array_equal(read(good["openlog_artemis"]).temperature_c, 25.0 + np.arange(60))
+    np.testing.assert_array_equal(read(good["general"]).temperature_c, 25 + np.arange(60) / 8)
+    assert read(good["ngimu"]).temperature_c is None
+    log = read(good["ngimu"], temperature_column="Barometer")
+    assert (log.temperature_c == 1013).all()
+
+
+def test_a_temperature_in_fahrenheit_is_not_taken_for_celsius(good, read):
+    assert read(good["general"].replace("(°C)", "(°F)")).temperature_c is None
+
+
+@pytest.mark.parametrize("header", ["sep=,\n", "", "DeviceTag:,1\nSyncStatus:,0\n\n"])
+def test_a_dot_export_needs_no_first_lines(header, good, rates, read):
+    table = good["movella_dot"][good["movella_dot"].index("PacketCounter") :]
+    np.testing.assert_array_equal(read(header + table).samples, rates)
+
+
+def test_the_names_of_mt_manager_which_writes_rad_per_s_are_not_taken_for_a_dot(good, read):
+    table = good["movella_dot"][good["movella_dot"].index("PacketCounter") :]
+    with pytest.raises(InputError, match="expected columns of angular rate"):
+        read(f"// General information:\n//  MT Manager version: 2022.2.0\n{table}")
+
+
+def save_v73(path, arrays):
+    """As MATLAB does: 512 bytes of its own before HDF5, arrays transposed."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, array in arrays.items():
+            file[name] = np.atleast_2d(array).T if array.ndim == 2 else array[None]
+            file[name].attrs["MATLAB_class"] = np.bytes_("double")
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file".ljust(512))
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".mat", ".v73.mat", ".h5"])
+def test_named_arrays_are_columns(suffix, rates, read):
+    arrays = {"t": np.arange(60) / 100, "gyro_dps": rates, "acc": rates + 1, "degC": rates[:, 0]}
+
+    def save(path):
+        if suffix == ".npz":
+            np.savez(path, **arrays)
+        elif suffix == ".mat":
+            scipy.io.savemat(path, arrays)
+        elif suffix == ".v73.mat":
+            save_v73(path, arrays)
+        else:
+            with h5py.File(path, "w") as file:
+                file.update(arrays)
+
+    log = read(save, name=f"log{suffix}", time_units="s", temperature_column="degC")
+    np.testing.assert_array_equal(log.samples, rates)
+    np.testing.assert_array_equal(log.temperature_c, rates[:, 0])
+    assert log.rate_hz == pytest.approx(100)
+    named = ("acc.z", "acc.y", "acc.x")
+    other = read(save, name=f"log{suffix}", columns=named, units="mdps")
+    np.testing.assert_allclose(other.samples, (rates + 1)[:, ::-1] * 1e-3)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32, np.int16])
+def test_an_npy_file_of_three_columns_needs_a_unit(dtype, rates, read):
+    counts = (rates * 100).astype(dtype)
+    save = lambda path: np.save(path, counts)  # noqa: E731
+    log = read(save, name="log.npy", units="raw", scale_dps=0.01)
+    np.testing.assert_allclose(log.samples, counts.astype(float) * 0.01)
+    assert log.rate_hz is None
+    assert checks(log) == [("timestamps", "kept")]
+    with pytest.raises(InputError, match="expected a unit of the rates"):
+        read(save, name="log.npy")
+
+
+def test_a_parquet_copy_is_read_as_the_text_is(frame, rates, read):
+    log = read(frame.to_parquet, 120, name="log.parquet")
+    np.testing.assert_array_equal(log.samples, rates)
+    assert log.rate_hz == pytest.approx(120)
+    assert not log.findings
+
+
+def test_parquet_timestamps_and_integers_with_missing_values(rates, read):
+    times = pd.Timestamp("2024-03-01") + pd.to_timedelta(np.arange(60) * 5, unit="ms")
+    counts = pd.array([None, *range(1, 60)], dtype="Int32")
+    table = pd.DataFrame({"time": times, "wx (mdps)": counts, "wy (mdps)": 5, "wz (mdps)": 7.0})
+    log = read(table.to_parquet, 200, name="log.parquet")
+    np.testing.assert_allclose(log.samples[1:, 0], np.arange(1, 60) * 1e-3)
+    assert np.isnan(log.samples[0, 0])
+    assert log.rate_hz == pytest.approx(200)
+
+
+@pytest.mark.parametrize(
+    "header",
+    ["X (deg/s),Y (deg/s),Z (deg/s)", "gx_dps,gy_dps,gz_dps", "w x [°/s],w y [°/s],w z [°/s]",
+     "X (DPS),Y (DPS),Z (DPS)", "a.x (deg s^-1),a.y (deg s^-1),a.z (deg s^-1)"],
+)  # fmt: skip
+def test_units_of_a_header_in_the_spellings_that_are_met(header, rates, read):
+    rows = "\n".join(f"{k},{x},{y},{z}" for k, (x, y, z) in enumerate(rates.tolist()))
+    spelled = header.replace("deg s", "deg·s")
+    for encoding in ("utf-8", "cp1252"):
+        log = read(f"k,{spelled}\n{rows}\n".encode(encoding))
+        np.testing.assert_array_equal(log.samples, rates)
+
+
+def test_columns_in_another_order_than_x_y_z_are_put_in_order(rates, read):
+    rows = "\n".join(f"{z},{x},{y}" for x, y, z in rates.tolist())
+    log = read(f"gz_dps,gx_dps,gy_dps\n{rows}\n")
+    np.testing.assert_array_equal(log.samples, rates)
+
+
+def test_a_file_without_header_is_read_by_numbers_of_columns(rates, read):
+    rows = "\n".join(f"{k},{z},{y},{x}" for k, (x, y, z) in enumerate(rates.tolist())) + "\n"
+    options = {"units": "deg/s", "time_column": 0, "time_units": "ms"}
+    log = read(rows, columns=(3, 2, 1), **options)
+    np.testing.assert_array_equal(log.samples, rates)
+    assert log.rate_hz == pytest.approx(1000)
+    with pytest.raises(InputError, match=r"expected a column 7 \(from 0\), got 4 columns"):
+        read(rows, columns=(3, 2, 7), **options)
+
+
+def test_units_of_the_options_win_over_the_format_but_not_over_the_header(good, rates, read):
+    log = read(good["movella_dot"], units="rad/s")
+    np.testing.assert_allclose(log.samples, np.degrees(rates), rtol=1e-14)
+    with pytest.raises(InputError, match="the header says deg/s.*and units of the options rad/s"):
+        read(good["ngimu"], units="rad/s")
+    with pytest.raises(InputError, match="the header says ms.*and time_units of the options s"):
+        read(good["general"], time_units="s")
+
+
+def test_the_header_wins_over_the_format(good, rates, read):
+    text = good["movella_dot"]
+    for axis in "XYZ":
+        text = text.replace(f"Gyr_{axis}", f"Gyr_{axis} (rad/s)")
+    np.testing.assert_allclose(read(text).samples, np.degrees(rates), rtol=1e-14)
+
+
+@pytest.mark.parametrize("unit", ["deg/h", "rpm", "mrad/s", "LSB"])
+def test_an_unknown_unit_in_the_header_is_refused_even_of_a_known_format(unit, good, read):
+    text = good["movella_dot"]
+    for axis in "XYZ":
+        text = text.replace(f"Gyr_{axis}", f"Gyr_{axis} ({unit})")
+    with pytest.raises(InputError, match="expected a unit of the rates|raw counts"):
+        read(text)
+
+
+def test_a_format_can_be_forced_and_a_wrong_one_is_refused(good, read):
+    options = {"columns": ("Acc_X", "Acc_Y", "Acc_Z"), "units": "mdps"}
+    forced = read(good["movella_dot"], format="general", **options)
+    np.testing.assert_allclose(forced.samples, [[0.1e-3, 0.2e-3, 9.8e-3]] * 60)
+    with pytest.raises(InputError, match="expected a column 'gX', got 'PacketCounter'"):
+        read(good["movella_dot"], format="openlog_artemis")
+    with pytest.raises(InputError, match="expected format auto, movella_dot, .*got 'dot'"):
+        read(good["movella_dot"], format="dot")
+
+
+def test_a_new_format_is_a_class_and_an_entry(monkeypatch, rates, read):
+    class Shimmer(Reader):
+        rates = ("Gyro_X", "Gyro_Y", "Gyro_Z")
+        units = "deg/s"
+
+    monkeypatch.setattr("gyro_pipeline.readers.formats.READERS", {"shimmer": Shimmer(), **READERS})
+    rows = "\n".join(f"{x}\t{y}\t{z}" for x, y, z in rates.tolist())
+    np.testing.assert_array_equal(read(f"Gyro_X\tGyro_Y\tGyro_Z\n{rows}\n").samples, rates)
+
+
+REAL = os.environ.get("GYRO_PIPELINE_REAL_DATA")
+
+
+@pytest.mark.skipif(not REAL, reason="GYRO_PIPELINE_REAL_DATA names no folder of real recordings")
+@pytest.mark.parametrize(
+    ("unit", "rows"), [(1, 14461), (2, 14469), (3, 14464), (4, 14460), (5, 14468)]
+)
+def test_real_dot_files_are_read_as_numpy_reads_them(unit, rows):
+    path = Path(REAL) / f"dot_x_stat_{unit}.csv"
+    log = read_log(path, ReaderOptions(), 120)
+    text = [line.split(",")[7:10] for line in path.read_text().splitlines()[1:]]
+    np.testing.assert_array_equal(log.samples, np.array(text, np.float64))
+    assert log.samples.shape == (rows, 3)
+    assert not log.samples[0].any()
+    assert log.rate_hz == pytest.approx(120, rel=1e-9)
+    assert not log.findings
+    assert not len(log.gap_rows)
+    assert np.isinf(log.samples).any(axis=1).nonzero()[0].tolist() == ([13001] if unit == 1 else [])

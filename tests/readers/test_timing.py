@@ -1,0 +1,161 @@
+"""Rates and gaps of stamps and counters whose truth is known."""
+
+import numpy as np
+import pytest
+
+from gyro_pipeline.logs import KEPT, REJECTED
+from gyro_pipeline.readers.timing import check_rate, from_counter, from_stamps
+
+N = 1000
+
+
+def rng():
+    return np.random.default_rng(11)
+
+
+def checks(timing):
+    return [finding.check for finding in timing.findings]
+
+
+def test_even_stamps_give_their_rate_exactly():
+    timing = from_stamps(np.arange(N) / 120, 1.0)
+    assert timing.rate_hz == pytest.approx(120, rel=1e-12)
+    assert not timing.findings
+    assert not len(timing.gap_rows)
+
+
+@pytest.mark.parametrize(("unit_s", "scale"), [(1.0, 1), (1e-3, 1e3), (1e-6, 1e6)])
+def test_units_of_time_give_the_same_rate(unit_s, scale):
+    assert from_stamps(np.arange(N) / 50 * scale, unit_s).rate_hz == pytest.approx(50)
+
+
+@pytest.mark.parametrize("rate", [98.0, 120.0, 70.3])
+def test_stamps_rounded_to_hundredths_give_the_true_rate_and_no_gaps(rate):
+    timing = from_stamps(np.round(np.arange(N) / rate, 2), 1.0)
+    assert timing.rate_hz == pytest.approx(rate, rel=2e-3)
+    assert "gaps" not in checks(timing)
+
+
+def test_stamps_of_whole_milliseconds_do_not_round_the_rate():
+    timing = from_stamps(np.floor(np.arange(N) * 1000 / 120), 1e-3)
+    assert timing.rate_hz == pytest.approx(120, rel=1e-3)
+    assert not timing.findings
+
+
+@pytest.mark.parametrize("burst", [4, 10, 25])
+def test_stamps_in_bursts_give_the_count_over_the_duration(burst):
+    written = np.ceil((np.arange(N) + 1) / burst) * burst / 250 + 1e-4 * rng().random(N)
+    timing = from_stamps(np.sort(written), 1.0)
+    assert timing.rate_hz == pytest.approx(250, rel=burst / N)
+    assert checks(timing) == ["timestamps"]
+    assert not len(timing.gap_rows)
+
+
+def test_a_hole_in_bursts_is_a_gap_and_does_not_change_the_rate():
+    written = np.ceil((np.arange(N) + 1) / 10) * 10 / 250
+    written[500:] += 2
+    timing = from_stamps(written, 1.0)
+    assert timing.gap_rows.tolist() == [500]
+    assert timing.rate_hz == pytest.approx(250, rel=0.02)
+
+
+def test_lost_samples_are_gaps_and_do_not_change_the_rate():
+    kept = np.delete(np.arange(N), [100, 101, 500])
+    timing = from_stamps(kept / 200, 1.0)
+    assert timing.gap_rows.tolist() == [100, 498]
+    assert timing.rate_hz == pytest.approx(200, rel=1e-12)
+    assert checks(timing) == ["gaps"]
+    assert timing.findings[0].detail == "samples are missing, 0.025 s: 2 times, at rows 100, 498"
+
+
+def test_many_lost_samples_are_no_bursts():
+    kept = np.flatnonzero(rng().random(N) > 0.1)
+    timing = from_stamps(kept / 200, 1.0)
+    assert timing.rate_hz == pytest.approx(200, rel=1e-12)
+    np.testing.assert_array_equal(timing.gap_rows, np.flatnonzero(np.diff(kept) > 1) + 1)
+
+
+def test_rows_without_a_stamp_are_no_gaps():
+    stamps = np.arange(N) / 100
+    stamps[[0, 30, 31, 700]] = np.nan
+    timing = from_stamps(stamps, 1.0)
+    assert timing.rate_hz == pytest.approx(100, rel=1e-12)
+    assert not len(timing.gap_rows)
+
+
+def test_jitter_is_said_and_averages_out():
+    timing = from_stamps((np.arange(N) + rng().uniform(-0.2, 0.2, N)) / 100, 1.0)
+    assert timing.rate_hz == pytest.approx(100, rel=1e-3)
+    assert checks(timing) == ["jitter"]
+
+
+def test_time_that_goes_back_is_a_gap():
+    timing = from_stamps(np.r_[np.arange(600), np.arange(400)] / 100, 1.0)
+    assert timing.gap_rows.tolist() == [600]
+    assert timing.rate_hz == pytest.approx(100)
+    assert checks(timing) == ["time order"]
+
+
+def test_repeated_stamps_are_said():
+    stamps = np.arange(N) / 120
+    stamps[500] = stamps[499]
+    timing = from_stamps(stamps, 1.0)
+    assert checks(timing) == ["gaps", "duplicated timestamps"]
+
+
+@pytest.mark.parametrize(
+    ("period", "step", "unit_s"),
+    [(2**32, 8333, 1e-6), (2**16, 10, 1e-3), (2**24, 100, 1e-6), (86_400, 0.02, 1.0)],
+)
+def test_counters_of_time_and_midnight_are_unwrapped(period, step, unit_s):
+    timing = from_stamps(np.mod(period - 500 * step + step * np.arange(N), period), unit_s)
+    assert timing.rate_hz == pytest.approx(1 / (step * unit_s), rel=1e-9)
+    assert not len(timing.gap_rows)
+    assert checks(timing) == ["wrap-around"]
+    assert timing.findings[0].detail.endswith("once, at row 500")
+
+
+@pytest.mark.parametrize("stamps", [np.zeros(9), np.full(9, np.nan), np.arange(9.0)[::-1]])
+def test_stamps_that_do_not_advance_give_no_rate(stamps):
+    timing = from_stamps(stamps, 1.0)
+    assert timing.rate_hz is None
+    assert [f.outcome for f in timing.findings] == [KEPT]
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_a_packet_counter_may_wrap_but_not_skip(bits):
+    counts = np.mod(np.arange(N) + 2**bits - 100, 2**bits).astype(float)
+    whole = from_counter(counts, bits)
+    assert not len(whole.gap_rows)
+    assert checks(whole) == ["wrap-around"]
+    skipped = from_counter(np.delete(counts, [300, 301]), bits)
+    assert skipped.gap_rows.tolist() == [300]
+    assert checks(skipped) == ["wrap-around", "packet counter"]
+    counts[300] = np.nan
+    assert not len(from_counter(counts, bits).gap_rows)
+
+
+@pytest.mark.parametrize("counts", [[5, 6, 6, 7], [5, 6, 3, 4], [5, 6, 8, 9]])
+def test_a_packet_that_repeats_or_goes_back_or_skips_is_a_gap(counts):
+    timing = from_counter(np.array(counts, float), 16)
+    assert timing.gap_rows.tolist() == [2]
+    assert checks(timing) == ["packet counter"]
+    assert timing.rate_hz is None
+
+
+def test_a_rate_within_the_tolerance_is_no_finding():
+    assert check_rate(121.9, 120, 2.0) == ()
+
+
+@pytest.mark.parametrize(
+    ("rate", "advice"),
+    [
+        (60, "got 60 Hz; check the file's time"),
+        (0.12, "it is off by 10^-3: check time_units"),
+        (120e6, "it is off by 10^6: check time_units"),
+    ],
+)
+def test_another_rate_is_rejected_with_advice(rate, advice):
+    (finding,) = check_rate(rate, 120, 2.0)
+    assert finding.outcome == REJECTED
+    assert advice in finding.detail
