@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-_HIDDEN, _BATCH, _LEARNING_RATE, _WEIGHT_DECAY = 32, 256, 3e-3, 1e-2
+_HIDDEN, _BATCH, _LEARNING_RATE, _WEIGHT_DECAY = 32, 256, 6e-3, 1e-2
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def train_perceptrons(
     inputs: NDArray[np.float64],
     aims: NDArray[np.float64],
     used: NDArray[np.bool_],
-    steps: int = 800,
+    steps: int = 400,
     seed: int = 0,
 ) -> Perceptrons:
     """Train networks with squared errors and AdamW, on a learning rate that rises and falls.
