@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from gyro_pipeline.conventions import AXES
+from gyro_pipeline.conventions import AXES, LEAVE_ONE_DEVICE_OUT
 
 PerAxis = tuple[float, float, float]
 Precision = Literal["float32", "bfloat16"]
@@ -22,6 +22,14 @@ class Parameter(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+class WarmUp(Parameter):
+    """A bias that settles after power-on: amplitude times exp(-t / time constant)."""
+
+    amplitude_mdps: float = Field(description="its mean over power-ons, at power-on")
+    spread_mdps: float = Field(ge=0, description="its standard deviation over power-ons")
+    time_constant_s: float = Field(gt=0, description="the same at all power-ons")
+
+
 class SimulatedNoise(Parameter):
     """The stand-in for a sensor whose files are not at hand (sources: conf/base/globals.yml)."""
 
@@ -30,6 +38,10 @@ class SimulatedNoise(Parameter):
     unit_bias_dps: float = Field(ge=0, description="unit-to-unit biases are uniform in +- this")
     lag1_correlation: float = Field(0.0, gt=-0.5, lt=0.5, description="of successive samples")
     flicker_mdps: float = Field(0.0, ge=0, description="bias instability B; 0 is white noise")
+    random_walk_mdps_per_rts: float = Field(
+        0.0, ge=0, description="K: a walk from power-on, whose variance after t s is K^2 t"
+    )
+    warm_up: WarmUp | None = Field(None, description="of each axis on its own; null for none")
 
 
 class Sensor(Parameter):
@@ -177,7 +189,27 @@ class Study(Parameter):
         None, min_length=1, description="its own; null: those of all studies"
     )
     default: bool = Field(True, description="part of `kedro run` and `--pipeline=reporting`")
+    protocol: Literal["by_recording", "leave_one_device_out"] = Field(
+        "by_recording",
+        description="what tests: recordings of IMU 1, or every IMU in turn, as an unseen device "
+        "(docs/honest_protocol.md); the second has no networks of the paper's",
+    )
     sensors: dict[str, Grid]
+
+    @property
+    def unseen_devices(self) -> bool:
+        """Whether the devices that test are unseen ones."""
+        return self.protocol == LEAVE_ONE_DEVICE_OUT
+
+    @model_validator(mode="after")
+    def _networks_know_their_device(self) -> Self:
+        networks = [name for name in self.estimators if name.startswith("cnn")]
+        if self.unseen_devices and networks:
+            raise ValueError(
+                f"estimators: {', '.join(networks)} cannot be judged on unseen devices; leave "
+                "them out of a study with protocol leave_one_device_out"
+            )
+        return self
 
 
 class Leakage(Parameter):
@@ -281,6 +313,9 @@ class Parameters(Parameter):
     """All of it, as one tree."""
 
     source: str = Field(pattern=r"^[a-z0-9_]+$", description="where the logs come from")
+    published_address: str = Field(
+        pattern="^https?://", description="base address of the authors' files; the catalog reads it"
+    )
     sensors: dict[str, Sensor]
     ground_truth: GroundTruth
     virtual_gyros: VirtualGyros

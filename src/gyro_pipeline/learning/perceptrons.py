@@ -1,5 +1,7 @@
 """Small networks trained side by side, each on its own part of the same examples."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +36,18 @@ class Perceptrons:
         return torch.baddbmm(offsets, values, weights)
 
 
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """On networks so small, more than one thread only wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@_one_thread()
 def train_perceptrons(
     inputs: NDArray[np.float64],
     aims: NDArray[np.float64],

@@ -174,6 +174,33 @@ def mean_squares(
     return best - averaging, float(variance + (off @ model.mean) ** 2 - averaging)
 
 
+@lru_cache(maxsize=1 << 16)  # a curve asks for the same in every recording
+def outside_noise(
+    noise: NoiseFigures, samples: int, rate_hz: float, start: int, size: int
+) -> float:
+    """Averaging noise of the mean of the samples outside a window, about the bias.
+
+    Args:
+        noise: N, B and K.
+        samples: Of the whole recording, more than ``size``.
+        rate_hz: Samples per second.
+        start: First sample of the window, counted from power-on.
+        size: Samples of the window.
+
+    Returns:
+        Variance, (deg/s)^2; N^2 / (T - T0) if the noise is white.
+    """
+    if noise.instability == 0 and noise.random_walk == 0:
+        return noise.white**2 * rate_hz / (samples - size)
+    edges = np.unique([0, start, start + size, samples])
+    lengths = np.where(edges[:-1] == start, 0, np.diff(edges))
+    figures = noise.white, noise.instability, noise.random_walk
+    covariance = np.tensordot(
+        np.square(figures), noise_covariances(edges, samples, rate_hz), axes=1
+    )
+    return float(lengths @ covariance @ lengths) / (samples - size) ** 2
+
+
 @dataclass(frozen=True, eq=False)
 class WindowModel:
     """A window's block means y and a truth, before anything is known of bias and amplitude c.

@@ -9,7 +9,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from gyro_pipeline.conventions import ALL, AXES, DISJOINT, FIRST, PAPER, TRUE
+from gyro_pipeline.conventions import ALL, AXES, DISJOINT, FIRST, PAPER, TEST_IMU, TRUE
+from gyro_pipeline.physics.allan import NoiseFigures
+from gyro_pipeline.physics.recording_model import outside_noise
 
 CURVE_STEP_S = 0.25
 """Resolution of the running-mean curve; the equivalent time is interpolated between points."""
@@ -26,15 +28,17 @@ class TestRecording:
         number: Recording number.
         samples: Shape (3, n), deg/s.
         rate_hz: Sample rate, Hz.
-        noise: N per axis from training recordings (drawn, if simulated), (3,), deg/s sqrt(s).
+        noise: N, B and K of each axis from training recordings, or as drawn if simulated.
         true_bias: Drawn bias, shape (3,), deg/s; None on measured data.
+        imu: Whose recording it is.
     """
 
     number: int
     samples: np.ndarray
     rate_hz: float
-    noise: np.ndarray
+    noise: tuple[NoiseFigures, ...]
     true_bias: np.ndarray | None
+    imu: int = TEST_IMU
 
     @cached_property
     def running_sums(self) -> np.ndarray:
@@ -51,22 +55,27 @@ class TestRecording:
         """The truth for every window, with that truth's own averaging variance.
 
         ``PAPER``, the mean of the whole recording, counts as exact (the paper's definition).
-        ``DISJOINT``, the mean of the samples outside the window, is off by N^2 / (T - T0), which
-        is to be taken off the squared error. ``TRUE`` is the drawn bias of simulated data.
+        ``DISJOINT``, the mean of the samples outside the window, has an averaging noise of its own,
+        N^2 / (T - T0) if it is white, which is to be taken off the squared error. If noise is
+        coloured, what window and truth share stays in it. ``TRUE`` is the drawn bias of simulated
+        data.
 
         Args:
             size: Samples per window.
 
         Returns:
-            For each truth its value, shape (windows, 3) in deg/s, and variance, shape (3,).
+            For each truth its value in deg/s and its variance, both of shape (windows, 3).
         """
         n = self.samples.shape[-1]
         sums, total = self.window_sums(size), self.running_sums[:, -1]
-        exact = np.zeros(len(AXES))
+        exact = np.zeros(sums.shape)
         truths = {PAPER: (np.broadcast_to(total / n, sums.shape), exact)}
         if size < n:
-            variance = self.noise**2 * self.rate_hz / (n - size)
-            truths[DISJOINT] = ((total - sums) / (n - size), variance)
+            variance = [
+                [outside_noise(axis, n, self.rate_hz, window * size, size) for axis in self.noise]
+                for window in range(len(sums))
+            ]
+            truths[DISJOINT] = ((total - sums) / (n - size), np.array(variance))
         if self.true_bias is not None:
             truths[TRUE] = (np.broadcast_to(self.true_bias, sums.shape), exact)
         return truths
@@ -95,12 +104,13 @@ def error_columns(
     value, variance = recording.truths(size)[truth]
     n = len(estimates)
     return {
+        "imu": np.full(n * len(AXES), recording.imu),
         "recording": np.full(n * len(AXES), recording.number),
         "window": np.repeat(np.arange(n), len(AXES)),
         "axis": np.tile(AXES, n),
         "truth": np.full(n * len(AXES), truth),
         "error_dps": (estimates - value).ravel(),
-        "truth_variance": np.tile(variance, n),
+        "truth_variance": variance.ravel(),
         "sigma_dps": np.ravel(sigma),
     }
 
@@ -119,7 +129,7 @@ def error_table(recording: TestRecording, size: int, estimates: np.ndarray) -> p
         estimates: Shape (windows, 3), deg/s.
 
     Returns:
-        Columns ``recording, window, axis, truth, error_dps, truth_variance, sigma_dps``.
+        Columns ``imu, recording, window, axis, truth, error_dps, truth_variance, sigma_dps``.
     """
     sigma = np.full(estimates.shape, np.nan)
     truths = recording.truths(size)
@@ -134,8 +144,8 @@ def running_mean_curve(recording: TestRecording, size: int) -> pd.DataFrame:
         size: Samples of the study's window; a point of the curve lies exactly there.
 
     Returns:
-        Columns ``recording, truth, windows`` (``first`` or ``all``), ``time_s``, ``sum_sq`` in
-        (deg/s)^2 with the truth's own variance taken off, and ``count`` of squares in the sum.
+        Columns ``imu, recording, truth, windows`` (``first`` or ``all``), ``time_s``, ``sum_sq``
+        in (deg/s)^2 with the truth's own variance taken off, and ``count`` of squares in the sum.
     """
     n = recording.samples.shape[-1]
     step = max(1, round(CURVE_STEP_S * recording.rate_hz))
@@ -148,6 +158,7 @@ def running_mean_curve(recording: TestRecording, size: int) -> pd.DataFrame:
                 continue
             squares = (estimates - value) ** 2 - variance
             for windows, part in ((FIRST, squares[:1]), (ALL, squares)):
-                rows.append((recording.number, truth, windows, time_s, part.sum(), part.size))
-    columns = ["recording", "truth", "windows", "time_s", "sum_sq", "count"]
+                place = recording.imu, recording.number
+                rows.append((*place, truth, windows, time_s, part.sum(), part.size))
+    columns = ["imu", "recording", "truth", "windows", "time_s", "sum_sq", "count"]
     return pd.DataFrame(rows, columns=columns)

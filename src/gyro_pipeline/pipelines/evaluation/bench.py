@@ -1,6 +1,6 @@
 """The test bench: one sensor, window and fold, on which every estimator is judged alike."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -23,12 +23,12 @@ from gyro_pipeline.conventions import (
     TARGET_OF,
     TEST,
     TEST_IMU,
+    TRAIN,
     TRUE,
     InputError,
 )
 from gyro_pipeline.estimators import Estimator, RunningMean
 from gyro_pipeline.parameters import Evaluation
-from gyro_pipeline.physics.allan import SHORTEST_FIT_SAMPLES, fit_noise
 from gyro_pipeline.physics.ceiling import (
     best_gain,
     best_saving,
@@ -36,15 +36,22 @@ from gyro_pipeline.physics.ceiling import (
     oracle,
     pooled,
     running_mean_rmse,
-    turn_on_spread,
 )
+from gyro_pipeline.physics.recording_model import (
+    LinearEstimate,
+    best_linear,
+    mean_squares,
+)
+from gyro_pipeline.pipelines.evaluation.device import TestDevice
 from gyro_pipeline.protocol.scores import (
     Estimate,
     ResampledCurve,
     SquaredErrors,
     beats_oracle,
+    clusters,
     coverage,
     curve_errors,
+    equivalent_time,
     resampled_weights,
     score,
     squared_errors,
@@ -60,74 +67,20 @@ from gyro_pipeline.protocol.truths import (
 from gyro_pipeline.protocol.windows import cut_windows, window_size
 from gyro_pipeline.tracking import metric_name
 
-_CEILING_RESAMPLES = 400
-
-
-@dataclass(frozen=True)
-class TestDevice:
-    """What is known of the test IMU, per axis: drawn if simulated, else from its recordings.
-
-    Attributes:
-        noise: N, shape (resamples, 3), deg/s sqrt(s); the first row is the estimate itself.
-        spread: Turn-on spread tau, same shape, deg/s.
-        unit_bias: Drawn prior mean, shape (3,), deg/s; None on measured data.
-        white: Whether the ceiling is the exact limit, so that beating it is a defect.
-    """
-
-    noise: np.ndarray
-    spread: np.ndarray
-    unit_bias: np.ndarray | None
-    white: bool
-
-
-def describe_device(
-    recordings: xr.Dataset, bias: pd.DataFrame, allan: xr.Dataset, numbers: Sequence[int], seed: int
-) -> TestDevice:
-    """Noise and turn-on spread of the test IMU, with a bootstrap over the recordings used.
-
-    Args:
-        recordings: With the drawn values on simulated data.
-        bias: Ground truth.
-        allan: Allan variances.
-        numbers: Recordings to learn from; none of a hold-out's test recordings.
-        seed: Of the bootstrap.
-    """
-    if recordings.attrs["simulated"]:
-        return TestDevice(
-            noise=recordings.true_noise.to_numpy()[None],
-            spread=recordings.true_turn_on_spread.to_numpy()[None],
-            unit_bias=recordings.true_unit_bias.sel(imu=TEST_IMU).to_numpy(),
-            white=float(recordings.true_flicker) == 0,
-        )
-    duration_s = recordings.sizes["sample"] / recordings.attrs["rate_hz"]
-    means = bias[bias.imu == TEST_IMU].pivot(index="recording", columns="axis", values="bias_dps")
-    variances = allan.allan_variance.sel(imu=TEST_IMU, recording=list(numbers))
-    variances = variances.transpose("recording", "axis", "time_s").to_numpy()
-    generator = np.random.default_rng(seed)
-    draws = generator.integers(len(numbers), size=(_CEILING_RESAMPLES, len(numbers)))
-    noise, spread = [], []
-    for chosen in [np.arange(len(numbers)), *draws]:
-        shortest_s = SHORTEST_FIT_SAMPLES / recordings.attrs["rate_hz"]
-        fits = [
-            fit_noise(allan.time_s.to_numpy(), variance, duration_s, shortest_s)
-            for variance in variances[chosen].mean(axis=0)
-        ]
-        noise.append([fit.white for fit in fits])
-        values = means.loc[list(numbers)].to_numpy()[chosen]
-        spread.append(turn_on_spread(values, np.array(noise[-1]), duration_s))
-    return TestDevice(np.array(noise), np.array(spread), None, white=False)
+_CURVE_POINTS = 30  # of the expected running mean, to interpolate between
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Test recordings of the test IMU, cut into windows of one length.
+    """Test recordings of the test IMU, or of several unseen ones, cut into windows of one length.
 
     Attributes:
         recordings: All recordings of the sensor.
-        device: From :func:`describe_device`.
-        numbers: The test recordings.
+        device: From :func:`describe_device`, or from :func:`describe_unseen` of the same IMUs.
+        numbers: The test recordings; one of several IMUs may lack some.
         window_s: Calibration time T0, seconds.
         evaluation: Resamples and seed of the intervals.
+        imus: Whose recordings test, in order.
     """
 
     recordings: xr.Dataset
@@ -135,6 +88,7 @@ class Bench:
     numbers: tuple[int, ...]
     window_s: float
     evaluation: Evaluation
+    imus: tuple[int, ...] = (TEST_IMU,)
 
     @cached_property
     def size(self) -> int:
@@ -149,27 +103,37 @@ class Bench:
 
     @cached_property
     def tested(self) -> list[TestRecording]:
-        """The test IMU's recordings with what is needed to judge an estimate."""
-        chosen = self.recordings.sel(imu=TEST_IMU, recording=list(self.numbers))
-        known = "true_bias" in chosen
-        return [
+        """The test recordings with what is needed to judge an estimate."""
+        known = "true_bias" in self.recordings
+        places = product(self.imus, self.numbers)
+        chosen = [self.recordings.sel(imu=imu, recording=number) for imu, number in places]
+        tested = [
             TestRecording(
                 number=int(one.recording),
                 samples=one.angular_rate.to_numpy(),
-                rate_hz=chosen.attrs["rate_hz"],
-                noise=self.device.noise[0],
+                rate_hz=self.recordings.attrs["rate_hz"],
+                noise=self.device.figures[self._axes(int(one.imu))],
                 true_bias=one.true_bias.to_numpy() if known else None,
+                imu=int(one.imu),
             )
-            for one in (chosen.sel(recording=number) for number in self.numbers)
+            for one in chosen
         ]
+        lacking = len(self.imus) > 1  # the plan has refused recordings that the test IMU lacks
+        return [one for one in tested if not (lacking and np.isnan(one.samples[0, 0]))]
 
-    def errors(self, estimator: Estimator, imus: int = 1) -> pd.DataFrame:
-        """Errors of an estimator on IMU 1, in all windows against all truths.
+    def _axes(self, imu: int) -> slice:
+        """Where the axes of an IMU are among those of ``device``."""
+        first = len(AXES) * self.imus.index(imu)
+        return slice(first, first + len(AXES))
+
+    def errors(self, estimator: Estimator | Mapping[int, Estimator], imus: int = 1) -> pd.DataFrame:
+        """Errors of an estimator in all windows against all truths.
 
         It is asked for the target that each truth is about.
 
         Args:
-            estimator: Sees ``imus`` IMUs side by side, the test IMU first.
+            estimator: Sees ``imus`` IMUs side by side, the test IMU first; or one for each IMU
+                that is tested.
             imus: How many.
 
         Raises:
@@ -178,6 +142,7 @@ class Bench:
         seen = self.recordings.angular_rate.sel(imu=slice(TEST_IMU, TEST_IMU + imus - 1))
         parts = []
         for recording in self.tested:
+            own = estimator[recording.imu] if isinstance(estimator, Mapping) else estimator
             samples = (
                 recording.samples
                 if imus == 1
@@ -189,7 +154,7 @@ class Bench:
             judged = {
                 target: [
                     values[:, : len(AXES)]
-                    for values in estimator.estimate(windows, target, start_s, recording.number)
+                    for values in own.estimate(windows, target, start_s, recording.number)
                 ]
                 for target in (RECORDING_MEAN, BIAS)
             }
@@ -225,7 +190,11 @@ class Bench:
     def _resampled(self) -> np.ndarray:
         """Weights of the recordings in each resample."""
         drawn = self.evaluation.resamples, self.evaluation.bootstrap_seed
-        return resampled_weights(len(self.numbers), *drawn)
+        return resampled_weights(self._clusters, *drawn)
+
+    @cached_property
+    def _clusters(self) -> int:
+        return int(clusters(self.mean_errors).nunique())
 
     @cached_property
     def curve(self) -> pd.DataFrame:
@@ -242,38 +211,109 @@ class Bench:
     @cached_property
     def oracle_errors(self) -> pd.DataFrame | None:
         """Errors of the best possible estimator for each truth; None where it is not known."""
-        if self.device.unit_bias is None or not self.device.white:
+        if self.device.unit_bias is None:
             return None
-        known = (self.device.unit_bias, self.device.spread[0], self.device.noise[0])
         parts = []
         for recording in self.tested:
-            means = recording.window_sums(self.size) / self.size
             for truth in recording.truths(self.size):
-                best = oracle(means, *known, self.window_s, self.recording_s, truth)
+                best = self._best(recording, truth)
                 sigma = np.full(best.shape, np.nan)
                 parts.append(error_columns(recording, self.size, truth, best, sigma))
         return stacked(parts)
 
+    def _best(self, recording: TestRecording, truth: str) -> np.ndarray:
+        """Estimates by one who knows what was drawn, (windows, 3), deg/s."""
+        device, size = self.device, self.size
+        if device.models is None:
+            assert device.unit_bias is not None
+            means = recording.window_sums(size) / size
+            axes = self._axes(recording.imu)
+            known = (device.unit_bias[axes], device.spread[0, axes], device.noise[0, axes])
+            return oracle(means, *known, self.window_s, self.recording_s, truth)
+        windows = cut_windows(recording.samples, size)
+        return np.stack(
+            [
+                [
+                    float(self._line(axis, i * size, truth)(one[None])[0])
+                    for i, one in enumerate(rows)
+                ]
+                for axis, rows in enumerate(windows, self._axes(recording.imu).start)
+            ],
+            axis=-1,
+        )
+
+    @cached_property
+    def _lines(self) -> dict[tuple[int, int, str], LinearEstimate]:
+        return {}
+
+    def _line(self, axis: int, start: int, truth: str) -> LinearEstimate:
+        """The best linear estimate of a window under the device's model, worked out once."""
+        assert self.device.models is not None
+        key = axis, start, truth
+        if key not in self._lines:
+            self._lines[key] = best_linear(self.device.models[axis], start, self.size, truth)
+        return self._lines[key]
+
     @property
     def ceiling_basis(self) -> str:
         """In words, what the ceilings are computed from."""
-        if self.device.unit_bias is None:
-            return "estimated from recordings, white noise"
-        return "drawn values" if self.device.white else "drawn values, without the flicker noise"
+        if self.device.unit_bias is not None:
+            return "drawn values"
+        noise = "white noise" if self.device.models is None else "fitted N, B and K"
+        return f"estimated from recordings, {noise}"
 
-    def ceilings(self, truth: str) -> dict[str, Estimate]:
-        """What no estimator can be better than; exact, without an interval, on simulated data."""
+    def ceilings(self, truth: str, windows: str) -> dict[str, Estimate]:
+        """What no estimator can be better than; exact, without an interval, on simulated data.
+
+        On measured data the interval is that of N and the turn-on spread.
+        """
         times = (self.window_s, self.recording_s)
         limit = pooled(ceiling_rmse(self.device.noise, self.device.spread, *times, truth))
         mean = pooled(running_mean_rmse(self.device.noise, *times, truth))
+        ratio, saving = limit / mean, None
+        if truth == PAPER:
+            saving = best_saving(ratio, self.window_s / self.recording_s)
+        if self.device.models is not None:
+            squares, means = self._expected(truth, windows, self.size)
+            if squares <= 0 or means <= 0:  # the truth's own noise was taken off
+                return {}
+            limit = limit * np.sqrt(squares) / limit[0]
+            ratio = ratio * np.sqrt(squares / means) / ratio[0]
+            if saving is not None:
+                saving = saving + self._expected_saving(windows, squares) - saving[0]
         ceilings = {
             "ceiling_rmse_dps": with_interval(limit),
-            "ceiling_accuracy_gain_pct": with_interval(100 * best_gain(limit / mean)),
+            "ceiling_accuracy_gain_pct": with_interval(100 * best_gain(ratio)),
         }
-        if truth == PAPER:
-            saving = best_saving(limit / mean, self.window_s / self.recording_s)
+        if saving is not None:
             ceilings["ceiling_time_saving_pct"] = with_interval(100 * saving)
         return ceilings
+
+    @cached_property
+    def _ceilings(self) -> dict[tuple[str, str], dict[str, Estimate]]:
+        """By truth and windows; the same for every estimator."""
+        return {view: self.ceilings(*view) for view in self.curves}
+
+    def _expected(self, truth: str, windows: str, size: int) -> tuple[float, float]:
+        """Mean squares of the best linear estimate and the running mean, over axes and windows."""
+        assert self.device.models is not None
+        starts = range(0, self.recordings.sizes["sample"] - size + 1, size)
+        squares = [
+            mean_squares(model, start, size, truth)
+            for model in self.device.models
+            for start in (starts[:1] if windows == FIRST else starts)
+        ]
+        best, mean = np.mean(squares, axis=0)
+        return float(best), float(mean)
+
+    def _expected_saving(self, windows: str, squares: float) -> float:
+        """1 - T0 / t*, where the running mean of t* is expected to have these squares."""
+        samples = self.recordings.sizes["sample"]
+        sizes = np.unique(np.geomspace(self.size, samples, _CURVE_POINTS).astype(int))
+        # of the whole recording it is 0, but for rounding
+        curve = [max(self._expected(PAPER, windows, int(size))[1], 0.0) for size in sizes]
+        reached = equivalent_time(sizes, np.sqrt([curve]), np.sqrt([squares]))[0]
+        return float(1 - self.size / reached) if np.isfinite(reached) else 0.0
 
     def metrics(self, errors: pd.DataFrame, weights: str) -> dict[str, float]:
         """All figures of merit of one set of errors, by metric name; only finite ones.
@@ -293,7 +333,7 @@ class Bench:
                 curve = self.curves[truth, windows]
                 scores = score(own, mean, curve, self.window_s, self._resampled)
                 if weights == LAST:
-                    scores |= self.ceilings(truth)
+                    scores |= self._ceilings[truth, windows]
                 for base, estimate in scores.items():
                     named = {"": estimate.value, "lo": estimate.lo, "hi": estimate.hi}
                     metrics |= {
@@ -301,7 +341,7 @@ class Bench:
                         for bound, value in named.items()
                         if value is not None and np.isfinite(value)
                     }
-                if self._oracles and len(self.numbers) > 1:
+                if self._oracles and self._clusters > 1:
                     p = beats_oracle(own, self._oracles[truth, windows])
                     metrics[metric_name("beats_oracle_p", windows, weights, truth)] = p
         return metrics
@@ -335,11 +375,11 @@ def off_the_curve(metrics: Mapping[str, float]) -> dict[str, str]:
 
 
 def test_recordings(roles: pd.DataFrame, fold: int) -> tuple[int, ...]:
-    """Test recordings of a fold; for ``HOLD_OUT`` on a k-fold, those of all folds."""
+    """Test recordings of a fold; for ``HOLD_OUT`` on several folds, those of all."""
     tests = roles[roles.role == TEST]
     if fold != HOLD_OUT:
         tests = tests[tests.fold == fold]
-    return tuple(sorted(tests.recording.tolist()))
+    return tuple(sorted(tests.recording.unique().tolist()))
 
 
 def known_recordings(roles: pd.DataFrame) -> tuple[int, ...]:
@@ -347,3 +387,13 @@ def known_recordings(roles: pd.DataFrame) -> tuple[int, ...]:
     if (roles.fold == HOLD_OUT).all():
         roles = roles[roles.role != TEST]
     return tuple(sorted(roles.recording.unique().tolist()))
+
+
+def known_places(roles: pd.DataFrame) -> list[tuple[int, int]]:
+    """IMU and number of the recordings from which the noise of unseen devices is learned."""
+    train = (
+        roles[roles.role == TRAIN]
+        .sort_values(["imu", "recording"])
+        .drop_duplicates("imu recording".split())
+    )
+    return list(zip(train.imu.tolist(), train.recording.tolist(), strict=True))

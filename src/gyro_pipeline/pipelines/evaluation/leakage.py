@@ -23,7 +23,9 @@ from gyro_pipeline.physics import allan as allan_module
 from gyro_pipeline.physics import ceiling
 from gyro_pipeline.physics.ceiling import oracle
 from gyro_pipeline.pipelines.evaluation import bench as bench_module
-from gyro_pipeline.pipelines.evaluation.bench import Bench, describe_device
+from gyro_pipeline.pipelines.evaluation import device as device_module
+from gyro_pipeline.pipelines.evaluation.bench import Bench
+from gyro_pipeline.pipelines.evaluation.device import describe_device
 from gyro_pipeline.pipelines.evaluation.waiting import waiting
 from gyro_pipeline.protocol import leaks, scores
 from gyro_pipeline.protocol import truths as truths_module
@@ -40,7 +42,16 @@ from gyro_pipeline.tracking import (
     StoredRun,
 )
 
-_CODE = (allan_module, ceiling, bench_module, leaks, scores, truths_module, windows_module)
+_CODE = (
+    allan_module,
+    ceiling,
+    bench_module,
+    device_module,
+    leaks,
+    scores,
+    truths_module,
+    windows_module,
+)
 
 
 def evaluate_leakage(  # noqa: PLR0917 - a node's arguments are its datasets
@@ -92,7 +103,7 @@ def _judged(run: StoredRun, bench: Bench, divided: Division, judged_with: str) -
     scored = {f"{base}_strided": estimate for base, estimate in scored.items()}
     metrics = {
         name: value
-        for base, estimate in (scored | bench.ceilings(PAPER)).items()
+        for base, estimate in (scored | bench.ceilings(PAPER, ALL)).items()
         for name, value in (
             (base, estimate.value),
             (f"{base}_lo", estimate.lo),
@@ -131,7 +142,7 @@ def strided_error_table(estimator: Estimator, bench: Bench, divided: Division) -
         seen = cut_windows(one.samples, bench.size, starts).transpose(1, 0, 2)
         estimated, _ = estimator.estimate(seen, RECORDING_MEAN)
         estimates = {"": estimated, "mean_": means, "constant_": constant}
-        if device.unit_bias is not None and device.white:
+        if device.unit_bias is not None and device.models is None:
             known = (device.unit_bias, device.spread[0], device.noise[0])
             estimates["oracle_"] = oracle(means, *known, bench.window_s, bench.recording_s, PAPER)
         of = {"recording": one.number, "start": np.repeat(starts, len(AXES))}
