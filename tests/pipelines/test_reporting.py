@@ -740,6 +740,22 @@ def test_estimators_are_compared_with_the_mean_and_the_best_linear_one(estimator
     assert (table["Recordings"] == 8).all()
 
 
+def test_against_the_other_truths_mean_squares_are_compared(estimators, nothing):
+    pooled, runs = estimators
+    worse = runs[1].load(ERRORS)
+    worse.loc[worse.truth == "true", "error_dps"] = 11.0  # the mean's is 9
+    results = pooled([runs[0], replace(runs[1], load={ERRORS: worse}.__getitem__), runs[2]])
+    bayes = results.iloc[1]
+    for name, off in {"mean": 9, "best_linear": 4.5}.items():
+        ends = [bayes[f"less_{name}_dps2_true{end}"] for end in ("", "_lo", "_hi")]
+        assert ends == pytest.approx(3 * [11**2 - off**2])
+    table = comparison(results, nothing).set_index("Estimator")
+    shown = table["Less best linear, true bias mdps²"]
+    assert shown["empirical_bayes"].startswith("+100750000.000 [+")
+    assert shown["best_linear"] == table["Less mean, true bias mdps²"]["mean"] == "–"
+    assert set(table["Less mean, outside mdps²"]) == {"–"}  # these runs have no such truth
+
+
 def test_what_is_there_is_compared_and_the_command_for_the_rest_is_given(estimators, nothing):
     pooled, runs = estimators
     results = pooled(runs[:2])

@@ -52,7 +52,8 @@ class _Linear(FittedEstimator):
         ]
         weights = np.stack([line.weights for line in lines]).reshape(*shape, -1)
         constants = np.reshape([line.constant for line in lines], shape)
-        sigma = np.sqrt(np.reshape([line.variance for line in lines], shape))
+        variance = np.reshape([line.variance for line in lines], shape)
+        sigma = np.sqrt(np.maximum(variance, 0.0))  # of a whole recording it is 0, but for rounding
         means = block_means(samples, lines[0].edges)
         return np.sum(means * weights[which], axis=-1) + constants[which], sigma[which]
 

@@ -71,10 +71,14 @@ class ResidualNetwork(FittedEstimator):
 
     def _fit(self, training: TrainingRecordings) -> None:
         self._linear.fit(training)
-        self._rates = []
+        self._rates, self._folds = [], []
         if training.seen:
-            others = [one for one in training.imus if one != training.imu]
-            self._rates = [training.of(one).rates for one in (training.imu, *others)]
+            imus = [training.imu, *(one for one in training.imus if one != training.imu)]
+            self._rates = [training.of(one).rates for one in imus]
+            numbers = [training.of(one).labels[0] for one in imus]
+            # what was recorded together is left out together
+            every = np.unique(np.concatenate(numbers))
+            self._folds = [np.searchsorted(every, one) % _FOLDS for one in numbers]
         self._corrections: dict[int, _Correction | None] = {}
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
@@ -107,7 +111,9 @@ class ResidualNetwork(FittedEstimator):
     def _train(self, size: int) -> _Correction | None:
         starts = _starts(self._linear.models[0].samples, size)
         examples = [self._examples(rates, starts, size) for rates in self._rates]
-        inputs, aims, folds = (np.concatenate(part) for part in zip(*examples, strict=True))
+        dealt = zip(self._folds, examples, strict=True)
+        folds = np.concatenate([np.repeat(one, len(y) // len(one)) for one, (_, y) in dealt])
+        inputs, aims = (np.concatenate(part) for part in zip(*examples, strict=True))
         scales = np.sqrt(np.mean(inputs**2, axis=0)) + np.finfo(float).tiny
         used = folds != np.arange(_FOLDS)[:, None]
         networks = train_perceptrons(inputs / scales, aims[:, None], used)
@@ -123,8 +129,8 @@ class ResidualNetwork(FittedEstimator):
 
     def _examples(
         self, rates: NDArray[np.floating], starts: NDArray[np.integer], size: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.integer]]:
-        """Inputs (n, m), aims (n,) and folds (n,) of one IMU's windows, recording by recording."""
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Inputs (n, m) and aims (n,) of one IMU's windows, recording by recording."""
         means = rates.mean(axis=-1, dtype=np.float64)
         shift = 0.0
         if rates is not self._rates[0]:
@@ -136,13 +142,7 @@ class ResidualNetwork(FittedEstimator):
             linear, sigma = self._linear.estimate(windows, RECORDING_MEAN, at_s)
             inputs.append(self._inputs(windows.swapaxes(0, 1), start).swapaxes(0, 1))
             aims.append((means + shift - linear) / sigma)
-        shape = len(rates), len(starts) * rates.shape[1]
-        folds = np.repeat(np.arange(len(rates)) % _FOLDS, shape[1])
-        return (
-            np.stack(inputs, 1).reshape(-1, inputs[0].shape[-1]),
-            np.stack(aims, 1).ravel(),
-            folds,
-        )
+        return np.stack(inputs, 1).reshape(-1, inputs[0].shape[-1]), np.stack(aims, 1).ravel()
 
     def _inputs(self, windows: NDArray[np.floating], start: int) -> NDArray[np.float64]:
         """Innovations, and when the windows began; (axes, n, samples) to (axes, n, inputs)."""

@@ -41,7 +41,7 @@ FEWEST_RECORDINGS = 3
 _BLOCK_S = 0.5
 _RANGE = 1e4  # of a standard deviation about its first guess
 _STEP = 1e-3  # of the numerical gradient, in logarithms
-_CHANCE = 0.01  # of looking for a warm-up where there is none
+_CHANCE = 0.2  # of fitting a warm-up, to no avail, where there is none
 _TIME_CONSTANTS = (0.02, 0.1, 0.3, 1.0, 3.0)  # of the recording: limits, and where searches start
 
 
@@ -221,7 +221,7 @@ class _Likelihood:
         """Whether a decay from power-on explains more of the recordings than chance would.
 
         Each recording's amplitude, fitted by generalised least squares, is normal with a known
-        variance if there is no warm-up; their squares are then chi-squared.
+        variance if there is no warm-up; the squares of their sum and of each are then chi-squared.
         """
         figures, spreads, _ = self.unpack(x)
         covariance = np.tensordot(np.square(figures), self.unit, axes=1) + spreads[0] ** 2
@@ -234,8 +234,12 @@ class _Likelihood:
         both = np.column_stack([(self.means - mean[0]).T, *decays])
         white = linalg.solve_triangular(root, both, lower=True, check_finite=False)
         y, decay = white[:, : len(self.means)], white[:, len(self.means) :]
-        squares = np.sum((decay.T @ y) ** 2, axis=1) / np.sum(decay**2, axis=0)
-        return bool(squares.max() > stats.chi2.isf(_CHANCE / len(shares), len(self.means)))
+        amplitudes = decay.T @ y / np.sqrt(np.sum(decay**2, axis=0))[:, None]  # in their sigma
+        count, looks = len(self.means), 2 * len(shares)
+        alike = np.abs(amplitudes.sum(axis=1)).max() / np.sqrt(count)
+        scatter = np.sum(amplitudes**2, axis=1).max()
+        chances = stats.chi2.sf([alike**2, scatter], [1, count])
+        return bool(chances.min() < _CHANCE / looks)
 
     def maximise(self, time_constant_s: float) -> optimize.OptimizeResult:
         """Search from the guess with this time constant."""

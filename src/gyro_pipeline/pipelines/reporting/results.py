@@ -15,6 +15,7 @@ from gyro_pipeline.parameters import Evaluation
 from gyro_pipeline.protocol.scores import (
     Estimate,
     curve_errors,
+    paired_difference,
     resampled_weights,
     rmse_difference,
     score,
@@ -232,9 +233,7 @@ def network_row(
 def differences(
     runs: Sequence[StoredRun], references: Mapping[str, pd.DataFrame], evaluation: Evaluation
 ) -> dict[str, Any]:
-    """RMSE less that of other estimators on the same windows, paired over recordings.
-
-    Over all windows, against the mean of the recording.
+    """Errors less those of other estimators on all the same windows, paired over recordings.
 
     Args:
         runs: All seeds and folds of the row.
@@ -242,14 +241,24 @@ def differences(
         evaluation: Resamples and seed of the intervals.
 
     Returns:
-        ``less_<name>_dps`` with its interval, ``_lo`` and ``_hi``.
+        ``less_<name>_dps``, of the RMSEs against the mean of the recording, and
+        ``less_<name>_dps2_<truth>``, of the mean squares against the other truths, whose own noise
+        may leave none to take the root of. Each with its interval, ``_lo`` and ``_hi``.
     """
-    own = squared_errors(_errors(runs), PAPER, ALL)
-    weights = resampled_weights(len(own.sums), evaluation.resamples, evaluation.bootstrap_seed)
+    table = _errors(runs)
+    weights = resampled_weights(
+        table.recording.nunique(), evaluation.resamples, evaluation.bootstrap_seed
+    )
     row: dict[str, Any] = {}
-    for name, errors in references.items():
-        less = rmse_difference(own, squared_errors(errors, PAPER, ALL), weights)
-        row |= {f"less_{name}_dps{end}": value for end, value in _ends(less).items()}
+    for truth in table.truth.unique():
+        own = squared_errors(table, truth, ALL)
+        for name, errors in references.items():
+            other = squared_errors(errors, truth, ALL)
+            if truth == PAPER:
+                less, key = rmse_difference(own, other, weights), f"less_{name}_dps"
+            else:
+                less, key = paired_difference(own, other, weights), f"less_{name}_dps2_{truth}"
+            row |= {key + end: value for end, value in _ends(less).items()}
     return row
 
 

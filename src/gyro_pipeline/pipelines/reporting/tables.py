@@ -10,11 +10,14 @@ import xarray as xr
 
 from gyro_pipeline.conventions import (
     ALL,
+    DISJOINT,
     FIRST,
     MDPS,
+    PAPER,
     TEST,
     TEST_IMU,
     TRAIN,
+    TRUE,
     VALIDATION,
     InputError,
     Missing,
@@ -67,7 +70,8 @@ def comparison(results: pd.DataFrame, elsewhere: pd.DataFrame) -> pd.DataFrame |
     """Estimators side by side, over all windows against the mean of the recording.
 
     Differences are of RMSEs on the same windows, with 95 % intervals over recordings; negative ones
-    are in favour of the row's estimator.
+    are in favour of the row's estimator. Against the samples outside the window, truth (b), and the
+    drawn bias, truth (c), they are of mean squares.
 
     Args:
         results: From ``pool_results``.
@@ -101,6 +105,11 @@ def _compared(row: pd.Series, group: pd.DataFrame) -> dict[str, Any]:
         "RMSE / running mean's": round(row.test_rmse_dps_all / mean, 3),
         "Less running mean mdps": _difference(row, MEAN),
         f"Less {DEFAULT} mdps": _difference(row, DEFAULT),
+        **{
+            f"Less {name.replace('_', ' ')}, {text} mdps²": _difference(row, name, truth)
+            for truth, text in ((DISJOINT, "outside"), (TRUE, "true bias"))
+            for name in (MEAN, DEFAULT)
+        },
         "Ceiling mdps": round(row.ceiling_rmse_dps_all / MDPS, 3),
         "Within ±1σ %": _covered(row.coverage_1sigma_all),
         "Within ±2σ %": _covered(row.coverage_2sigma_all),
@@ -114,14 +123,17 @@ def _covered(fraction: float | None) -> float | None:
     return None if fraction is None else round(100 * fraction, 1)
 
 
-def _difference(row: pd.Series, name: str) -> str:
-    value, lo, hi = (row.get(f"less_{name}_dps{end}") for end in ("", "_lo", "_hi"))
+def _difference(row: pd.Series, name: str, truth: str = PAPER) -> str:
+    key, unit = f"less_{name}_dps", MDPS
+    if truth != PAPER:
+        key, unit = f"less_{name}_dps2_{truth}", MDPS**2
+    value, lo, hi = (row.get(key + end) for end in ("", "_lo", "_hi"))
     if value is None or pd.isna(value) or name == row.estimator:
         return "–"
     ends = (
-        "" if lo is None or hi is None or pd.isna(lo) else f" [{lo / MDPS:+.3f}, {hi / MDPS:+.3f}]"
+        "" if lo is None or hi is None or pd.isna(lo) else f" [{lo / unit:+.3f}, {hi / unit:+.3f}]"
     )
-    return f"{value / MDPS:+.3f}{ends}"
+    return f"{value / unit:+.3f}{ends}"
 
 
 def three_gyroscopes(results: pd.DataFrame, published: Published) -> pd.DataFrame | Missing:
