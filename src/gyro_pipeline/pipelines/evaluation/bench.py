@@ -391,9 +391,5 @@ def known_recordings(roles: pd.DataFrame) -> tuple[int, ...]:
 
 def known_places(roles: pd.DataFrame) -> list[tuple[int, int]]:
     """IMU and number of the recordings from which the noise of unseen devices is learned."""
-    train = (
-        roles[roles.role == TRAIN]
-        .sort_values(["imu", "recording"])
-        .drop_duplicates("imu recording".split())
-    )
-    return list(zip(train.imu.tolist(), train.recording.tolist(), strict=True))
+    train = roles[roles.role == TRAIN]
+    return sorted(set(zip(train.imu.tolist(), train.recording.tolist(), strict=True)))
