@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from gyro_pipeline.conventions import AXES
+from gyro_pipeline.conventions import AXES, LEAVE_ONE_DEVICE_OUT
 
 PerAxis = tuple[float, float, float]
 Precision = Literal["float32", "bfloat16"]
@@ -274,7 +274,27 @@ class Study(Parameter):
         None, min_length=1, description="its own; null: those of all studies"
     )
     default: bool = Field(True, description="part of `kedro run` and `--pipeline=reporting`")
+    protocol: Literal["by_recording", "leave_one_device_out"] = Field(
+        "by_recording",
+        description="what tests: recordings of IMU 1, or every IMU in turn, as an unseen device "
+        "(docs/honest_protocol.md); the second has no networks of the paper's",
+    )
     sensors: dict[str, Grid]
+
+    @property
+    def unseen_devices(self) -> bool:
+        """Whether the devices that test are unseen ones."""
+        return self.protocol == LEAVE_ONE_DEVICE_OUT
+
+    @model_validator(mode="after")
+    def _networks_know_their_device(self) -> Self:
+        networks = [name for name in self.estimators if name.startswith("cnn")]
+        if self.unseen_devices and networks:
+            raise ValueError(
+                f"estimators: {', '.join(networks)} cannot be judged on unseen devices; leave "
+                "them out of a study with protocol leave_one_device_out"
+            )
+        return self
 
 
 class Leakage(Parameter):

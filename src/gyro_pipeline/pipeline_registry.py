@@ -66,10 +66,12 @@ def _runs(parameters: Parameters, studies: dict[str, list[str]]) -> Pipeline:
     whole = Pipeline([])
     for study, sensors in studies.items():
         for sensor in sensors:
-            virtual = any(parameters.studies[study].sensors[sensor].virtual_gyros)
-            whole += _measured(sensor) + _split(sensor, virtual)
-            whole += training.create_pipeline(study, sensor, virtual)
-            whole += evaluation.create_pipeline(study, sensor, virtual)
+            asked = parameters.studies[study]
+            virtual = any(asked.sensors[sensor].virtual_gyros)
+            roles = "devices" if asked.unseen_devices else "roles"
+            whole += _measured(sensor) + _split(sensor, virtual, asked.unseen_devices)
+            whole += training.create_pipeline(study, sensor, virtual, roles)
+            whole += evaluation.create_pipeline(study, sensor, virtual, roles)
     return whole
 
 
@@ -89,10 +91,10 @@ def _measured(sensor: str) -> Pipeline:
     return raw_logs.create_pipeline(sensor) + ground_truth.create_pipeline(sensor)
 
 
-def _split(sensor: str, virtual: bool) -> Pipeline:
+def _split(sensor: str, virtual: bool, unseen_devices: bool = False) -> Pipeline:
     """The roles of the recordings, and the virtual gyroscopes drawn from those that train."""
     drawn = virtual_gyros.create_pipeline(sensor) if virtual else Pipeline([])
-    return windowed_splits.create_pipeline(sensor) + drawn
+    return windowed_splits.create_pipeline(sensor, unseen_devices) + drawn
 
 
 def _virtual_sensors(parameters: Parameters) -> set[str]:

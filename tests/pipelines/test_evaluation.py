@@ -26,10 +26,10 @@ from gyro_pipeline.physics.recording_model import outside_noise
 from gyro_pipeline.pipelines.evaluation import bench as bench_module
 from gyro_pipeline.pipelines.evaluation.bench import (
     Bench,
-    describe_device,
     known_recordings,
     off_the_curve,
 )
+from gyro_pipeline.pipelines.evaluation.device import describe_device
 from gyro_pipeline.pipelines.evaluation.folds import Fitted
 from gyro_pipeline.pipelines.evaluation.nodes import evaluate
 from gyro_pipeline.pipelines.ground_truth.nodes import measure_allan_variance, measure_bias
@@ -546,7 +546,9 @@ def test_an_estimator_never_sees_the_drawn_values(simulated, world, monkeypatch)
 
 def test_too_few_recordings_are_an_error_that_says_so(world, as_stored, make_roles):
     roles = make_roles(14, test=12)
-    with pytest.raises(InputError, match="best_linear cannot be fitted to 2 recordings: .*leave"):
+    with pytest.raises(
+        InputError, match="fold -1, 2 recordings: best_linear cannot be fitted: .*leave"
+    ):
         judge(of_estimators(world, ["best_linear"], roles), as_stored)
 
 

@@ -304,7 +304,7 @@ def test_a_negative_mean_square_is_reported_not_clipped():
     negative = squared_errors(table, DISJOINT, ALL)
     curve = curve_of([1, 2], [2, 1], recordings=5)
     weights = resampled_weights(5, 300, seed=0)
-    scores = score(negative, squares(np.ones((5, 1))), curve, 1.0, weights)
+    scores = scored(negative, squares(np.ones((5, 1))), curve, 1.0, weights)
     assert set(scores) == {"test_mse_dps2"}
     mse = scores["test_mse_dps2"]
     assert mse.value == pytest.approx(np.mean([0.01, 0.04, 0.09, 0.16, 0.25]) - 0.2)

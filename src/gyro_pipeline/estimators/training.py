@@ -40,6 +40,13 @@ class TrainingRecordings:
         self.known = [imu] if self.seen else self.imus
         self._others: dict[int, TrainingRecordings] = {}
 
+    def unseen(self, imu: int) -> "TrainingRecordings":
+        """What the other IMUs tell of one, as if it were not among the recordings."""
+        others = [one for one in self.imus if one != imu]
+        training = TrainingRecordings(self.recordings.sel(imu=others), imu)
+        training._others = {one: self.of(one) for one in others}
+        return training
+
     def of(self, imu: int) -> "TrainingRecordings":
         """The same about another of the IMUs."""
         if self.seen and imu == self.imu:
@@ -48,11 +55,15 @@ class TrainingRecordings:
             self._others[imu] = TrainingRecordings(self.recordings, imu)
         return self._others[imu]
 
-    @cached_property
+    @property
     def rates(self) -> NDArray[np.floating]:
         """Samples of all recordings of the known IMUs, (recordings, axes, samples), deg/s."""
-        if not self.seen:
-            return np.concatenate([self.of(imu).rates for imu in self.known])
+        if self.seen:
+            return self._own
+        return np.concatenate([self.of(imu).rates for imu in self.known])
+
+    @cached_property
+    def _own(self) -> NDArray[np.floating]:
         rates = self.recordings.angular_rate.sel(imu=self.imu)
         return rates.transpose("recording", "axis", "sample").to_numpy()[self._present]
 
@@ -69,14 +80,23 @@ class TrainingRecordings:
     @cached_property
     def noise_figures(self) -> list[NoiseFigures]:
         """N, B and K of each axis, from the Allan variance averaged over recordings."""
-        times = averaging_times_s(self.rates.shape[-1], self.rate_hz)
-        shortest_s = SHORTEST_FIT_SAMPLES / self.rate_hz
-        times = times[times >= shortest_s * (1 - 1e-9)]
-        variances = [
-            np.mean([allan_variance(row, self.rate_hz, times) for row in rows], axis=0)
-            for rows in self.rates.swapaxes(0, 1)
-        ]
-        return [fit_noise(times, one, self.recording_s, shortest_s) for one in variances]
+        fitted = self.recording_s, SHORTEST_FIT_SAMPLES / self.rate_hz
+        return [fit_noise(self._times_s, one, *fitted) for one in self._variances.mean(axis=0)]
+
+    @property
+    def _times_s(self) -> NDArray[np.float64]:
+        """Averaging times that the fit uses."""
+        times = averaging_times_s(self.recordings.sizes["sample"], self.rate_hz)
+        return times[times * self.rate_hz >= SHORTEST_FIT_SAMPLES * (1 - 1e-9)]
+
+    @cached_property
+    def _variances(self) -> NDArray[np.float64]:
+        """Allan variances, (recordings, axes, times)."""
+        if not self.seen:
+            return np.concatenate([self.of(imu)._variances for imu in self.known])
+        rows = self.rates.reshape(-1, self.rates.shape[-1])
+        variances = [allan_variance(row, self.rate_hz, self._times_s) for row in rows]
+        return np.reshape(variances, (*self.rates.shape[:2], -1))
 
     @property
     def white_noise(self) -> NDArray[np.float64]:

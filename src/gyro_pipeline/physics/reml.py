@@ -165,6 +165,11 @@ class _Likelihood:
         self.edges = block_edges(samples, round(_BLOCK_S * rate_hz))
         self.offset = float(means.mean())
         self.means = means - self.offset
+        self.levels = self.means.mean(axis=1)
+        self.rest = (self.means - self.levels[:, None]).T
+        # as many columns as there are blocks have the same squares as all recordings'
+        self.scatter = linalg.qr(self.rest.T, mode="economic")[1].T
+        self.noise = lru_cache(maxsize=16)(self._noise)  # of a gradient's steps, most keep it
         self.rate_hz, self.duration_s, self.warm_up = rate_hz, samples / rate_hz, warm_up
         self.unit = noise_covariances(self.edges, samples, rate_hz)
         self.known: NDArray[np.float64] | None = None
@@ -192,22 +197,36 @@ class _Likelihood:
     def deviance(
         self, x: NDArray[np.float64]
     ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-        """-2 times the restricted log-likelihood and prior; the fitted c and its covariance."""
+        """-2 times the restricted log-likelihood and prior; the fitted c and its covariance.
+
+        Each recording alone gives a c with the noise's covariance, and residuals that do not
+        depend on the spreads. The c of several then scatter by that covariance and the spreads. So
+        a spread may be any multiple of the noise, as it is from unit to unit.
+        """
         figures, spreads, time_constant_s = self.unpack(x)
+        root, log_determinant, squares = self.noise(*figures.tolist())
         design = profiles(self.edges, self.rate_hz, time_constant_s)[:, : spreads.size]
-        covariance = np.tensordot(np.square(figures), self.unit, axes=1)
-        covariance += (design * np.square(spreads)) @ design.T
-        root = np.linalg.cholesky(covariance)
-        white = linalg.solve_triangular(
-            root, np.column_stack([self.means.T, design]), lower=True, check_finite=False
-        )
-        y, z = white[:, : len(self.means)], white[:, len(self.means) :]
-        information = len(self.means) * z.T @ z
-        mean = np.linalg.solve(information, (z.T @ y).sum(axis=1))
-        deviance = 2 * len(self.means) * np.log(np.diag(root)).sum()
-        deviance += np.linalg.slogdet(information)[1]
-        deviance += np.sum((y - (z @ mean)[:, None]) ** 2) - 2 * np.log(spreads).sum()
-        return float(deviance), mean, np.linalg.inv(information)
+        white = linalg.solve_triangular(root, design, lower=True, check_finite=False)
+        weighted = linalg.solve_triangular(root, white, lower=True, trans="T", check_finite=False)
+        information = white.T @ white
+        own = np.linalg.solve(information, weighted.T @ self.rest)
+        squares = squares - np.sum(own * (information @ own))
+        own[0] += self.levels
+        mean, scatter = own.mean(axis=1), np.linalg.inv(information) + np.diag(spreads**2)
+        off, n = own - mean[:, None], self.levels.size
+        deviance = n * (log_determinant + np.linalg.slogdet(information)[1])
+        deviance += (n - 1) * np.linalg.slogdet(scatter)[1] + mean.size * np.log(n)
+        deviance += squares + np.sum(off * np.linalg.solve(scatter, off))
+        return float(deviance - 2 * np.log(spreads).sum()), mean, scatter / n
+
+    def _noise(self, *figures: float) -> tuple[NDArray[np.float64], float, float]:
+        """Of N, B and K: the root of their covariance, its log determinant, and squares.
+
+        The squares are those of the block means about each recording's level, whitened.
+        """
+        root = np.linalg.cholesky(np.tensordot(np.square(figures), self.unit, axes=1))
+        white = linalg.solve_triangular(root, self.scatter, lower=True, check_finite=False)
+        return root, float(2 * np.log(np.diag(root)).sum()), float(np.sum(white**2))
 
     def criterion(self, x: NDArray[np.float64]) -> float:
         """-2 times the log-likelihood, plus log n for each parameter, spreads and means."""

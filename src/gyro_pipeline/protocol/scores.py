@@ -50,8 +50,20 @@ class Estimate:
     hi: float | None = None
 
 
+def clusters(table: pd.DataFrame) -> pd.Series:
+    """What intervals resample as a whole: recordings, or devices where several are tested.
+
+    Windows of a recording share its history, and recordings of an unseen device its prior.
+
+    Args:
+        table: Errors or curves; their columns ``recording`` and, if there, ``imu``.
+    """
+    several = "imu" in table and table.imu.nunique() > 1
+    return table.imu if several else table.recording
+
+
 def squared_errors(errors: pd.DataFrame, truth: str, windows: str) -> SquaredErrors:
-    """Squares of the chosen errors by recording, in order of recording number.
+    """Squares of the chosen errors by recording (or device, see :func:`clusters`), in order.
 
     Args:
         errors: Columns ``recording, window, truth, error_dps, truth_variance``; several runs of
@@ -63,8 +75,8 @@ def squared_errors(errors: pd.DataFrame, truth: str, windows: str) -> SquaredErr
     if windows == FIRST:
         chosen = chosen[chosen.window == 0]
     squares = chosen.error_dps**2 - chosen.truth_variance
-    by_recording = squares.groupby(chosen.recording).agg(["sum", "count"])
-    return SquaredErrors(by_recording["sum"].to_numpy(), by_recording["count"].to_numpy())
+    grouped = squares.groupby(clusters(chosen)).agg(["sum", "count"])
+    return SquaredErrors(grouped["sum"].to_numpy(), grouped["count"].to_numpy())
 
 
 @dataclass(frozen=True)
@@ -98,7 +110,7 @@ class ResampledCurve:
 
 
 def curve_errors(curve: pd.DataFrame, truth: str, windows: str) -> Curve:
-    """The chosen running-mean curve by recording, in order of recording number.
+    """The chosen running-mean curve by recording (or device, see :func:`clusters`), in order.
 
     Args:
         curve: From :func:`gyro_pipeline.protocol.truths.running_mean_curve`, concatenated.
@@ -106,7 +118,8 @@ def curve_errors(curve: pd.DataFrame, truth: str, windows: str) -> Curve:
         windows: ``first`` or ``all``.
     """
     chosen = curve[(curve.truth == truth) & (curve.windows == windows)]
-    table = chosen.pivot(index="recording", columns="time_s", values=["sum_sq", "count"])
+    sums = chosen.groupby([clusters(chosen).rename("cluster"), "time_s"])[["sum_sq", "count"]].sum()
+    table = sums.unstack("time_s")
     squares = SquaredErrors(table["sum_sq"].to_numpy(), table["count"].to_numpy())
     return Curve(table["sum_sq"].columns.to_numpy(float), squares)
 

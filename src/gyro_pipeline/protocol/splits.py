@@ -28,16 +28,77 @@ def assign_roles(
     Raises:
         InputError: If no recording would be left for training.
     """
-    if given is not None:
-        folds = {HOLD_OUT: [r for r in recordings if given[r] == TEST]}
-    elif len(recordings) < splits.k_fold_below:
-        folds = _k_folds(recordings, splits)
-    else:
-        n_test = max(1, round(splits.test_fraction * len(recordings)))
-        folds = {HOLD_OUT: list(recordings[-n_test:])}
+    held_out = _held_out(recordings, splits, given)
+    folds = _k_folds(recordings, splits) if held_out is None else {HOLD_OUT: held_out}
     roles = pd.concat([_fold_roles(f, test, recordings, splits) for f, test in folds.items()])
     check_roles(roles)
     return roles.reset_index(drop=True)
+
+
+def leave_one_device_out(
+    recordings: Mapping[int, Sequence[int]],
+    splits: Splits,
+    given: Mapping[int, str] | None = None,
+) -> pd.DataFrame:
+    """Let every IMU in turn be the unseen device: it tests, and all others train.
+
+    Where :func:`assign_roles` holds recordings out, only those of the unseen device test, and only
+    the rest of the others' train: recordings made together with a test recording never train. Where
+    it makes a k-fold, or there is one recording, all of the device's test and all of the others'
+    train: few recordings are all needed, and what IMUs recorded together share is no bias.
+
+    Args:
+        recordings: Numbers, in order, of the recordings that each IMU has.
+        splits: Fractions and counts.
+        given: ``"train"`` or ``"test"`` for each recording, where the source came split.
+
+    Returns:
+        Columns ``fold`` (the unseen IMU), ``imu``, ``recording``, ``role``.
+
+    Raises:
+        InputError: Fewer than two IMUs, or an IMU without a recording to test or to learn from.
+    """
+    if len(recordings) <= 1:
+        raise InputError(
+            f"unseen devices: expected at least 2 IMUs, got {len(recordings)}; bring recordings of "
+            "more, or leave the sensor out of the study"
+        )
+    numbers = sorted({number for own in recordings.values() for number in own})
+    held_out = _held_out(numbers, splits, given)
+    rows = [
+        (unseen, imu, number, TEST if imu == unseen else TRAIN)
+        for unseen in recordings
+        for imu, own in recordings.items()
+        for number in own
+        if held_out is None or (number in held_out) == (imu == unseen)
+    ]
+    roles = pd.DataFrame(rows, columns=["fold", "imu", "recording", "role"])
+    check_devices(roles)
+    return roles
+
+
+def check_devices(roles: pd.DataFrame) -> None:
+    """Refuse a fold in which the unseen device trains or another tests, and one that lacks either.
+
+    Args:
+        roles: As from :func:`leave_one_device_out`.
+
+    Raises:
+        InputError: Naming the fold, the IMU and its recordings.
+    """
+    for unseen, group in roles.groupby("fold"):
+        wrong = group[(group.imu == unseen) != (group.role == TEST)]
+        for (imu, role), rows in wrong.groupby(["imu", "role"]):
+            raise InputError(
+                f"unseen device IMU {unseen}: recordings {', '.join(map(str, rows.recording))} of "
+                f"IMU {imu} have role {role!r}; the unseen device tests, and only the others train"
+            )
+        for role in (TRAIN, TEST):
+            if not (group.role == role).any():
+                raise InputError(
+                    f"unseen device IMU {unseen}: no recording has role {role!r}; bring more "
+                    "recordings, or leave the sensor out of the study"
+                )
 
 
 def check_roles(roles: pd.DataFrame) -> None:
@@ -91,20 +152,24 @@ def refuse_copies(contents: Mapping[tuple[int, int], str], roles: pd.DataFrame) 
 
     Args:
         contents: A hash of the samples, by IMU and recording number.
-        roles: From :func:`assign_roles`.
+        roles: From :func:`assign_roles` or :func:`leave_one_device_out`.
 
     Raises:
         InputError: Naming both recordings and the fold.
     """
     first: dict[str, tuple[int, int]] = {}
-    for (imu, number), content in contents.items():
-        twin_imu, twin = first.setdefault(content, (imu, number))
-        for fold, group in roles.groupby("fold"):
-            role = group.set_index("recording").role
-            if role[twin] != role[number]:
+    twins = [(place, first.setdefault(content, place)) for place, content in contents.items()]
+    copies = [(place, twin) for place, twin in twins if place != twin]
+    for fold, group in roles.groupby("fold"):
+        by_imu = "imu" in group
+        index = ["imu", "recording"] if by_imu else "recording"
+        role_of = group.set_index(index).role.to_dict()
+        for place, twin in copies:
+            role, other = (role_of.get(one if by_imu else one[1]) for one in (place, twin))
+            if role and other and role != other:
                 raise InputError(
-                    f"fold {fold}: IMU {imu} recording {number} ({role[number]}) holds the same "
-                    f"samples as IMU {twin_imu} recording {twin} ({role[twin]}); leave one of "
+                    f"fold {fold}: IMU {place[0]} recording {place[1]} ({role}) holds the same "
+                    f"samples as IMU {twin[0]} recording {twin[1]} ({other}); leave one of "
                     "them out, or give both the same role"
                 )
 
@@ -117,6 +182,17 @@ def deal(count: int, folds: int, seed: int) -> list[np.ndarray]:
 def with_role(roles: pd.DataFrame, fold: int, role: str) -> list[int]:
     """Recording numbers that have ``role`` in ``fold``."""
     return roles.recording[(roles.fold == fold) & (roles.role == role)].tolist()
+
+
+def _held_out(
+    recordings: Sequence[int], splits: Splits, given: Mapping[int, str] | None
+) -> list[int] | None:
+    """The test recordings of a hold-out; None where few recordings make a k-fold."""
+    if given is not None:
+        return [r for r in recordings if given[r] == TEST]
+    if len(recordings) < splits.k_fold_below:
+        return None
+    return list(recordings[-max(1, round(splits.test_fraction * len(recordings))) :])
 
 
 def _k_folds(recordings: Sequence[int], splits: Splits) -> dict[int, list[int]]:

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from gyro_pipeline.conventions import ALL, AXES, DISJOINT, FIRST, PAPER, TRUE
+from gyro_pipeline.conventions import ALL, AXES, DISJOINT, FIRST, PAPER, TEST_IMU, TRUE
 from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.recording_model import outside_noise
 
@@ -30,6 +30,7 @@ class TestRecording:
         rate_hz: Sample rate, Hz.
         noise: N, B and K of each axis from training recordings, or as drawn if simulated.
         true_bias: Drawn bias, shape (3,), deg/s; None on measured data.
+        imu: Whose recording it is.
     """
 
     number: int
@@ -37,6 +38,7 @@ class TestRecording:
     rate_hz: float
     noise: tuple[NoiseFigures, ...]
     true_bias: np.ndarray | None
+    imu: int = TEST_IMU
 
     @cached_property
     def running_sums(self) -> np.ndarray:
@@ -102,6 +104,7 @@ def error_columns(
     value, variance = recording.truths(size)[truth]
     n = len(estimates)
     return {
+        "imu": np.full(n * len(AXES), recording.imu),
         "recording": np.full(n * len(AXES), recording.number),
         "window": np.repeat(np.arange(n), len(AXES)),
         "axis": np.tile(AXES, n),
@@ -126,7 +129,7 @@ def error_table(recording: TestRecording, size: int, estimates: np.ndarray) -> p
         estimates: Shape (windows, 3), deg/s.
 
     Returns:
-        Columns ``recording, window, axis, truth, error_dps, truth_variance, sigma_dps``.
+        Columns ``imu, recording, window, axis, truth, error_dps, truth_variance, sigma_dps``.
     """
     sigma = np.full(estimates.shape, np.nan)
     truths = recording.truths(size)
@@ -141,8 +144,8 @@ def running_mean_curve(recording: TestRecording, size: int) -> pd.DataFrame:
         size: Samples of the study's window; a point of the curve lies exactly there.
 
     Returns:
-        Columns ``recording, truth, windows`` (``first`` or ``all``), ``time_s``, ``sum_sq`` in
-        (deg/s)^2 with the truth's own variance taken off, and ``count`` of squares in the sum.
+        Columns ``imu, recording, truth, windows`` (``first`` or ``all``), ``time_s``, ``sum_sq``
+        in (deg/s)^2 with the truth's own variance taken off, and ``count`` of squares in the sum.
     """
     n = recording.samples.shape[-1]
     step = max(1, round(CURVE_STEP_S * recording.rate_hz))
@@ -155,6 +158,7 @@ def running_mean_curve(recording: TestRecording, size: int) -> pd.DataFrame:
                 continue
             squares = (estimates - value) ** 2 - variance
             for windows, part in ((FIRST, squares[:1]), (ALL, squares)):
-                rows.append((recording.number, truth, windows, time_s, part.sum(), part.size))
-    columns = ["recording", "truth", "windows", "time_s", "sum_sq", "count"]
+                place = recording.imu, recording.number
+                rows.append((*place, truth, windows, time_s, part.sum(), part.size))
+    columns = ["imu", "recording", "truth", "windows", "time_s", "sum_sq", "count"]
     return pd.DataFrame(rows, columns=columns)

@@ -1,7 +1,7 @@
 """The test bench: one sensor, window and fold, on which every estimator is judged alike."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 
@@ -23,12 +23,12 @@ from gyro_pipeline.conventions import (
     TARGET_OF,
     TEST,
     TEST_IMU,
+    TRAIN,
     TRUE,
     InputError,
 )
 from gyro_pipeline.estimators import Estimator, RunningMean
 from gyro_pipeline.parameters import Evaluation
-from gyro_pipeline.physics.allan import SHORTEST_FIT_SAMPLES, NoiseFigures, fit_noise
 from gyro_pipeline.physics.ceiling import (
     best_gain,
     best_saving,
@@ -36,20 +36,19 @@ from gyro_pipeline.physics.ceiling import (
     oracle,
     pooled,
     running_mean_rmse,
-    turn_on_spread,
 )
 from gyro_pipeline.physics.recording_model import (
     LinearEstimate,
-    RecordingModel,
     best_linear,
     mean_squares,
 )
-from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, fit_recording_model
+from gyro_pipeline.pipelines.evaluation.device import TestDevice
 from gyro_pipeline.protocol.scores import (
     Estimate,
     ResampledCurve,
     SquaredErrors,
     beats_oracle,
+    clusters,
     coverage,
     curve_errors,
     equivalent_time,
@@ -68,124 +67,20 @@ from gyro_pipeline.protocol.truths import (
 from gyro_pipeline.protocol.windows import cut_windows, window_size
 from gyro_pipeline.tracking import metric_name
 
-_CEILING_RESAMPLES = 400
 _CURVE_POINTS = 30  # of the expected running mean, to interpolate between
 
 
 @dataclass(frozen=True)
-class TestDevice:
-    """What is known of the test IMU, per axis: drawn if simulated, else from its recordings.
-
-    Attributes:
-        noise: N, shape (resamples, 3), deg/s sqrt(s); the first row is the estimate itself.
-        spread: Turn-on spread tau, same shape, deg/s.
-        unit_bias: Drawn prior mean, shape (3,), deg/s; None on measured data.
-        models: Of each axis, where its noise is not white or its bias warms up; drawn if simulated,
-            else fitted.
-    """
-
-    noise: np.ndarray
-    spread: np.ndarray
-    unit_bias: np.ndarray | None
-    models: tuple[RecordingModel, ...] | None = None
-
-    @property
-    def figures(self) -> tuple[NoiseFigures, ...]:
-        """N, B and K of each axis."""
-        if self.models is not None:
-            return tuple(model.noise for model in self.models)
-        return tuple(NoiseFigures(float(white), 0.0, 0.0) for white in self.noise[0])
-
-
-def describe_device(
-    recordings: xr.Dataset, bias: pd.DataFrame, allan: xr.Dataset, numbers: Sequence[int], seed: int
-) -> TestDevice:
-    """Noise and turn-on spread of the test IMU, with a bootstrap over the recordings used.
-
-    Args:
-        recordings: With the drawn values on simulated data.
-        bias: Ground truth.
-        allan: Allan variances.
-        numbers: Recordings to learn from; none of a hold-out's test recordings.
-        seed: Of the bootstrap.
-    """
-    if recordings.attrs["simulated"]:
-        return TestDevice(
-            noise=recordings.true_noise.to_numpy()[None],
-            spread=recordings.true_turn_on_spread.to_numpy()[None],
-            unit_bias=recordings.true_unit_bias.sel(imu=TEST_IMU).to_numpy(),
-            models=_drawn_models(recordings),
-        )
-    duration_s = recordings.sizes["sample"] / recordings.attrs["rate_hz"]
-    means = bias[bias.imu == TEST_IMU].pivot(index="recording", columns="axis", values="bias_dps")
-    variances = allan.allan_variance.sel(imu=TEST_IMU, recording=list(numbers))
-    variances = variances.transpose("recording", "axis", "time_s").to_numpy()
-    generator = np.random.default_rng(seed)
-    draws = generator.integers(len(numbers), size=(_CEILING_RESAMPLES, len(numbers)))
-    noise, spread = [], []
-    for chosen in [np.arange(len(numbers)), *draws]:
-        shortest_s = SHORTEST_FIT_SAMPLES / recordings.attrs["rate_hz"]
-        fits = [
-            fit_noise(allan.time_s.to_numpy(), variance, duration_s, shortest_s)
-            for variance in variances[chosen].mean(axis=0)
-        ]
-        noise.append([fit.white for fit in fits])
-        values = means.loc[list(numbers)].to_numpy()[chosen]
-        spread.append(turn_on_spread(values, np.array(noise[-1]), duration_s))
-    models = _fitted_models(recordings, numbers, np.array(spread[0]))
-    return TestDevice(np.array(noise), np.array(spread), None, models)
-
-
-def _drawn_models(recordings: xr.Dataset) -> tuple[RecordingModel, ...] | None:
-    """What each axis of the test IMU was drawn from; None for white noise without a warm-up."""
-    drawn = {
-        name: float(recordings.get(f"true_{name}", 0.0)) for name in ("flicker", "random_walk")
-    }
-    warm_up = recordings.get("true_warm_up")
-    if not any(drawn.values()) and warm_up is None:
-        return None
-    models = []
-    for axis in recordings.axis.to_numpy():
-        one = recordings.sel(imu=TEST_IMU, axis=axis)
-        noise = NoiseFigures(float(one.true_noise), drawn["flicker"], drawn["random_walk"])
-        mean, spread = [float(one.true_unit_bias)], [float(one.true_turn_on_spread)]
-        constant_s = np.inf
-        if warm_up is not None:
-            amplitude, scatter, constant_s = warm_up.to_numpy().tolist()
-            mean, spread = [*mean, amplitude], [*spread, scatter]
-        covariance = np.diag(np.square(spread))
-        place = recordings.sizes["sample"], float(recordings.attrs["rate_hz"])
-        models.append(RecordingModel(*place, noise, np.array(mean), covariance, constant_s))
-    return tuple(models)
-
-
-def _fitted_models(
-    recordings: xr.Dataset, numbers: Sequence[int], spread: np.ndarray
-) -> tuple[RecordingModel, ...] | None:
-    """Models of the test IMU's axes with a spread found otherwise; None of too few recordings."""
-    if len(numbers) < FEWEST_RECORDINGS:
-        return None
-    rates = recordings.angular_rate.sel(imu=TEST_IMU, recording=list(numbers))
-    rates = rates.transpose("axis", "recording", "sample").to_numpy()
-    models = []
-    for axis, tau in zip(rates, spread, strict=True):
-        model = fit_recording_model(axis, float(recordings.attrs["rate_hz"]), warm_up=None)
-        covariance = np.diag(np.diag(model.covariance))
-        covariance[0, 0] = tau**2
-        models.append(replace(model, covariance=covariance))
-    return tuple(models)
-
-
-@dataclass(frozen=True)
 class Bench:
-    """Test recordings of the test IMU, cut into windows of one length.
+    """Test recordings of the test IMU, or of several unseen ones, cut into windows of one length.
 
     Attributes:
         recordings: All recordings of the sensor.
-        device: From :func:`describe_device`.
-        numbers: The test recordings.
+        device: From :func:`describe_device`, or from :func:`describe_unseen` of the same IMUs.
+        numbers: The test recordings; one of several IMUs may lack some.
         window_s: Calibration time T0, seconds.
         evaluation: Resamples and seed of the intervals.
+        imus: Whose recordings test, in order.
     """
 
     recordings: xr.Dataset
@@ -193,6 +88,7 @@ class Bench:
     numbers: tuple[int, ...]
     window_s: float
     evaluation: Evaluation
+    imus: tuple[int, ...] = (TEST_IMU,)
 
     @cached_property
     def size(self) -> int:
@@ -207,27 +103,37 @@ class Bench:
 
     @cached_property
     def tested(self) -> list[TestRecording]:
-        """The test IMU's recordings with what is needed to judge an estimate."""
-        chosen = self.recordings.sel(imu=TEST_IMU, recording=list(self.numbers))
-        known = "true_bias" in chosen
-        return [
+        """The test recordings with what is needed to judge an estimate."""
+        known = "true_bias" in self.recordings
+        places = product(self.imus, self.numbers)
+        chosen = [self.recordings.sel(imu=imu, recording=number) for imu, number in places]
+        tested = [
             TestRecording(
                 number=int(one.recording),
                 samples=one.angular_rate.to_numpy(),
-                rate_hz=chosen.attrs["rate_hz"],
-                noise=self.device.figures,
+                rate_hz=self.recordings.attrs["rate_hz"],
+                noise=self.device.figures[self._axes(int(one.imu))],
                 true_bias=one.true_bias.to_numpy() if known else None,
+                imu=int(one.imu),
             )
-            for one in (chosen.sel(recording=number) for number in self.numbers)
+            for one in chosen
         ]
+        lacking = len(self.imus) > 1  # the plan has refused recordings that the test IMU lacks
+        return [one for one in tested if not (lacking and np.isnan(one.samples[0, 0]))]
 
-    def errors(self, estimator: Estimator, imus: int = 1) -> pd.DataFrame:
-        """Errors of an estimator on IMU 1, in all windows against all truths.
+    def _axes(self, imu: int) -> slice:
+        """Where the axes of an IMU are among those of ``device``."""
+        first = len(AXES) * self.imus.index(imu)
+        return slice(first, first + len(AXES))
+
+    def errors(self, estimator: Estimator | Mapping[int, Estimator], imus: int = 1) -> pd.DataFrame:
+        """Errors of an estimator in all windows against all truths.
 
         It is asked for the target that each truth is about.
 
         Args:
-            estimator: Sees ``imus`` IMUs side by side, the test IMU first.
+            estimator: Sees ``imus`` IMUs side by side, the test IMU first; or one for each IMU
+                that is tested.
             imus: How many.
 
         Raises:
@@ -236,6 +142,7 @@ class Bench:
         seen = self.recordings.angular_rate.sel(imu=slice(TEST_IMU, TEST_IMU + imus - 1))
         parts = []
         for recording in self.tested:
+            own = estimator[recording.imu] if isinstance(estimator, Mapping) else estimator
             samples = (
                 recording.samples
                 if imus == 1
@@ -247,7 +154,7 @@ class Bench:
             judged = {
                 target: [
                     values[:, : len(AXES)]
-                    for values in estimator.estimate(windows, target, start_s, recording.number)
+                    for values in own.estimate(windows, target, start_s, recording.number)
                 ]
                 for target in (RECORDING_MEAN, BIAS)
             }
@@ -283,7 +190,11 @@ class Bench:
     def _resampled(self) -> np.ndarray:
         """Weights of the recordings in each resample."""
         drawn = self.evaluation.resamples, self.evaluation.bootstrap_seed
-        return resampled_weights(len(self.numbers), *drawn)
+        return resampled_weights(self._clusters, *drawn)
+
+    @cached_property
+    def _clusters(self) -> int:
+        return int(clusters(self.mean_errors).nunique())
 
     @cached_property
     def curve(self) -> pd.DataFrame:
@@ -316,7 +227,8 @@ class Bench:
         if device.models is None:
             assert device.unit_bias is not None
             means = recording.window_sums(size) / size
-            known = (device.unit_bias, device.spread[0], device.noise[0])
+            axes = self._axes(recording.imu)
+            known = (device.unit_bias[axes], device.spread[0, axes], device.noise[0, axes])
             return oracle(means, *known, self.window_s, self.recording_s, truth)
         windows = cut_windows(recording.samples, size)
         return np.stack(
@@ -325,7 +237,7 @@ class Bench:
                     float(self._line(axis, i * size, truth)(one[None])[0])
                     for i, one in enumerate(rows)
                 ]
-                for axis, rows in enumerate(windows)
+                for axis, rows in enumerate(windows, self._axes(recording.imu).start)
             ],
             axis=-1,
         )
@@ -377,6 +289,11 @@ class Bench:
             ceilings["ceiling_time_saving_pct"] = with_interval(100 * saving)
         return ceilings
 
+    @cached_property
+    def _ceilings(self) -> dict[tuple[str, str], dict[str, Estimate]]:
+        """By truth and windows; the same for every estimator."""
+        return {view: self.ceilings(*view) for view in self.curves}
+
     def _expected(self, truth: str, windows: str, size: int) -> tuple[float, float]:
         """Mean squares of the best linear estimate and the running mean, over axes and windows."""
         assert self.device.models is not None
@@ -416,7 +333,7 @@ class Bench:
                 curve = self.curves[truth, windows]
                 scores = score(own, mean, curve, self.window_s, self._resampled)
                 if weights == LAST:
-                    scores |= self.ceilings(truth, windows)
+                    scores |= self._ceilings[truth, windows]
                 for base, estimate in scores.items():
                     named = {"": estimate.value, "lo": estimate.lo, "hi": estimate.hi}
                     metrics |= {
@@ -424,7 +341,7 @@ class Bench:
                         for bound, value in named.items()
                         if value is not None and np.isfinite(value)
                     }
-                if self._oracles and len(self.numbers) > 1:
+                if self._oracles and self._clusters > 1:
                     p = beats_oracle(own, self._oracles[truth, windows])
                     metrics[metric_name("beats_oracle_p", windows, weights, truth)] = p
         return metrics
@@ -458,11 +375,11 @@ def off_the_curve(metrics: Mapping[str, float]) -> dict[str, str]:
 
 
 def test_recordings(roles: pd.DataFrame, fold: int) -> tuple[int, ...]:
-    """Test recordings of a fold; for ``HOLD_OUT`` on a k-fold, those of all folds."""
+    """Test recordings of a fold; for ``HOLD_OUT`` on several folds, those of all."""
     tests = roles[roles.role == TEST]
     if fold != HOLD_OUT:
         tests = tests[tests.fold == fold]
-    return tuple(sorted(tests.recording.tolist()))
+    return tuple(sorted(tests.recording.unique().tolist()))
 
 
 def known_recordings(roles: pd.DataFrame) -> tuple[int, ...]:
@@ -470,3 +387,9 @@ def known_recordings(roles: pd.DataFrame) -> tuple[int, ...]:
     if (roles.fold == HOLD_OUT).all():
         roles = roles[roles.role != TEST]
     return tuple(sorted(roles.recording.unique().tolist()))
+
+
+def known_places(roles: pd.DataFrame) -> list[tuple[int, int]]:
+    """IMU and number of the recordings from which the noise of unseen devices is learned."""
+    train = roles[roles.role == TRAIN]
+    return sorted(set(zip(train.imu.tolist(), train.recording.tolist(), strict=True)))

@@ -1,13 +1,14 @@
 """Estimators without a network, fitted in every fold."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from gyro_pipeline.conventions import BIAS, TEST, TEST_IMU, InputError
+from gyro_pipeline.conventions import BIAS, TEST, TEST_IMU, TRAIN, InputError
 from gyro_pipeline.estimators import (
     ESTIMATORS,
     Estimates,
@@ -52,14 +53,9 @@ class Fitted:
         if key not in self._folds:
             roles = self._roles[self._roles.fold == fold]
             numbers = sorted(roles.recording[roles.role != TEST].tolist())
-            try:
+            place = f"{self._recordings.attrs['sensor']} fold {fold}, {len(numbers)} recordings"
+            with _explained(name, place):
                 self._folds[key] = ESTIMATORS[name]().fit(self._samples(key[1:], numbers))
-            except InputError as error:
-                sensor = self._recordings.attrs["sensor"]
-                raise InputError(
-                    f"{sensor} fold {fold}: {name} cannot be fitted to {len(numbers)} recordings: "
-                    f"{error}; bring more recordings or leave it out of the study"
-                ) from error
         return self._folds[key]
 
     def _samples(self, key: tuple[int, int, int], numbers: list[int]) -> TrainingRecordings:
@@ -83,6 +79,44 @@ class Fitted:
         drawn = self._virtual[["angular_rate"]].sel(imu=slice(1, imus), recording=slice(1, last))
         drawn = drawn.assign_coords(imu=drawn.imu + int(self._recordings.imu.max()))
         return xr.concat([samples, drawn], "imu", join="outer").assign_attrs(samples.attrs)
+
+
+class FittedToOthers:
+    """Estimators without a network, fitted for each IMU to the recordings of all others.
+
+    Args:
+        recordings: Of all IMUs; estimators get the samples alone, without drawn values.
+        roles: From :func:`gyro_pipeline.protocol.splits.leave_one_device_out`.
+    """
+
+    def __init__(self, recordings: xr.Dataset, roles: pd.DataFrame) -> None:
+        train = roles[roles.role == TRAIN]
+        numbers = sorted(train.recording.unique().tolist())
+        known = TrainingRecordings(recordings[["angular_rate"]].sel(recording=numbers).load())
+        self._sensor = recordings.attrs["sensor"]
+        self._training = {imu: known.unseen(imu) for imu in sorted(roles.fold.unique().tolist())}
+        self._fitted: dict[str, dict[int, Estimator]] = {}
+
+    def estimator(self, name: str, real_imus: int, virtual_imus: int) -> Mapping[int, Estimator]:
+        """An estimator for each IMU; whatever the cell names, all other real IMUs train."""
+        if name not in self._fitted:
+            self._fitted[name] = {}
+            for imu, training in self._training.items():
+                with _explained(name, f"{self._sensor} without IMU {imu}"):
+                    self._fitted[name][imu] = ESTIMATORS[name]().fit(training)
+        return self._fitted[name]
+
+
+@contextmanager
+def _explained(name: str, where: str) -> Iterator[None]:
+    """Say which estimator cannot be fitted, to what, and what to do."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(
+            f"{where}: {name} cannot be fitted: {error}; bring more recordings or leave it out of "
+            "the study"
+        ) from error
 
 
 class OfFolds:

@@ -23,7 +23,9 @@ from gyro_pipeline.physics import allan as allan_module
 from gyro_pipeline.physics import ceiling
 from gyro_pipeline.physics.ceiling import oracle
 from gyro_pipeline.pipelines.evaluation import bench as bench_module
-from gyro_pipeline.pipelines.evaluation.bench import Bench, describe_device
+from gyro_pipeline.pipelines.evaluation import device as device_module
+from gyro_pipeline.pipelines.evaluation.bench import Bench
+from gyro_pipeline.pipelines.evaluation.device import describe_device
 from gyro_pipeline.pipelines.evaluation.waiting import waiting
 from gyro_pipeline.protocol import leaks, scores
 from gyro_pipeline.protocol import truths as truths_module
@@ -40,7 +42,16 @@ from gyro_pipeline.tracking import (
     StoredRun,
 )
 
-_CODE = (allan_module, ceiling, bench_module, leaks, scores, truths_module, windows_module)
+_CODE = (
+    allan_module,
+    ceiling,
+    bench_module,
+    device_module,
+    leaks,
+    scores,
+    truths_module,
+    windows_module,
+)
 
 
 def evaluate_leakage(  # noqa: PLR0917 - a node's arguments are its datasets

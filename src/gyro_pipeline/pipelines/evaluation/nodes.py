@@ -1,12 +1,12 @@
 """Nodes of the evaluation stage."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import pandas as pd
 import xarray as xr
 
-from gyro_pipeline.conventions import ALL, AXES, BEST, FIRST, LAST
+from gyro_pipeline.conventions import ALL, AXES, BEST, FIRST, LAST, TEST_IMU
 from gyro_pipeline.estimators import (
     ORIENTATION_NOTE,
     Estimator,
@@ -24,15 +24,17 @@ from gyro_pipeline.parameters import Evaluation
 from gyro_pipeline.physics import allan as allan_module
 from gyro_pipeline.physics import ceiling, history, recording_model, reml
 from gyro_pipeline.pipelines.evaluation import bench as bench_module
+from gyro_pipeline.pipelines.evaluation import device as device_module
 from gyro_pipeline.pipelines.evaluation import folds
 from gyro_pipeline.pipelines.evaluation.bench import (
     Bench,
-    describe_device,
+    known_places,
     known_recordings,
     off_the_curve,
     test_recordings,
 )
-from gyro_pipeline.pipelines.evaluation.folds import Fitted
+from gyro_pipeline.pipelines.evaluation.device import describe_device, describe_unseen
+from gyro_pipeline.pipelines.evaluation.folds import Fitted, FittedToOthers
 from gyro_pipeline.pipelines.evaluation.waiting import waiting
 from gyro_pipeline.protocol import scores, truths, windows
 from gyro_pipeline.studies import MEAN, NETWORKS
@@ -51,7 +53,7 @@ logger = logging.getLogger(__name__)
 _CODE = (
     *(allan_module, ceiling, recording_model, reml, history),
     *(averages, base, linear, networks, perceptrons, shrinkage, training),
-    *(bench_module, folds, scores, truths, windows),
+    *(bench_module, device_module, folds, scores, truths, windows),
 )
 
 
@@ -80,27 +82,36 @@ def evaluate(
     Yields:
         Metrics and per-window errors, to be added to each run.
     """
-    fitted = Fitted(recordings, roles, virtual)
     judged_with = fingerprint([code_hash(_CODE), evaluation.model_dump()])
-    seed = evaluation.bootstrap_seed
-    device = describe_device(recordings, bias, allan, known_recordings(roles), seed)
+    fitted: Fitted | FittedToOthers
+    if "imu" in roles:  # every IMU in turn is an unseen device
+        imus = tuple(sorted(roles.fold.unique().tolist()))
+        fitted = FittedToOthers(recordings, roles)
+        device = describe_unseen(recordings, allan, known_places(roles))
+    else:
+        imus, seed = (TEST_IMU,), evaluation.bootstrap_seed
+        fitted = Fitted(recordings, roles, virtual)
+        device = describe_device(recordings, bias, allan, known_recordings(roles), seed)
     benches: dict[tuple[float, int], Bench] = {}
     for cell, run in waiting(cells, runs, judged_with, recordings.attrs["sensor"]):
         key = cell["window_s"], cell["fold"]
         if key not in benches:
             numbers = test_recordings(roles, cell["fold"])
-            benches[key] = Bench(recordings, device, numbers, cell["window_s"], evaluation)
+            benches[key] = Bench(recordings, device, numbers, key[0], evaluation, imus)
         yield _judge(run, benches[key], fitted, judged_with)
 
 
-def _judge(run: StoredRun, bench: Bench, fitted: Fitted, judged_with: str) -> EvaluatedRun:
+def _judge(
+    run: StoredRun, bench: Bench, fitted: Fitted | FittedToOthers, judged_with: str
+) -> EvaluatedRun:
     artifacts = {}
     name = run.params["estimator"]
     real_imus, virtual_imus = (
         int(run.params[gyros]) // len(AXES) for gyros in ("real_gyros", "virtual_gyros")
     )
     if name not in NETWORKS:
-        judged: dict[str, Estimator] = {LAST: fitted.estimator(name, real_imus, virtual_imus)}
+        judged: dict[str, Estimator | Mapping[int, Estimator]]
+        judged = {LAST: fitted.estimator(name, real_imus, virtual_imus)}
     else:
         stored = run.load(WEIGHTS)
         judged = {which: NetworkEstimator(stored, which) for which in (LAST, BEST) if stored[which]}
@@ -116,8 +127,11 @@ def _judge(run: StoredRun, bench: Bench, fitted: Fitted, judged_with: str) -> Ev
     artifacts[ERRORS] = pd.concat(tables, ignore_index=True)
     tags = {EVALUATED_WITH: judged_with, "ceiling": bench.ceiling_basis}
     tags |= off_the_curve(metrics)
-    tags["recommended"] = str(judged[LAST].recommended)
-    if judged[LAST].uses_prior:
+    marked = judged[LAST]
+    if isinstance(marked, Mapping):
+        marked = next(iter(marked.values()))
+    tags["recommended"] = str(marked.recommended)
+    if marked.uses_prior:
         tags["uses_prior"] = ORIENTATION_NOTE
     logger.info(
         "%s %s: RMSE %.7f deg/s in the first window, %.6f in all (last epoch)",

@@ -7,13 +7,14 @@ from gyro_pipeline.pipelines.evaluation.nodes import evaluate
 from gyro_pipeline.studies import LEAKAGE
 
 
-def create_pipeline(study: str, sensor: str, virtual: bool) -> Pipeline:
+def create_pipeline(study: str, sensor: str, virtual: bool, roles: str = "roles") -> Pipeline:
     """Evaluation of one study's runs on one sensor.
 
     Args:
         study: Its name.
         sensor: Its name.
         virtual: Whether virtual gyroscopes take part.
+        roles: ``roles``, or ``devices`` where every IMU in turn is an unseen one.
     """
     drawn = {"virtual": f"{sensor}.virtual_gyros.recordings"} if virtual else {}
     return Pipeline(
@@ -26,7 +27,7 @@ def create_pipeline(study: str, sensor: str, virtual: bool) -> Pipeline:
                     "recordings": f"{sensor}.raw_logs.recordings",
                     "bias": f"{sensor}.ground_truth.bias",
                     "allan": f"{sensor}.ground_truth.allan",
-                    "roles": f"{sensor}.windowed_splits.roles",
+                    "roles": f"{sensor}.windowed_splits.{roles}",
                     "evaluation": "params:evaluation",
                 }
                 | drawn,

@@ -35,10 +35,40 @@ _ALIKE = "To be read like the figure of SparkFun with 3 real gyroscopes."
 _ESTIMATORS = (
     "Left: error over all windows. Right: the same relative to the running mean. Relatives share a "
     "colour, filled markers are the recommended estimators. The dashed line is the ceiling, on "
-    "measured data an estimate for white noise. Lower is better. Estimators in black need no "
-    f"training recordings; each of the others {ORIENTATION_NOTE}."
+    "measured data an estimate. Lower is better. Estimators in black need no training recordings; "
+    f"each of the others {ORIENTATION_NOTE}."
+)
+_RATIOS = (
+    "RMSE over all windows against the mean of the recording, relative to that of the running mean "
+    "over the same window, with 95 % intervals. A gain is one whose interval lies below 1. "
+    "Differences, coverage and the other truths are in `tables/{study}_comparison.csv`."
+)
+_UNSEEN = (
+    "Every device in turn is one that the estimators have never seen: they learn from the others, "
+    "and all that those tell of its bias is the spread from unit to unit. Intervals are over "
+    "devices; over two to five of them they are rough."
 )
 _TOLERANCE = "The band is the tolerance around the mean of the recording, which counts as truth."
+
+_NAMES = {"sparkfun": "SparkFun", "dot": "DOT", "ng": "NG", "memsense": "Memsense"}
+
+
+def _compared(kind: str) -> dict[str, Caption]:
+    """Of the studies that compare estimators, for each sensor: tables or figures."""
+    what = {"tables": "error relative to the running mean", "figures": "error against the window"}
+    captions = {}
+    for study, whose, more in (
+        ("estimators", "estimators", ""),
+        ("unseen_devices", "estimators on unseen devices", f" {_UNSEEN}"),
+    ):
+        text = _ESTIMATORS
+        if kind == "tables":
+            text = _RATIOS.format(study=study)
+        for sensor, name in _NAMES.items():
+            title = f"{name}: {whose}, {what[kind]}"
+            captions[f"{kind}/{study}_{sensor}"] = Caption(title, text + more, study)
+    return captions
+
 
 CAPTIONS = {
     "tables/augmentation_three_gyroscopes": Caption(
@@ -53,14 +83,7 @@ CAPTIONS = {
         "below the row of the same sensor.",
         "real2real",
     ),
-    "tables/estimators_comparison": Caption(
-        "Estimators without a network",
-        "RMSE over all windows, against the mean of the recording. Differences are of RMSEs on the "
-        "same windows, with 95 % intervals over recordings; negative ones are in favour of the "
-        "row's estimator. The last columns say how often the truth lies within one and two of the "
-        f"standard deviations that it states: 68 and 95 % are right. One that {ORIENTATION_NOTE}.",
-        "estimators",
-    ),
+    **_compared("tables"),
     "tables/sensor_specifications": Caption(
         "Sensors: datasheets and recordings",
         "Datasheet values beside those found in the recordings: the root mean square over "
@@ -88,14 +111,7 @@ CAPTIONS = {
         "are what the networks save, with 95 % intervals.",
         "real2real",
     ),
-    "figures/estimators_sparkfun": Caption(
-        "SparkFun: estimators against the window length",
-        _ESTIMATORS,
-        "estimators",
-    ),
-    "figures/estimators_dot": Caption("DOT: estimators", _ESTIMATORS, "estimators"),
-    "figures/estimators_ng": Caption("NG: estimators", _ESTIMATORS, "estimators"),
-    "figures/estimators_memsense": Caption("Memsense: estimators", _ESTIMATORS, "estimators"),
+    **_compared("figures"),
     "figures/input_channels_input_channels": Caption(
         "Method 1: more gyroscopes as input channels",
         f"{_ON_CURVE} Paper, section IV-C.",

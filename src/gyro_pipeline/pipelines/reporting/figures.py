@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 from numpy.typing import ArrayLike, NDArray
 
-from gyro_pipeline.conventions import ALL, FIRST, MDPS, PAPER, Missing
+from gyro_pipeline.conventions import ALL, FIRST, LEAVE_ONE_DEVICE_OUT, MDPS, PAPER, Missing
 from gyro_pipeline.parameters import Published, PublishedResult
 from gyro_pipeline.physics.ceiling import best_saving, ceiling_rmse, running_mean_rmse
 from gyro_pipeline.pipelines.reporting.style import (
@@ -133,26 +133,6 @@ def saving_against_turn_on_spread(
     return figure
 
 
-def sparkfun(results: pd.DataFrame, elsewhere: pd.DataFrame) -> Figure | Missing:
-    """SparkFun: all estimators against the window length."""
-    return _estimators(results, elsewhere, "sparkfun")
-
-
-def dot(results: pd.DataFrame, elsewhere: pd.DataFrame) -> Figure | Missing:
-    """Movella DOT: all estimators against the window length."""
-    return _estimators(results, elsewhere, "dot")
-
-
-def ng(results: pd.DataFrame, elsewhere: pd.DataFrame) -> Figure | Missing:
-    """NG: all estimators against the window length."""
-    return _estimators(results, elsewhere, "ng")
-
-
-def memsense(results: pd.DataFrame, elsewhere: pd.DataFrame) -> Figure | Missing:
-    """Memsense: all estimators against the window length."""
-    return _estimators(results, elsewhere, "memsense")
-
-
 def equal_spread(row: pd.Series, bound: str = "") -> float:
     """The turn-on spread tau that, on all axes, gives the ceiling of a result.
 
@@ -184,8 +164,17 @@ def _best_saving_pct(row: pd.Series, spreads_dps: NDArray[np.float64]) -> NDArra
     return 100 * best_saving(rho, row.window_s / row.recording_s)
 
 
-def _estimators(results: pd.DataFrame, elsewhere: pd.DataFrame, sensor: str) -> Figure | Missing:
-    """RMSE against the window length; a row of panels for each source of the recordings."""
+def estimators(results: pd.DataFrame, elsewhere: pd.DataFrame, sensor: str) -> Figure | Missing:
+    """RMSE of all estimators against the window length.
+
+    Args:
+        results: From ``pool_results``.
+        elsewhere: From ``pool_measured_elsewhere``.
+        sensor: Whose.
+
+    Returns:
+        A row of panels for each source of the recordings.
+    """
     own = _of(results, sensor)
     if lacking := tuple(own.missing.dropna()):
         return Missing(lacking)
@@ -196,7 +185,9 @@ def _estimators(results: pd.DataFrame, elsewhere: pd.DataFrame, sensor: str) -> 
         for (left, right), rows in zip(axes, sources, strict=True):
             _draw_estimators(left, right, rows)
         share_legend(figure, axes.ravel(), columns=4)
-        figure.suptitle(f"{sensor}: error against window length, all windows")
+        unseen = own.protocol.iloc[0] == LEAVE_ONE_DEVICE_OUT
+        whose = f"{sensor}, unseen devices" if unseen else sensor
+        figure.suptitle(f"{whose}: error against window length, all windows")
     return figure
 
 

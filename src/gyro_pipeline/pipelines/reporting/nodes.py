@@ -76,7 +76,7 @@ def pool_results(  # noqa: PLR0913, PLR0917 - a node's arguments are its dataset
         )
     curves = [pd.DataFrame(columns=_CURVES), *map(pooled_curve, means.values())]
     return (
-        pd.DataFrame(results),
+        pd.DataFrame(results).assign(protocol=study.protocol),
         pd.concat(curves[1:] or curves),
         pd.DataFrame(unused, columns=_UNUSED),
     )
@@ -118,7 +118,8 @@ def pool_measured_elsewhere(  # noqa: PLR0913, PLR0917 - a node's arguments are 
             trained = [cell for cell in row if find_runs([cell], runs, settings)]
             rows += [trained] if find_runs(trained, runs, settings) else []
         results += [row for row in pool(rows, runs, settings, evaluation)[0] if row["run_ids"]]
-    return pd.DataFrame(results, columns=None if results else [*ROW, "missing", "run_ids"])
+    columns = None if results else [*ROW, "missing", "run_ids"]
+    return pd.DataFrame(results, columns=columns).assign(protocol=study.protocol)
 
 
 def or_missing(make: Callable[..., Any]) -> Callable[..., Any]:

@@ -1,8 +1,10 @@
 """Wiring of the reporting stage."""
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import product
 from typing import Any
 
+import pandas as pd
 from kedro.pipeline import Node, Pipeline
 
 from gyro_pipeline.pipelines.reporting import figures, leakage, signals, tables
@@ -27,6 +29,7 @@ TABLES: _Makers = {
     },
     "real2real": {tables.generalization: ["results", "measured_elsewhere", "published"]},
     "estimators": {tables.comparison: ["results", "measured_elsewhere"]},
+    "unseen_devices": {tables.comparison: ["results", "measured_elsewhere"]},
 }
 FIGURES: _Makers = {
     "augmentation": {
@@ -41,12 +44,13 @@ FIGURES: _Makers = {
         figures.saving_against_turn_on_spread: ["results", "measured_elsewhere", "published"],
     },
     "input_channels": {figures.input_channels: ["results", "curves"]},
-    "estimators": {
-        figure: ["results", "measured_elsewhere"]
-        for figure in (figures.sparkfun, figures.dot, figures.ng, figures.memsense)
-    },
 }
 """The tables and figures that each study carries, and what they are made from."""
+
+OF_EACH_SENSOR = {"tables": tables.ratios, "figures": figures.estimators}
+"""What studies that compare estimators have for each of their sensors, named after it."""
+
+COMPARED = ("estimators", "unseen_devices")
 
 _SHOWN = "sparkfun"
 """Whose signals the figures of signals show."""
@@ -156,7 +160,22 @@ def _study_nodes(study: str, sensors: Sequence[str]) -> list[Node]:
         for function, wanted in makers.get(study, {}).items():
             inputs = ["params:published" if w == "published" else f"{stage}.{w}" for w in wanted]
             nodes.append(_made(function, inputs, f"{stage}.{kind}.{function.__name__}", study))
+    if study in COMPARED:
+        inputs = [pooled[0], elsewhere]
+        for (kind, make), sensor in product(OF_EACH_SENSOR.items(), sensors):
+            function = _of_sensor(make, sensor)
+            nodes.append(_made(function, inputs, f"{stage}.{kind}.{sensor}", f"{kind}_{study}"))
     return nodes
+
+
+def _of_sensor(make: _Function, sensor: str) -> _Function:
+    """A function of a sensor's results as one that knows the sensor, and has its name."""
+
+    def made(results: pd.DataFrame, elsewhere: pd.DataFrame) -> Any:
+        return make(results, elsewhere, sensor)
+
+    made.__name__, made.__doc__ = sensor, make.__doc__
+    return made
 
 
 def _recording_nodes(sensors: Sequence[str], virtual: Sequence[str]) -> list[Node]:
@@ -199,11 +218,11 @@ def _made(
 ) -> Node:
     """A table or figure, and what it lacks."""
     name = function.__name__
-    gap = output.rpartition(".")[0].replace(".tables", ".gaps").replace(".figures", ".gaps")
+    place, kind, _ = output.rsplit(".", maxsplit=2)
     return Node(
         or_missing(function),
         inputs,
-        [output, f"{gap}.{name}"],
+        [output, f"{place}.gaps.{name}" + ("_figure" if kind == "figures" else "")],
         name=f"{name}_{study}" if study else name,
         namespace="reporting",
     )

@@ -18,6 +18,8 @@ Reasons = tuple[str, ...]
 Part = pd.DataFrame | Path | Missing | list[StoredRun] | Reasons
 _BASE = ("base", "local")
 _RESULTS = "_results"
+_LONG = "_comparison"
+"""Ends the names of tables that are too long for a page; what it shows is drawn from them."""
 _FEW = 6
 """So many missing commands are named where the table or figure would be."""
 
@@ -54,7 +56,8 @@ def write_report(
     shown = folder | fresh
     env = _env(used)
     whole = [place for place in shown if place.startswith("tables/") and place.endswith(_RESULTS)]
-    further = [place for place in folder if place not in CAPTIONS and place not in whole]
+    known = {*CAPTIONS, *whole}
+    further = [place for place in folder if place not in known and not place.endswith(_LONG)]
     narrowed = ", ".join(f"{k}={v}" for k, v in only.model_dump(exclude_none=True).items())
 
     def items(places: Iterable[str]) -> list[dict[str, Any]]:
@@ -202,7 +205,7 @@ def _code(runs: Sequence[StoredRun]) -> str:
 def _item(place: str, shown: Mapping[str, Part], env: str) -> dict[str, Any]:
     """A table or figure with its title, caption and the commands that make it."""
     caption = CAPTIONS.get(place) or FURTHER.get(place) or _plain_caption(place)
-    part, gap = shown.get(place), shown.get(f"gaps/{place.split('/', maxsplit=1)[1]}")
+    part, gap = shown.get(place), shown.get(_gap(place))
     command = f"kedro run --pipeline={caption.pipeline}" if caption.pipeline else ""
     missing = gap if isinstance(gap, tuple) and 0 < len(gap) <= _FEW else (command,)
     return {
@@ -215,6 +218,12 @@ def _item(place: str, shown: Mapping[str, Part], env: str) -> dict[str, Any]:
         "table": _narrow(part) if isinstance(part, pd.DataFrame) else None,
         "figure": part if isinstance(part, Path) else None,
     }
+
+
+def _gap(place: str) -> str:
+    """Where it is kept what a table or figure lacks."""
+    kind, name = place.split("/", maxsplit=1)
+    return f"gaps/{name}" + ("_figure" if kind == "figures" else "")
 
 
 def _narrow(table: pd.DataFrame) -> pd.DataFrame:

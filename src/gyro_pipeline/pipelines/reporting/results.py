@@ -1,8 +1,8 @@
 """From tracked runs to one row per result: folds and seeds pooled, with intervals."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from itertools import groupby
 from typing import Any
 
@@ -14,6 +14,9 @@ from gyro_pipeline.estimators import DEFAULT
 from gyro_pipeline.parameters import Evaluation
 from gyro_pipeline.protocol.scores import (
     Estimate,
+    ResampledCurve,
+    SquaredErrors,
+    clusters,
     curve_errors,
     paired_difference,
     resampled_weights,
@@ -54,7 +57,7 @@ def pool(
         all there; and a run of the running mean by sensor.
     """
     results: list[dict[str, Any]] = []
-    means: dict[tuple[str, float], StoredRun] = {}
+    means: dict[tuple[str, float], RunningMeans] = {}
     defaults: dict[tuple[str, float], pd.DataFrame] = {}
     found_rows = [(cells, find_runs(cells, runs, settings)) for cells in rows]
     for cells, found in found_rows:
@@ -69,14 +72,14 @@ def pool(
             results.append(row | {"missing": command_for(cells)})
             continue
         if cell.estimator == MEAN:
-            means[key] = found[0]
+            means[key] = RunningMeans(found[0], evaluation)
             row |= mean_row(found[0])
             if key in defaults:
                 row |= differences(found, {DEFAULT: defaults[key]}, evaluation)
         else:
-            row |= network_row(found, means[key], cell.window_s, evaluation)
+            row |= network_row(found, means[key], cell.window_s)
             if key in defaults:
-                references = {MEAN: _errors([means[key]]), DEFAULT: defaults[key]}
+                references = {MEAN: means[key].errors, DEFAULT: defaults[key]}
                 row |= differences(found, references, evaluation)
         row |= {name: found[0].metrics.get(name) for name in COVERAGES}
         row["simulated"] = found[0].tags["simulated"] == "1"
@@ -85,10 +88,10 @@ def pool(
         results.append(row)
         if key in defaults and cell.estimator == CNN:
             best = [best_epoch(run) for run in found]
-            scores = network_row(best, means[key], cell.window_s, evaluation)
+            scores = network_row(best, means[key], cell.window_s)
             less = differences(best, references, evaluation)
             results.append(row | scores | less | {"estimator": CNN_BEST})
-    return results, {sensor: mean for (sensor, _), mean in reversed(means.items())}
+    return results, {sensor: mean.run for (sensor, _), mean in reversed(means.items())}
 
 
 def best_epoch(run: StoredRun) -> StoredRun:
@@ -180,16 +183,58 @@ def mean_row(mean: StoredRun) -> dict[str, Any]:
     return row
 
 
-def network_row(
-    runs: Sequence[StoredRun], mean: StoredRun, window_s: float, evaluation: Evaluation
-) -> dict[str, Any]:
+@dataclass(frozen=True, eq=False)
+class RunningMeans:
+    """The running mean of one window, which all rows of that window are held against.
+
+    Attributes:
+        run: Its run.
+        evaluation: Resamples and seed of the intervals.
+    """
+
+    run: StoredRun
+    evaluation: Evaluation
+
+    @cached_property
+    def errors(self) -> pd.DataFrame:
+        """Its errors."""
+        return _errors([self.run])
+
+    @cached_property
+    def weights(self) -> np.ndarray:
+        """Of recordings, or devices, in each resample."""
+        return _resampled(self.errors, self.evaluation)
+
+    @cached_property
+    def squares(self) -> dict[str, SquaredErrors]:
+        """Squared errors for all and for first windows."""
+        return {windows: squared_errors(self.errors, PAPER, windows) for windows in (ALL, FIRST)}
+
+    @cached_property
+    def curves(self) -> dict[str, ResampledCurve]:
+        """Its RMSE against its length, likewise."""
+        curve = self.run.load(CURVE)
+        curves = {windows: curve_errors(curve, PAPER, windows) for windows in (ALL, FIRST)}
+        return {windows: curve.of(self.weights) for windows, curve in curves.items()}
+
+    def scores(self, errors: pd.DataFrame, windows: str, window_s: float) -> dict[str, Estimate]:
+        """Figures of merit of others' errors in the same windows."""
+        own, reference = squared_errors(errors, PAPER, windows), self.squares[windows]
+        return score(own, reference, self.curves[windows], window_s, self.weights)
+
+
+def _resampled(errors: pd.DataFrame, evaluation: Evaluation) -> np.ndarray:
+    drawn = evaluation.resamples, evaluation.bootstrap_seed
+    return resampled_weights(clusters(errors).nunique(), *drawn)
+
+
+def network_row(runs: Sequence[StoredRun], mean: RunningMeans, window_s: float) -> dict[str, Any]:
     """One row of a table: errors of all folds and seeds pooled, networks at the last epoch.
 
     Args:
         runs: All seeds and folds.
         mean: The running mean on the same recordings.
         window_s: T0, seconds.
-        evaluation: Resamples and seed of the intervals.
 
     Returns:
         Figures of merit for all and for first windows, each with its interval over recordings of
@@ -197,26 +242,13 @@ def network_row(
         deviation over the seeds' own figures (None for one seed).
     """
     errors = {seed: _errors(group) for seed, group in _by_seed(runs)}
-    mean_errors, curve = mean.load(ERRORS), mean.load(CURVE)
-    resampled = resampled_weights(
-        mean_errors.recording.nunique(), evaluation.resamples, evaluation.bootstrap_seed
-    )
-    row: dict[str, Any] = {"seeds": len(errors), "recordings": mean_errors.recording.nunique()}
+    tested = mean.errors.get("imu", pd.Series(0, mean.errors.index))
+    places = pd.DataFrame({"imu": tested, "recording": mean.errors.recording}).drop_duplicates()
+    row: dict[str, Any] = {"seeds": len(errors), "recordings": len(places)}
     for windows in (ALL, FIRST):
-
-        def scores(
-            table: pd.DataFrame, weights: np.ndarray, windows: str = windows
-        ) -> dict[str, Estimate]:
-            return score(
-                squared_errors(table, PAPER, windows),
-                squared_errors(mean_errors, PAPER, windows),
-                curve_errors(curve, PAPER, windows).of(weights),
-                window_s,
-                weights,
-            )
-
-        pooled = scores(pd.concat(errors.values()), resampled)
-        single = [scores(table, resampled[:1]) for table in errors.values()]
+        pooled = mean.scores(pd.concat(errors.values()), windows, window_s)
+        of_seeds = errors.values() if len(errors) > 1 else ()
+        single = [mean.scores(table, windows, window_s) for table in of_seeds]
         for base, estimate in pooled.items():
             row[metric_name(base, windows)] = estimate.value
             row[metric_name(base, windows, bound="lo")] = estimate.lo
@@ -226,7 +258,7 @@ def network_row(
             row[metric_name(base, windows) + "_seed_sd"] = (
                 np.std(values, ddof=1) if several else None
             )
-    limits = mean_row(mean)
+    limits = mean_row(mean.run)
     return row | {k: v for k, v in limits.items() if k.startswith(("ceiling", "recording_s"))}
 
 
@@ -246,9 +278,7 @@ def differences(
         may leave none to take the root of. Each with its interval, ``_lo`` and ``_hi``.
     """
     table = _errors(runs)
-    weights = resampled_weights(
-        table.recording.nunique(), evaluation.resamples, evaluation.bootstrap_seed
-    )
+    weights = _resampled(table, evaluation)
     row: dict[str, Any] = {}
     for truth in table.truth.unique():
         own = squared_errors(table, truth, ALL)

@@ -12,6 +12,7 @@ from gyro_pipeline.conventions import (
     ALL,
     DISJOINT,
     FIRST,
+    LEAVE_ONE_DEVICE_OUT,
     MDPS,
     PAPER,
     TEST,
@@ -35,6 +36,7 @@ logger = logging.getLogger(__name__)
 
 _HOUR_S = 3600
 _AT_DATASHEET = "At the datasheet's rate h"
+_MEAN_MDPS = "running mean, RMSE in mdps"
 _KEYS = ["sensor", "real_gyros", "virtual_gyros", "window_s"]
 
 
@@ -63,7 +65,7 @@ def results_table(results: pd.DataFrame, elsewhere: pd.DataFrame) -> pd.DataFram
     table["ceiling mdps"] = (made.ceiling_rmse_dps / MDPS).round(3)
     table.insert(1, "source", [source_of(row) for _, row in made.iterrows()])
     logger.info("results\n%s", table.to_string(index=False, na_rep="–"))
-    return table.assign(split=made.folds.map(_split), runs=made.run_ids.map(_short))
+    return table.assign(split=made.apply(_split, axis=1), runs=made.run_ids.map(_short))
 
 
 def comparison(results: pd.DataFrame, elsewhere: pd.DataFrame) -> pd.DataFrame | Missing:
@@ -114,9 +116,61 @@ def _compared(row: pd.Series, group: pd.DataFrame) -> dict[str, Any]:
         "Within ±1σ %": _covered(row.coverage_1sigma_all),
         "Within ±2σ %": _covered(row.coverage_2sigma_all),
         "Recordings": int(group.recordings.max()),
-        "Split": _split(row.folds),
+        "Split": _split(row),
         "Runs": _short(row.run_ids),
     }
+
+
+def ratios(results: pd.DataFrame, elsewhere: pd.DataFrame, sensor: str) -> pd.DataFrame | Missing:
+    """Errors of a sensor's estimators relative to the running mean, by window length.
+
+    Over all windows, against the mean of the recording, with 95 % intervals over recordings.
+
+    Args:
+        results: From ``pool_results``.
+        elsewhere: From ``pool_measured_elsewhere``.
+        sensor: Whose.
+
+    Returns:
+        A row per source and estimator, and one for its ceiling; a column per window.
+    """
+    own = results[results.sensor == sensor]
+    if lacking := tuple(own.missing.dropna()):
+        return Missing(lacking)
+    others = elsewhere[elsewhere.sensor == sensor]
+    sources = [own, *(rows for _, rows in others.groupby("source"))]
+    return pd.concat([_ratios(rows) for rows in sources], ignore_index=True)
+
+
+def _ratios(rows: pd.DataFrame) -> pd.DataFrame:
+    """Of one source."""
+    names = sorted(rows.estimator.unique(), key=[*ESTIMATORS, *rows.estimator].index)
+    table: dict[str, dict[str, str]] = {}
+    for window_s, group in rows.sort_values("window_s").groupby("window_s"):
+        named = {row.estimator: row for _, row in group.iterrows()}
+        mean = named[MEAN]
+        cells = {_MEAN_MDPS: f"{mean.test_rmse_dps_all / MDPS:.3f}"}
+        for name in (name for name in names if name in named and name != MEAN):
+            cells[_marked(name)] = _ratio(named[name], "accuracy_gain_pct_all")
+        cells["ceiling"] = _ratio(mean, "ceiling_accuracy_gain_pct_all")
+        table[f"{window_s:g} s"] = cells
+    made = pd.DataFrame(table).rename_axis("Estimator").reset_index()
+    made.insert(1, "Source", source_of(rows.iloc[0]))
+    return made.assign(Split=_split(rows.iloc[0]))
+
+
+def _marked(name: str) -> str:
+    """An estimator's name, and whether it is a recommended one."""
+    known = name in ESTIMATORS and ESTIMATORS[name]().recommended
+    return name.replace("_", " ") + (" (recommended)" if known else "")
+
+
+def _ratio(row: pd.Series, gain: str) -> str:
+    """One less an accuracy gain, whose interval turns round; 1 is the running mean."""
+    value, hi, lo = (1 - row.get(f"{gain}{end}", np.nan) / 100 for end in ("", "_lo", "_hi"))
+    if pd.isna(value):
+        return "–"
+    return f"{value:.3f}" if pd.isna(lo) else f"{value:.3f} [{lo:.3f}, {hi:.3f}]"
 
 
 def _covered(fraction: float | None) -> float | None:
@@ -234,7 +288,7 @@ def _result_row(
         "Approach": published.approach,
         "Sensor": row.sensor,
         "Source": source_of(row),
-        "Split": _split(row.folds),
+        "Split": _split(row),
         "Gyroscopes": ours,
         "Published S/A %": claim if theirs == ours else f"{claim} ({theirs})",
         "S %": _interval(row, "time_saving_pct", ALL),
@@ -259,8 +313,10 @@ def _gyroscopes(row: Any) -> str:
     return f"{row.real_gyros:.0f} real{virtual}"
 
 
-def _split(folds: float) -> str:
-    return "hold-out" if folds == 1 else f"k-fold, {folds:.0f} folds"
+def _split(row: pd.Series) -> str:
+    if row.get("protocol") == LEAVE_ONE_DEVICE_OUT:
+        return f"leave-one-device-out, {row.folds:.0f} devices"
+    return "hold-out" if row.folds == 1 else f"k-fold, {row.folds:.0f} folds"
 
 
 def _interval(row: pd.Series | None, base: str, windows: str) -> str:

@@ -27,7 +27,7 @@ from gyro_pipeline.learning.examples import Device, with_shuffled_labels
 from gyro_pipeline.learning.jobs import TrainingJob
 from gyro_pipeline.learning.trainings import run_trainings
 from gyro_pipeline.parameters import Execution, Only, Splits, Study, Training, VirtualGyros
-from gyro_pipeline.protocol.splits import check_roles, refuse_two_roles, with_role
+from gyro_pipeline.protocol.splits import check_devices, check_roles, refuse_two_roles, with_role
 from gyro_pipeline.protocol.windows import window_size
 from gyro_pipeline.studies import (
     CNN,
@@ -72,7 +72,8 @@ def plan(
     Raises:
         InputError: If the recordings cannot give what the grid asks for.
     """
-    check_roles(roles)
+    check = check_devices if study.unseen_devices else check_roles
+    check(roles)
     sensor, source = recordings.attrs["sensor"], recordings.attrs["source"]
     folds = sorted(roles.fold.unique().tolist())
     cells = study_cells(study, sensor, source, windows_s, seeds, only)

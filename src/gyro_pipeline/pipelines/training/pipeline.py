@@ -7,18 +7,19 @@ from gyro_pipeline.pipelines.training.nodes import plan, train
 from gyro_pipeline.studies import LEAKAGE
 
 
-def create_pipeline(study: str, sensor: str, virtual: bool) -> Pipeline:
+def create_pipeline(study: str, sensor: str, virtual: bool, roles: str = "roles") -> Pipeline:
     """Trainings of one study on one sensor.
 
     Args:
         study: Its name.
         sensor: Its name.
         virtual: Whether virtual gyroscopes take part.
+        roles: ``roles``, or ``devices`` where every IMU in turn is an unseen one.
     """
     stage = f"{study}.{sensor}.training"
     data = {
         "recordings": f"{sensor}.raw_logs.recordings",
-        "roles": f"{sensor}.windowed_splits.roles",
+        "roles": f"{sensor}.windowed_splits.{roles}",
         "training": "params:training",
     }
     if virtual:

@@ -6,7 +6,7 @@ import xarray as xr
 
 from gyro_pipeline.fingerprints import data_hash
 from gyro_pipeline.parameters import Splits
-from gyro_pipeline.protocol.splits import assign_roles, refuse_copies
+from gyro_pipeline.protocol.splits import assign_roles, leave_one_device_out, refuse_copies
 
 
 def split_recordings(recordings: xr.Dataset, splits: Splits) -> pd.DataFrame:
@@ -23,12 +23,39 @@ def split_recordings(recordings: xr.Dataset, splits: Splits) -> pd.DataFrame:
         InputError: If no recording is left for a role, or one is there twice, with two roles.
     """
     numbers = recordings.recording.to_numpy().tolist()
-    given = None
-    if "given_split" in recordings:
-        given = dict(zip(numbers, recordings.given_split.to_numpy().tolist(), strict=True))
-    roles = assign_roles(numbers, splits, given)
+    roles = assign_roles(numbers, splits, _given(recordings))
     refuse_copies(_contents(recordings), roles)
     return roles
+
+
+def split_devices(recordings: xr.Dataset, splits: Splits) -> pd.DataFrame:
+    """Roles of the recordings where every IMU in turn is an unseen device.
+
+    Args:
+        recordings: With ``given_split`` where the source came split.
+        splits: Counts.
+
+    Returns:
+        Columns ``fold`` (the unseen IMU), ``imu``, ``recording``, ``role``.
+
+    Raises:
+        InputError: Fewer than two IMUs, or a recording that is there twice, with two roles.
+    """
+    contents = _contents(recordings)
+    present: dict[int, list[int]] = {}
+    for imu, number in sorted(contents):
+        present.setdefault(imu, []).append(number)
+    roles = leave_one_device_out(present, splits, _given(recordings))
+    refuse_copies(contents, roles)
+    return roles
+
+
+def _given(recordings: xr.Dataset) -> dict[int, str] | None:
+    """The role of each recording, where the source came split."""
+    if "given_split" not in recordings:
+        return None
+    numbers = recordings.recording.to_numpy().tolist()
+    return dict(zip(numbers, recordings.given_split.to_numpy().tolist(), strict=True))
 
 
 def _contents(recordings: xr.Dataset) -> dict[tuple[int, int], str]:

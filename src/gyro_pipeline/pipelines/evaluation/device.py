@@ -1,0 +1,181 @@
+"""What is known of a device that is tested: its noise, and how its bias scatters."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from gyro_pipeline.conventions import TEST_IMU
+from gyro_pipeline.physics.allan import SHORTEST_FIT_SAMPLES, NoiseFigures, fit_noise
+from gyro_pipeline.physics.ceiling import turn_on_spread
+from gyro_pipeline.physics.recording_model import RecordingModel
+from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, fit_recording_model
+
+UNIT_SPREAD = 1.0
+"""Standard deviation of the bias from unit to unit, deg/s: 0.7 to 1.9 on the public DOT files."""
+
+_CEILING_RESAMPLES = 400
+
+
+@dataclass(frozen=True)
+class TestDevice:
+    """What is known of the test IMU, per axis: drawn if simulated, else from its recordings.
+
+    Of several unseen devices, the axes of one after the other.
+
+    Attributes:
+        noise: N, shape (resamples, axes), deg/s sqrt(s); the first row is the estimate itself.
+        spread: Turn-on spread tau, same shape, deg/s; of an unseen device, that of units.
+        unit_bias: Drawn prior mean, shape (axes,), deg/s; None on measured data.
+        models: Of each axis, where its noise is not white or its bias warms up; drawn if simulated,
+            else fitted.
+    """
+
+    noise: np.ndarray
+    spread: np.ndarray
+    unit_bias: np.ndarray | None
+    models: tuple[RecordingModel, ...] | None = None
+
+    @property
+    def figures(self) -> tuple[NoiseFigures, ...]:
+        """N, B and K of each axis."""
+        if self.models is not None:
+            return tuple(model.noise for model in self.models)
+        return tuple(NoiseFigures(float(white), 0.0, 0.0) for white in self.noise[0])
+
+
+def describe_unseen(
+    recordings: xr.Dataset, allan: xr.Dataset, places: Sequence[tuple[int, int]]
+) -> TestDevice:
+    """Several devices, as one knows them who has never seen them.
+
+    All that is known of their bias is the spread of units, for which that of the public DOT files
+    is taken. It is so large that the ceiling is the running mean if the noise is white. Noise is
+    that of all devices together, of which single ones have few recordings.
+
+    Args:
+        recordings: With the drawn values on simulated data.
+        allan: Allan variances.
+        places: IMU and number of the recordings to learn the noise from.
+
+    Returns:
+        The axes of one IMU after those of another, in order. There is no interval.
+    """
+    imus = sorted({imu for imu, _ in places})
+    if recordings.attrs["simulated"]:
+        noise = recordings.true_noise.to_numpy()
+        drawn = [_drawn_models(recordings.sel(imu=imu)) or () for imu in imus]
+        models = tuple(_with_prior(model, 0.0, UNIT_SPREAD) for own in drawn for model in own)
+    else:
+        variances = [allan.allan_variance.sel(imu=imu, recording=number) for imu, number in places]
+        mean = np.mean([one.transpose("axis", "time_s").to_numpy() for one in variances], axis=0)
+        noise = np.array([figures.white for figures in _allan_fits(recordings, allan, mean)])
+        spread = np.full(noise.shape, UNIT_SPREAD)
+        models = (_fitted_models(recordings, places, spread) or ()) * len(imus)
+    axes = np.tile(noise, len(imus))[None]
+    bias = np.zeros(axes.size) if recordings.attrs["simulated"] else None
+    return TestDevice(axes, np.full(axes.shape, UNIT_SPREAD), bias, models or None)
+
+
+def _with_prior(model: RecordingModel, mean: float, spread: float) -> RecordingModel:
+    """A model with another prior of the bias, which is independent of the warm-up."""
+    means, covariance = model.mean.copy(), np.diag(np.diag(model.covariance))
+    means[0], covariance[0, 0] = mean, spread**2
+    return replace(model, mean=means, covariance=covariance)
+
+
+def describe_device(  # noqa: PLR0913, PLR0917 - what a device is described by
+    recordings: xr.Dataset,
+    bias: pd.DataFrame,
+    allan: xr.Dataset,
+    numbers: Sequence[int],
+    seed: int,
+    imu: int = TEST_IMU,
+) -> TestDevice:
+    """Noise and turn-on spread of an IMU, with a bootstrap over the recordings used.
+
+    Args:
+        recordings: With the drawn values on simulated data.
+        bias: Ground truth.
+        allan: Allan variances.
+        numbers: Recordings to learn from; none of a hold-out's test recordings.
+        seed: Of the bootstrap.
+        imu: Which.
+    """
+    if recordings.attrs["simulated"]:
+        return TestDevice(
+            noise=recordings.true_noise.to_numpy()[None],
+            spread=recordings.true_turn_on_spread.to_numpy()[None],
+            unit_bias=recordings.true_unit_bias.sel(imu=imu).to_numpy(),
+            models=_drawn_models(recordings.sel(imu=imu)),
+        )
+    duration_s = recordings.sizes["sample"] / recordings.attrs["rate_hz"]
+    means = bias[bias.imu == imu].pivot(index="recording", columns="axis", values="bias_dps")
+    variances = allan.allan_variance.sel(imu=imu, recording=list(numbers))
+    variances = variances.transpose("recording", "axis", "time_s").to_numpy()
+    generator = np.random.default_rng(seed)
+    draws = generator.integers(len(numbers), size=(_CEILING_RESAMPLES, len(numbers)))
+    noise, spread = [], []
+    for chosen in [np.arange(len(numbers)), *draws]:
+        fits = _allan_fits(recordings, allan, variances[chosen].mean(axis=0))
+        noise.append([fit.white for fit in fits])
+        values = means.loc[list(numbers)].to_numpy()[chosen]
+        spread.append(turn_on_spread(values, np.array(noise[-1]), duration_s))
+    models = _fitted_models(recordings, [(imu, number) for number in numbers], spread[0])
+    return TestDevice(np.array(noise), np.array(spread), None, models)
+
+
+def _allan_fits(
+    recordings: xr.Dataset, allan: xr.Dataset, variances: np.ndarray
+) -> list[NoiseFigures]:
+    """N, B and K from Allan variances, one for each row (axes, times)."""
+    duration_s = recordings.sizes["sample"] / recordings.attrs["rate_hz"]
+    shortest_s = SHORTEST_FIT_SAMPLES / recordings.attrs["rate_hz"]
+    times_s = allan.time_s.to_numpy()
+    return [fit_noise(times_s, variance, duration_s, shortest_s) for variance in variances]
+
+
+def _drawn_models(recordings: xr.Dataset) -> tuple[RecordingModel, ...] | None:
+    """What each axis of an IMU was drawn from; None for white noise without a warm-up."""
+    drawn = {
+        name: float(recordings.get(f"true_{name}", 0.0)) for name in ("flicker", "random_walk")
+    }
+    warm_up = recordings.get("true_warm_up")
+    if not any(drawn.values()) and warm_up is None:
+        return None
+    models = []
+    for axis in recordings.axis.to_numpy():
+        one = recordings.sel(axis=axis)
+        noise = NoiseFigures(float(one.true_noise), drawn["flicker"], drawn["random_walk"])
+        mean, spread = [float(one.true_unit_bias)], [float(one.true_turn_on_spread)]
+        constant_s = np.inf
+        if warm_up is not None:
+            amplitude, scatter, constant_s = warm_up.to_numpy().tolist()
+            mean, spread = [*mean, amplitude], [*spread, scatter]
+        covariance = np.diag(np.square(spread))
+        place = recordings.sizes["sample"], float(recordings.attrs["rate_hz"])
+        models.append(RecordingModel(*place, noise, np.array(mean), covariance, constant_s))
+    return tuple(models)
+
+
+def _fitted_models(
+    recordings: xr.Dataset, places: Sequence[tuple[int, int]], spread: np.ndarray
+) -> tuple[RecordingModel, ...] | None:
+    """Models of the axes with a spread found otherwise; None of too few recordings.
+
+    Args:
+        recordings: All.
+        places: IMU and number of those to fit to.
+        spread: (axes,), deg/s.
+    """
+    if len(places) < FEWEST_RECORDINGS:
+        return None
+    rates = [recordings.angular_rate.sel(imu=imu, recording=number) for imu, number in places]
+    samples = np.stack([one.transpose("axis", "sample").to_numpy() for one in rates], axis=1)
+    models = []
+    for axis, tau in zip(samples, spread, strict=True):
+        model = fit_recording_model(axis, float(recordings.attrs["rate_hz"]), warm_up=None)
+        models.append(_with_prior(model, float(model.mean[0]), tau))
+    return tuple(models)
