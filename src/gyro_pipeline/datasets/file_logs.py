@@ -150,7 +150,7 @@ class FileLogs(AbstractDataset[Logs, Logs]):
             if self._cache is not None and path.suffix.lower() not in _BINARY:
                 state = path.stat()
                 key = fingerprint([str(path), state.st_size, state.st_mtime_ns, settings])
-                kept_as = self._cache / f"{key}.npz"
+                kept_as = self._cache / f"{key}.npy"
             found[name] = Reading(path, self._options, self._rate_hz, kept_as)
         return found
 
@@ -158,7 +158,7 @@ class FileLogs(AbstractDataset[Logs, Logs]):
         """Say what is there of an earlier run, and remove what is of other files."""
         if self._cache is None:
             return
-        there = set(self._cache.glob("*.npz"))
+        there = set(self._cache.glob("*.npy"))
         for path in there.difference(wanted):
             path.unlink()
         before = len(there.intersection(wanted))
