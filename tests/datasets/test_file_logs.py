@@ -38,7 +38,7 @@ def put(folder, *names):
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         rows = (f"{row / 120:.6f},{place},{row},0.5\n" for row in range(10))
-        path.write_text("Time,w_x,w_y,w_z\n" + "".join(rows))
+        path.write_text("Time (s),w_x (deg/s),w_y (deg/s),w_z (deg/s)\n" + "".join(rows))
 
 
 def numbers(logs):
