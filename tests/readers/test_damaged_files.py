@@ -6,6 +6,7 @@ of the good file come back, which are NaN, and the findings.
 
 import gzip
 import io
+import re
 import zipfile
 from dataclasses import dataclass, field
 
@@ -90,6 +91,18 @@ def in_quotes(text, delimiter=";"):
     return '"' + text.strip().replace(delimiter, f'"{delimiter}"').replace("\n", '"\n"') + '"\n'
 
 
+def dated(between, zone):
+    """Dates in place of the milliseconds."""
+
+    def change(text):
+        def date(milliseconds):
+            return f"2024-03-01{between}10:00:0{int(milliseconds[1]) / 1000:.2f}{zone};"
+
+        return re.sub(r"(?m)^(\d+);", date, text.replace("t_ms", "time"))
+
+    return change
+
+
 def joined(all_lines):
     return [*all_lines[:10], all_lines[10][:-1], all_lines[11][1:], *all_lines[12:]]
 
@@ -153,6 +166,17 @@ CASES = {
         Refused("separated by ;, got none"),
     ),
     "an enormous field that is not needed": (ANGLES, cell(20, 4, "7" * 3_000_000), Read()),
+    "dates for times": (GENERAL, dated("T", ""), Read(rate_hz=100)),
+    "dates for times in UTC, one of them unreadable": (
+        GENERAL,
+        lambda t: cell(9, 0, "2024-03-0x", ";")(dated(" ", "Z")(t)),
+        Read(rate_hz=100, findings=(UNREADABLE,)),
+    ),
+    "a clock time unreadable": (
+        ARTEMIS,
+        cell(9, 1, "12:xx"),
+        Read(rate_hz=100, findings=(("unreadable rows", "repaired"),)),
+    ),
     "NaN and infinity in words": (
         ANGLES,
         lambda t: cell(9, 7, " NaN")(cell(7, 8, "-Infinity")(t)),
@@ -175,6 +199,11 @@ CASES = {
         ANGLES,
         lambda t: t.encode() + bytes(4096),
         Read(findings=(CUT,)),
+    ),
+    "the last line is cut, fields are quoted": (
+        GENERAL,
+        lambda t: in_quotes(t)[:-6],
+        Read(BUT_LAST, findings=(CUT,), rate_hz=100),
     ),
     "text in a number column": (
         ANGLES,

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.io
+from pydantic import ValidationError
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.parameters import ReaderOptions
@@ -178,6 +179,20 @@ def test_an_unknown_unit_in_the_header_is_refused_even_of_a_known_format(unit, g
         text = text.replace(f"Gyr_{axis}", f"Gyr_{axis} ({unit})")
     with pytest.raises(InputError, match="expected a unit of the rates|raw counts"):
         read(text)
+
+
+def test_raw_counts_and_their_scale_go_together():
+    for options in ({"units": "raw"}, {"scale_dps": 0.01}, {"units": "mdps", "scale_dps": 0.01}):
+        with pytest.raises(ValidationError, match="units: raw and scale_dps go together"):
+            ReaderOptions(**options)
+
+
+def test_counts_that_the_header_names_are_scaled(rates, read):
+    rows = "\n".join(f"{k},{k + 1},{-k}" for k in range(60)) + "\n"
+    log = read("x (LSB),y (LSB),z (LSB)\n" + rows, units="raw", scale_dps=1 / 131)
+    np.testing.assert_allclose(log.samples[:, 1], np.arange(1, 61) / 131)
+    with pytest.raises(InputError, match="raw counts: give units: raw and scale_dps"):
+        read("x (LSB),y (LSB),z (LSB)\n" + rows)
 
 
 def test_a_format_can_be_forced_and_a_wrong_one_is_refused(good, read):
