@@ -468,3 +468,24 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path, read):
         read(lambda path: None)
     with pytest.raises(InputError, match="cannot be read: Is a directory"):
         read(lambda path: path.mkdir())
+
+
+@pytest.mark.parametrize(("rows", "most"), [(100, 3), (400, 4), (1000, 10)])
+def test_one_row_in_a_hundred_may_be_unreadable_but_no_more(rows, most, read):
+    good = ["x_dps,y_dps,z_dps", *["1,2,3"] * rows]
+    broken = [*good[: rows - most], *["1,2"] * most, "4,5,6"]
+    log = read("\n".join(broken) + "\n")
+    assert np.isnan(log.samples).all(axis=1).sum() == most
+    assert log.samples[-1].tolist() == [4, 5, 6]
+    with pytest.raises(InputError, match=f"got {most + 1} of {rows} that are not"):
+        read("\n".join([*broken[:-1], "1,2"]) + "\n")
+
+
+def test_a_finding_says_which_row_and_line_and_why(good, read):
+    text = cell(9, 8, "error")(good[ANGLES])
+    for content, line in ((text, 11), (text.replace("\n", "\n\n"), 21)):
+        (finding,) = read(content, 120).findings
+        assert finding.detail == (
+            f"1 of 60 rows cannot be read and are NaN: row 9 (line {line}): w_y: expected a "
+            "number, got 'error'"
+        )
