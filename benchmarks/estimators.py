@@ -1,8 +1,8 @@
 """How good the estimators are, against what is possible and against the running mean.
 
     python benchmarks/estimators.py                    # everything
-    python benchmarks/estimators.py --part white       # one part: white, warm_up, memsense, few,
-                                                       # coverage, history
+    python benchmarks/estimators.py --part white       # one part: white, cnn, warm_up, drifts,
+                                                       # memsense, few, coverage, history
     python benchmarks/estimators.py --quick            # a fraction of the seeds
 
 Simulated recordings are SparkFun's: N = 3.3 mdps sqrt(s), turn-on spread 0.31 mdps, 13000 samples
@@ -22,9 +22,12 @@ import xarray as xr
 
 from gyro_pipeline.conventions import AXES, DIMENSIONS, MDPS, PAPER, RECORDING_MEAN
 from gyro_pipeline.estimators import ESTIMATORS, FittedEstimator
+from gyro_pipeline.learning.examples import Device
+from gyro_pipeline.learning.jobs import NetworkEstimator, TrainingJob, run_training
 from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.noise import simulate_noise, warm_up
 from gyro_pipeline.physics.recording_model import RecordingModel, best_linear
+from gyro_pipeline.pipeline_registry import base_parameters
 from gyro_pipeline.protocol.windows import cut_windows
 
 SAMPLES, RECORDING_S = 13_000, 87.0
@@ -43,6 +46,13 @@ MODELS = {
     ),
     "coloured": RecordingModel(
         SAMPLES, RATE_HZ, NoiseFigures(N, FLICKER, 0), np.zeros(1), np.array([[SPREAD**2]])
+    ),
+    "coloured_walk": RecordingModel(
+        SAMPLES,
+        RATE_HZ,
+        NoiseFigures(N, FLICKER, RANDOM_WALK),
+        np.zeros(1),
+        np.array([[SPREAD**2]]),
     ),
     "warm_up": RecordingModel(
         SAMPLES,
@@ -166,9 +176,44 @@ def white(quick: bool) -> None:
     print("\nSimulated white noise, 10 s: RMSE over that of the oracle")
     names = [
         *("empirical_bayes", "empirical_bayes_pooled", "best_linear", "best_linear_allan"),
-        *("ridge", "training_mean", "mean"),
+        *("residual_network", "ridge", "window_mean_network", "training_mean", "mean"),
     ]
     to_the_oracle("white", names, [80, 10], 4 if quick else 20)
+
+
+class PaperNetwork:
+    """The paper's network with the settings of conf/base, the last 8 recordings for validation."""
+
+    def __init__(self, window_s: float, weights: str) -> None:
+        self._window_s, self._weights = window_s, weights
+
+    def fit(self, recordings: xr.Dataset) -> NetworkEstimator:
+        rates, numbers = recordings.angular_rate, recordings.recording.to_numpy().tolist()
+        bias = rates.astype(np.float64).mean("sample")
+        kept = -base_parameters().splits.validation_recordings
+        job = TrainingJob(
+            name="cnn",
+            devices=[Device(rates, bias, (1,), tuple(numbers[:kept]))],
+            validation=Device(rates, bias, (1,), tuple(numbers[kept:])),
+            window=round(self._window_s * recordings.attrs["rate_hz"]),
+            settings=base_parameters().training,
+            seed=0,
+        )
+        return NetworkEstimator(run_training(job, lambda work: None).artifact, self._weights)
+
+
+def cnn(quick: bool) -> None:
+    seeds = 2 if quick else 20
+    print("\nThe paper's network on the same white noise, 80 recordings, 10 s: last and best epoch")
+    for weights in ("last", "best"):
+        ratios = []
+        for seed in range(seeds):
+            made = simulate(np.random.default_rng([7, seed]), MODELS["white"], 80 + TESTED)
+            training, tested = split(made, 80)
+            oracle = rms(judged(Oracle(MODELS["white"], made.unit_bias.to_numpy()), tested, 10)[0])
+            network = PaperNetwork(10, weights).fit(training)
+            ratios.append(rms(judged(network, tested, 10)[0]) / oracle)
+        print(f"  {weights:24} {np.mean(ratios):6.3f} (largest {np.max(ratios):.3f}, n={seeds})")
 
 
 def warming(quick: bool) -> None:
@@ -177,10 +222,52 @@ def warming(quick: bool) -> None:
         f"warm-up 20 +- 5 mdps with 30 s; 10 s: RMSE over that of the exact oracle"
     )
     names = [
-        *("best_linear_warm_up", "ridge_same_time", "best_linear", "ridge"),
+        *("best_linear_warm_up", "residual_network", "ridge_same_time", "best_linear", "ridge"),
         *("empirical_bayes", "mean"),
     ]
     to_the_oracle("warm_up", names, [80, 10], 2 if quick else 10)
+
+
+def slow_and_fast(generator: np.random.Generator, count: int) -> xr.Dataset:
+    """The warm-up of each axis and power-on with its own time constant, from 15 to 60 s."""
+    made = simulate(generator, MODELS["coloured_walk"], count)
+    constants_s = generator.uniform(15, 60, (1, count, len(AXES)))
+    amplitudes = generator.normal(*WARM_UP[:2], constants_s.shape)
+    return drifting(made, warm_up(amplitudes, constants_s, SAMPLES, RATE_HZ))
+
+
+def heater(generator: np.random.Generator, count: int) -> xr.Dataset:
+    """A drift of 20 +- 5 mdps that begins at a random time from 10 to 60 s and settles in 5 s."""
+    made = simulate(generator, MODELS["coloured_walk"], count)
+    on_s = generator.uniform(10, 60, (1, count, len(AXES), 1))
+    size = generator.normal(*WARM_UP[:2], on_s.shape)
+    since_s = np.maximum(np.arange(SAMPLES) / RATE_HZ - on_s, 0)
+    return drifting(made, size * (1 - np.exp(-since_s / 5)))
+
+
+def drifting(recordings: xr.Dataset, drift: np.ndarray) -> xr.Dataset:
+    return recordings.assign(angular_rate=recordings.angular_rate + drift.astype(np.float32))
+
+
+def drifts(quick: bool) -> None:
+    seeds = 2 if quick else 20
+    print(
+        "\nDrifts that the linear model lacks, 80 recordings, 10 s: RMSE of the residual network "
+        "over that of best_linear_warm_up on the same windows"
+    )
+    makers = {"time constants 15 to 60 s": slow_and_fast, "heater at a random time": heater}
+    for name, make in makers.items():
+        ratios = []
+        for seed in range(seeds):
+            training, tested = split(make(np.random.default_rng([8, seed]), 80 + TESTED), 80)
+            fitted = [
+                ESTIMATORS[one]().fit(training)
+                for one in ("residual_network", "best_linear_warm_up")
+            ]
+            network, linear = (rms(judged(one, tested, 10)[0]) for one in fitted)
+            ratios.append(network / linear)
+        error = np.std(ratios, ddof=1) / np.sqrt(seeds)
+        print(f"  {name:26} {np.mean(ratios):.3f} +- {error:.3f} (largest {np.max(ratios):.3f})")
 
 
 def leave_one_out(recordings: xr.Dataset, make: Callable[[], FittedEstimator]) -> dict:
@@ -220,7 +307,7 @@ def real(quick: bool) -> None:
 
 
 def few(quick: bool) -> None:
-    names = ["empirical_bayes", "empirical_bayes_pooled", "best_linear"]
+    names = ["empirical_bayes", "empirical_bayes_pooled", "best_linear", "residual_network"]
     resamples = 8 if quick else 50
     print(
         "\nFive training recordings: RMSE over that of the running mean at 1 2 5 10 30 s, "
@@ -257,9 +344,9 @@ def coverage(quick: bool) -> None:
         f"training and {tested} test recordings each"
     )
     names = {
-        "white": ("mean", "empirical_bayes", "best_linear"),
-        "coloured": ("mean", "empirical_bayes", "best_linear"),
-        "warm_up": ("best_linear_warm_up",),
+        "white": ("mean", "empirical_bayes", "best_linear", "residual_network"),
+        "coloured": ("mean", "empirical_bayes", "best_linear", "residual_network"),
+        "warm_up": ("best_linear_warm_up", "residual_network"),
     }
     for source, tried in names.items():
         shares: dict[str, list] = {name: [] for name in tried}
@@ -296,7 +383,9 @@ def history(quick: bool) -> None:
 
 PARTS = {
     "white": white,
+    "cnn": cnn,
     "warm_up": warming,
+    "drifts": drifts,
     "memsense": real,
     "few": few,
     "coverage": coverage,

@@ -117,7 +117,7 @@ def pipeline(folder: Path, scratch: Path, processes: int) -> Callable[[], xr.Dat
     sensors = {"dot": sensor | {"samples": ROWS, "recording_s": ROWS / RATE_HZ}}
     source = FileLogs(
         *("dot", sensors, "fleet", str(folder), "imu{imu}/{recording}.csv"),
-        cache=str(scratch / "read"),
+        cache={"path": str(scratch / "read")},
     )
     execution = Execution(executor="processes", workers=processes)
 

@@ -22,7 +22,7 @@ ALLOWED = {
     "readers": {"conventions", "logs", "parameters"},
     "tracking": {"conventions"},
     "physics": {"conventions"},
-    "estimators": {"conventions", "physics"},
+    "estimators": {"conventions", "learning", "physics"},
     "protocol": {"conventions", "logs", "parameters", "physics"},
     "learning": {"conventions", "parameters", "protocol"},
     "datasets": {

@@ -13,6 +13,7 @@ from gyro_pipeline.studies import (
     CNN_SHUFFLED,
     LEAKAGE,
     MEAN,
+    RESIDUAL_NETWORK,
     Cell,
     LeakCell,
     leak_cells,
@@ -61,6 +62,9 @@ def test_augmentation_is_24_networks_and_4_running_means(base):
     grid = product(["sparkfun", "dot"], [3, 12], [0, 12, 24], [10.0, 30.0])
     named = [(c.sensor, c.real_gyros, c.virtual_gyros, c.window_s) for c in networks(cells)]
     assert sorted(named) == sorted(grid)
+    residual = [c for c in cells if c.estimator == RESIDUAL_NETWORK]
+    named = [(c.sensor, c.real_gyros, c.virtual_gyros, c.window_s) for c in residual]
+    assert sorted(named) == sorted(product(["sparkfun", "dot"], [3, 12], [0, 12, 24], [10.0, 30.0]))
     means = [(c.sensor, c.window_s) for c in cells if c.estimator == MEAN]
     assert sorted(means) == [("dot", 10), ("dot", 30), ("sparkfun", 10), ("sparkfun", 30)]
     assert {(c.method, c.seed, c.fold, c.source) for c in networks(cells)} == {
@@ -90,22 +94,24 @@ def test_the_three_studies_of_the_paper_need_46_trainings(base):
     cells = sum((cells_of(base, study) for study in studies), [])
     assert len(networks(cells)) == 24 + 24 + 8
     assert len(distinct(networks(cells))) == 46
-    assert len(distinct(cells)) == 46 + 8
+    assert len(distinct([c for c in cells if c.estimator == MEAN])) == 8
 
 
 def test_the_estimators_study_is_all_of_them_at_five_windows_on_every_sensor(base):
     cells = cells_of(base, "estimators")
     named = Counter((c.estimator, c.sensor, c.window_s) for c in cells)
-    assert named == Counter(product(ESTIMATORS, base.sensors, (1.0, 2.0, 5.0, 10.0, 30.0)))
-    fitted = [c for c in cells if c.estimator != MEAN]
+    every = product((*ESTIMATORS, CNN), base.sensors, (1.0, 2.0, 5.0, 10.0, 30.0))
+    assert named == Counter(every)
+    fitted = [c for c in cells if c.estimator not in (MEAN, CNN)]
     assert {(c.method, c.real_gyros, c.seed, c.fold) for c in fitted} == {(0, 3, 0, HOLD_OUT)}
-    assert networks(cells) == []
+    assert {(c.method, c.real_gyros, c.virtual_gyros) for c in networks(cells)} == {(2, 3, 0)}
 
 
 def test_estimators_are_the_same_for_every_seed_and_narrowed_like_networks(base, parameters):
-    assert cells_of(parameters("full"), "estimators") == cells_of(base, "estimators")
+    full, one = (cells_of(p, "estimators") for p in (parameters("full"), base))
+    assert [c for c in full if c.estimator != CNN] == [c for c in one if c.estimator != CNN]
     narrowed = cells_of(base, "estimators", sensor="dot", window_s=10, real_gyros=3)
-    assert [c.estimator for c in narrowed] == list(ESTIMATORS)
+    assert [c.estimator for c in narrowed] == [*ESTIMATORS, CNN]
     assert cells_of(base, "estimators", real_gyros=6) == []
     assert cells_of(base, "estimators", virtual_gyros=12) == []
 
@@ -174,7 +180,7 @@ def test_only_narrows(base, only, count, means):
     whole, cells = cells_of(base, "augmentation"), cells_of(base, "augmentation", **only)
     assert set(cells) <= set(whole)
     assert len(networks(cells)) == count
-    assert len(cells) == count + means
+    assert len(cells) == 2 * count + means  # a residual network beside each
     for name in set(only) - {"fold"}:
         assert {getattr(cell, name) for cell in networks(cells)} <= {only[name]}
     # a running mean stays wherever a network of its window does
@@ -207,13 +213,15 @@ def test_networks_are_repeated_in_every_fold_and_running_means_are_not(base):
     for window_s in (10, 30):
         folds = [c.fold for c in networks(folded) if c.window_s == window_s]
         assert folds == list(range(11))
-    assert len(distinct(folded)) == 2 + 22
+    assert sum(c.estimator == RESIDUAL_NETWORK for c in folded) == 2
+    assert len(distinct(folded)) == 2 + 2 + 22
 
 
 def test_an_estimator_without_a_network_is_one_run_over_all_folds(base):
     cells = cells_of(base, "estimators", sensor="memsense", window_s=10)
-    assert {c.fold for c in over_folds(cells, range(11), Only())} == {HOLD_OUT}
-    assert len(over_folds(cells, range(11), Only())) == len(ESTIMATORS)
+    folded = [c for c in over_folds(cells, range(11), Only()) if c.estimator != CNN]
+    assert {c.fold for c in folded} == {HOLD_OUT}
+    assert len(folded) == len(ESTIMATORS)
 
 
 def test_only_narrows_folds(base):

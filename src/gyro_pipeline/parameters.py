@@ -25,6 +25,14 @@ class Parameter(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+class WarmUp(Parameter):
+    """A bias that settles after power-on: amplitude times exp(-t / time constant)."""
+
+    amplitude_mdps: float = Field(description="its mean over power-ons, at power-on")
+    spread_mdps: float = Field(ge=0, description="its standard deviation over power-ons")
+    time_constant_s: float = Field(gt=0, description="the same at all power-ons")
+
+
 class SimulatedNoise(Parameter):
     """The stand-in for a sensor whose files are not at hand (sources: conf/base/globals.yml)."""
 
@@ -33,6 +41,10 @@ class SimulatedNoise(Parameter):
     unit_bias_dps: float = Field(ge=0, description="unit-to-unit biases are uniform in +- this")
     lag1_correlation: float = Field(0.0, gt=-0.5, lt=0.5, description="of successive samples")
     flicker_mdps: float = Field(0.0, ge=0, description="bias instability B; 0 is white noise")
+    random_walk_mdps_per_rts: float = Field(
+        0.0, ge=0, description="K: a walk from power-on, whose variance after t s is K^2 t"
+    )
+    warm_up: WarmUp | None = Field(None, description="of each axis on its own; null for none")
 
 
 class Sensor(Parameter):
@@ -366,6 +378,9 @@ class Parameters(Parameter):
     """All of it, as one tree."""
 
     source: str = Field(pattern=r"^[a-z0-9_]+$", description="where the logs come from")
+    published_address: str = Field(
+        pattern="^https?://", description="base address of the authors' files; the catalog reads it"
+    )
     sensors: dict[str, Sensor]
     quality: Quality
     ground_truth: GroundTruth

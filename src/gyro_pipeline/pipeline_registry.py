@@ -69,7 +69,7 @@ def _runs(parameters: Parameters, studies: dict[str, list[str]]) -> Pipeline:
             virtual = any(parameters.studies[study].sensors[sensor].virtual_gyros)
             whole += _measured(sensor) + _split(sensor, virtual)
             whole += training.create_pipeline(study, sensor, virtual)
-            whole += evaluation.create_pipeline(study, sensor)
+            whole += evaluation.create_pipeline(study, sensor, virtual)
     return whole
 
 

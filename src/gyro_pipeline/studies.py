@@ -27,6 +27,9 @@ CNN, CNN_SHUFFLED, MEAN = "cnn", "cnn_shuffled", "mean"
 NETWORKS = (CNN, CNN_SHUFFLED)
 """Estimators that are the paper's network: as it is, and with shuffled labels, a leak detector."""
 
+RESIDUAL_NETWORK = "residual_network"
+"""The estimator that is fitted to what a cell of the paper trains on: its real and virtual IMUs."""
+
 LEAKAGE = "leakage"
 """The leak study: its pipeline, MLflow experiment and parameters."""
 
@@ -195,11 +198,10 @@ def run_params(
         virtual_gyros: Their turn-on jitter is recorded where the cell has some.
     """
     params: dict[str, Any] = asdict(cell) | {"folds": folds}
+    if cell.virtual_gyros:
+        params["turn_on_jitter_mdps"] = virtual_gyros.turn_on_jitter_mdps
     if cell.estimator not in NETWORKS:
         return params
     validation = splits.validation_recordings if folds == 1 else splits.fold_validation_recordings
     params |= training.model_dump()
-    params |= {"validation_recordings": validation, "split_seed": splits.split_seed}
-    if cell.virtual_gyros:
-        params["turn_on_jitter_mdps"] = virtual_gyros.turn_on_jitter_mdps
-    return params
+    return params | {"validation_recordings": validation, "split_seed": splits.split_seed}

@@ -20,7 +20,7 @@ from gyro_pipeline.physics.reml import guarded_spread
 RATE, SAMPLES, SIZE = 20.0, 1600, 200
 N, TAU = 5 * MDPS, 1 * MDPS
 MODEL = constant_bias(SAMPLES, RATE, NoiseFigures(N, 0, 0), 0.0, TAU)
-NO_SIGMA = {"median", "trimmed_mean", "ridge", "ridge_same_time"}
+NO_SIGMA = {"median", "trimmed_mean", "ridge", "ridge_same_time", "window_mean_network"}
 NO_PRIOR = {"mean", "median", "trimmed_mean"}
 
 
@@ -77,8 +77,8 @@ def test_an_unknown_target_is_refused(fitted, windows, name):
 def test_some_are_recommended_and_the_default_is_one_of_them(fitted):
     recommended = {name for name, estimator in fitted.items() if estimator.recommended}
     assert DEFAULT in recommended
-    assert {"empirical_bayes", "best_linear", "best_linear_warm_up"} <= recommended
-    others = {"mean", "training_mean", "ridge", "empirical_bayes_pooled", "best_linear_allan"}
+    assert {"empirical_bayes", "best_linear", "residual_network"} <= recommended
+    others = {"mean", "ridge", "empirical_bayes_pooled", "best_linear_allan", "window_mean_network"}
     assert not recommended & others
 
 
@@ -96,7 +96,9 @@ def test_what_says_that_it_uses_no_prior_does_not(recordings, fitted, windows, n
     assert np.allclose(bias, other, atol=1e-9) == (not fitted[name].uses_prior)
 
 
-@pytest.mark.parametrize("name", ["empirical_bayes", "empirical_bayes_pooled", "best_linear"])
+@pytest.mark.parametrize(
+    "name", ["empirical_bayes", "empirical_bayes_pooled", "best_linear", "residual_network"]
+)
 def test_on_an_unseen_device_nothing_beats_the_mean(simulate, judged, name):
     """Its prior is the spread from unit to unit, here 100 times that of the noise."""
     known = simulate(MODEL, 6, seed=3, imus=5, unit_bias=0.5)

@@ -30,7 +30,7 @@ def test_it_is_the_dense_conditional_mean_given_training_and_window(simulate, ta
     """One normal distribution of training recordings and the new one, with a diffuse mean."""
     recordings = simulate(COLOURED, 6)
     estimator = BestLinear().fit(recordings.isel(recording=slice(5)))
-    fitted = estimator._axes[0]
+    fitted = estimator.models[0]
     edges = block_edges(SAMPLES, 10)
     means = block_means(recordings.angular_rate.to_numpy()[0, :, 0].astype(np.float64), edges)
     offset = means.mean()

@@ -53,9 +53,9 @@ def test_known_noise_is_kept():
 def test_the_likelihood_is_the_dense_one_of_all_contrasts():
     """REML is the likelihood of the data projected to where the fixed effect is not."""
     rates = recorded(4, 5)
-    likelihood = _Likelihood(rates, RATE, False, None)
     edges = block_edges(SAMPLES, 10)
-    means = block_means(rates, edges).ravel()
+    table = block_means(rates, edges)
+    likelihood, means = _Likelihood(table, SAMPLES, RATE, False, None), table.ravel()
     contrasts = np.linalg.svd(np.ones((means.size, 1)))[0][:, 1:]
 
     def dense(figures, tau):

@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+import xarray as xr
 
 from gyro_pipeline.conventions import (
     ALL,
@@ -20,6 +21,8 @@ from gyro_pipeline.conventions import (
 )
 from gyro_pipeline.estimators import ESTIMATORS, ORIENTATION_NOTE, RunningMean
 from gyro_pipeline.parameters import Grid, Study
+from gyro_pipeline.physics.noise import simulate_noise, warm_up
+from gyro_pipeline.physics.recording_model import outside_noise
 from gyro_pipeline.pipelines.evaluation import bench as bench_module
 from gyro_pipeline.pipelines.evaluation.bench import (
     Bench,
@@ -30,6 +33,7 @@ from gyro_pipeline.pipelines.evaluation.bench import (
 from gyro_pipeline.pipelines.evaluation.folds import Fitted
 from gyro_pipeline.pipelines.evaluation.nodes import evaluate
 from gyro_pipeline.pipelines.ground_truth.nodes import measure_allan_variance, measure_bias
+from gyro_pipeline.protocol.scores import squared_errors
 from gyro_pipeline.studies import CNN, MEAN
 from gyro_pipeline.tracking import CURVE, ERRORS, EVALUATED_WITH, HISTORY, WEIGHTS
 
@@ -90,8 +94,15 @@ def test_errors_of_the_running_mean_are_those_computed_by_hand(world, bench):
     squares = (windows - whole) ** 2
     assert metrics["test_rmse_dps"] == pytest.approx(np.sqrt(squares[:, 0].mean()))
     assert metrics["test_rmse_dps_all"] == pytest.approx(np.sqrt(squares.mean()))
-    noise = bench.device.noise[0] ** 2 / (RECORDING_S - WINDOW_S)
-    honest = ((windows - rest) ** 2).mean() - noise.mean()
+    place = 1040, 1040 / RECORDING_S
+    noise = [
+        outside_noise(figures, *place, start * SIZE, SIZE)
+        for figures in bench.device.figures
+        for start in range(5)
+    ]
+    white = bench.device.noise[0] ** 2 / (RECORDING_S - WINDOW_S)
+    assert np.mean(noise) == pytest.approx(white.mean(), rel=0.1)
+    honest = ((windows - rest) ** 2).mean() - np.mean(noise)
     assert metrics["test_mse_dps2_all_disjoint"] == pytest.approx(honest)
 
 
@@ -183,7 +194,10 @@ def test_noise_and_turn_on_spread_are_measured(make_recordings, parameters):
     np.testing.assert_allclose(device.spread[0, 1:], spread[1:], rtol=0.2)
     assert device.spread[0, 0] < 1.5e-4  # a third of N / sqrt(T), which is all there is
     assert device.unit_bias is None
-    assert not device.white
+    assert [model.noise.white for model in device.models] == pytest.approx(3 * [noise], rel=0.04)
+    assert [model.covariance[0, 0] for model in device.models] == pytest.approx(
+        device.spread[0] ** 2
+    )
     lo, hi = np.quantile(device.spread[1:, 2], [0.001, 0.999])
     assert lo < spread[2] < hi
 
@@ -224,24 +238,92 @@ def test_ceilings_of_simulated_data_are_the_closed_form(world, simulated):
     mean = noise**2 * (1 / WINDOW_S - 1 / RECORDING_S)
     best = mean * (r + (1 - r) * q / (1 + q))
     rho = np.sqrt(best.mean() / mean.mean())
-    ceilings = bench.ceilings(PAPER)
+    ceilings = bench.ceilings(PAPER, ALL)
     assert ceilings["ceiling_rmse_dps"].value == pytest.approx(np.sqrt(best.mean()))
     assert ceilings["ceiling_rmse_dps"].lo is None
     assert ceilings["ceiling_accuracy_gain_pct"].value == pytest.approx(100 * (1 - rho))
     saving = 100 * (1 - rho**2) * (1 - r)
     assert ceilings["ceiling_time_saving_pct"].value == pytest.approx(saving)
     posterior = noise**2 / WINDOW_S * q / (1 + q)
-    assert bench.ceilings(TRUE)["ceiling_rmse_dps"].value == (
+    assert bench.ceilings(TRUE, ALL)["ceiling_rmse_dps"].value == (
         pytest.approx(np.sqrt(posterior.mean()))
     )
 
 
-def test_coloured_noise_has_no_oracle(world, simulated):
-    coloured = simulated.assign(true_flicker=1e-3)
-    bench = Bench(coloured, device_of(world, coloured), TESTED, WINDOW_S, world.evaluation)
-    assert bench.oracle_errors is None
-    assert bench.ceiling_basis == "drawn values, without the flicker noise"
-    assert not any("oracle" in name for name in bench.metrics(bench.mean_errors, LAST))
+COLOUR = {"flicker": 3e-3, "random_walk": 1e-3}
+WARM_UP = (20e-3, 5e-3, 15.0)  # mean and spread of the amplitude, deg/s; time constant, s
+
+
+@pytest.fixture(scope="module")
+def coloured(simulated):
+    """200 recordings of flicker, random walk and warm-up, with what was drawn."""
+    generator, count = np.random.default_rng(4), 200
+    noise, spread = simulated.true_noise.to_numpy(), simulated.true_turn_on_spread.to_numpy()
+    unit = simulated.true_unit_bias.sel(imu=[1]).to_numpy()
+    bias = unit[:, None] + generator.normal(0, spread, (1, count, 3))
+    amplitude = generator.normal(*WARM_UP[:2], bias.shape)
+    samples = int(RECORDING_S * 20)
+    rates = bias[..., None] + warm_up(amplitude, np.full(bias.shape, WARM_UP[2]), samples, 20.0)
+    rates += simulate_noise(
+        generator,
+        rates.shape,
+        20.0,
+        noise,
+        flicker_dps=COLOUR["flicker"],
+        random_walk_dps_rts=COLOUR["random_walk"],
+    )
+    drawn = {
+        "angular_rate": (("imu", "recording", "axis", "sample"), rates.astype(np.float32)),
+        "true_bias": (("imu", "recording", "axis"), bias),
+        "true_unit_bias": (("imu", "axis"), unit),
+        "true_noise": ("axis", noise),
+        "true_turn_on_spread": ("axis", spread),
+        "true_warm_up": ("figure", np.array(WARM_UP)),
+        **{f"true_{name}": value for name, value in COLOUR.items()},
+    }
+    labels = {"imu": [1], "recording": np.arange(1, 1 + count), "axis": list("xyz")}
+    return xr.Dataset(drawn, labels, simulated.attrs)
+
+
+@pytest.fixture(scope="module")
+def coloured_bench(world, coloured):
+    device = device_of(world, coloured)
+    numbers = tuple(coloured.recording.to_numpy().tolist())
+    return Bench(coloured, device, numbers, WINDOW_S, world.evaluation)
+
+
+@pytest.mark.parametrize("windows", [FIRST, ALL])
+@pytest.mark.parametrize("truth", [PAPER, DISJOINT, TRUE])
+def test_the_ceiling_of_coloured_noise_and_warm_up_is_what_the_oracle_reaches(
+    coloured_bench, truth, windows
+):
+    assert coloured_bench.ceiling_basis == "drawn values"
+    oracle = squared_errors(coloured_bench.oracle_errors, truth, windows)
+    mean = squared_errors(coloured_bench.mean_errors, truth, windows)
+    every = np.ones((1, 200))
+    reached, of_mean = oracle.mean(every)[0], mean.mean(every)[0]
+    # 600 gyroscope recordings: 6 % of a mean square
+    expected = coloured_bench._expected(truth, windows, coloured_bench.size)
+    of_noise = coloured_bench.oracle_errors.query("truth == @truth").truth_variance.mean()
+    assert expected == pytest.approx((reached, of_mean), rel=0.12, abs=0.12 * of_noise)
+    ceilings = coloured_bench.ceilings(truth, windows)
+    if reached < 0:  # truth (b), less its own noise but not less what it shares with the window
+        assert truth == DISJOINT
+        assert not ceilings
+        return
+    reached, of_mean = np.sqrt([reached, of_mean])
+    assert ceilings["ceiling_rmse_dps"].value == pytest.approx(reached, rel=0.07)
+    gain = 100 * (1 - reached / of_mean)
+    assert ceilings["ceiling_accuracy_gain_pct"].value == pytest.approx(gain, abs=4)
+    assert ceilings["ceiling_rmse_dps"].lo is None
+
+
+def test_on_coloured_noise_one_who_looks_outside_the_window_is_found_out(coloured_bench):
+    metrics = coloured_bench.metrics(coloured_bench.mean_errors, LAST)
+    assert metrics["beats_oracle_p_all"] > 0.5
+    assert 0 < metrics["ceiling_time_saving_pct_all"] < 100
+    cheat = coloured_bench.metrics(coloured_bench.errors(Off(coloured_bench, 1e-3)), LAST)
+    assert cheat["beats_oracle_p_all"] < 1e-6
 
 
 def test_simulated_data_are_judged_against_the_drawn_bias_as_well(world, simulated):
@@ -417,7 +499,9 @@ def test_it_is_fitted_to_all_recordings_but_those_that_test(world, all_judged):
 
 def test_coverage_is_that_of_the_stated_deviations(all_judged):
     stated = {name for name, run in all_judged.items() if "coverage_1sigma_all" in run.metrics}
-    assert set(all_judged) - stated == {"median", "trimmed_mean", "ridge", "ridge_same_time"}
+    assert set(all_judged) - stated == {
+        *("median", "trimmed_mean", "ridge", "ridge_same_time", "window_mean_network")
+    }
     for name in stated:
         errors = all_judged[name].artifacts[ERRORS].query("truth == 'paper'")
         within = (errors.error_dps.abs() < 2 * errors.sigma_dps).mean()
@@ -450,11 +534,11 @@ def test_an_estimator_never_sees_the_drawn_values(simulated, world, monkeypatch)
 
     class Spy(RunningMean):
         def fit(self, recordings, imu=1):
-            seen.append(recordings)
+            seen.append(recordings.recordings)
             return self
 
     monkeypatch.setitem(ESTIMATORS, "mean", Spy)
-    Fitted(simulated, world.roles).estimator("mean")
+    Fitted(simulated, world.roles).estimator("mean", 1, 0)
     assert len(seen) == 1  # once for all recordings
     assert set(seen[0].data_vars) == {"angular_rate"}
     assert seen[0].recording.to_numpy().tolist() == list(range(1, 11))
@@ -469,3 +553,24 @@ def test_too_few_recordings_are_an_error_that_says_so(world, as_stored, make_rol
 def test_an_estimate_that_is_none_is_refused(bench):
     with pytest.raises(InputError, match="recording 11: expected an estimate for every window"):
         bench.errors(Off(bench, np.nan))
+
+
+def test_a_residual_network_learns_from_the_imus_of_its_cell(world, monkeypatch):
+    seen = []
+
+    class Spy(RunningMean):
+        def fit(self, recordings, imu=1):
+            seen.append(recordings.recordings)
+            return self
+
+    monkeypatch.setitem(ESTIMATORS, "residual_network", Spy)
+    fitted = Fitted(world.recordings, world.roles, world.virtual)
+    for real, virtual in ((1, 0), (2, 3), (2, 3)):
+        fitted.estimator("residual_network", real, virtual)
+    alone, together = seen  # fitted once for each
+    assert alone.imu.to_numpy().tolist() == [1]
+    assert together.imu.to_numpy().tolist() == [1, 2, 3, 4, 5]
+    drawn = together.angular_rate.sel(imu=slice(3, 5), recording=slice(1, 5)).to_numpy()
+    np.testing.assert_array_equal(drawn, world.virtual.angular_rate.to_numpy()[:3, :5])
+    # virtual recordings beyond those that train are not there
+    assert np.isnan(together.angular_rate.sel(imu=3, recording=slice(6, 10))).all()

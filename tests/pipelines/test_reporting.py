@@ -572,6 +572,16 @@ def test_hours_are_counted(stored, published):
     assert table.loc["all", "Training recordings"] == counted
 
 
+def test_virtual_recordings_of_an_older_version_are_an_error_that_says_what_to_run(
+    stored, published
+):
+    older = stored["dot_virtual"].copy()
+    del older.attrs["train_recordings"]
+    command = r"kedro run --pipeline=virtual_gyros --params=only\.sensor=dot"
+    with pytest.raises(InputError, match=rf"virtual recordings of dot.*older version.*{command}"):
+        hours(stored, published, dot_virtual=older)
+
+
 def test_a_recording_less_is_hours_less(stored, published):
     before = hours(stored, published)
     shorter = stored["sparkfun_recordings"].drop_sel(recording=1)
@@ -730,6 +740,22 @@ def test_estimators_are_compared_with_the_mean_and_the_best_linear_one(estimator
     assert (table["Recordings"] == 8).all()
 
 
+def test_against_the_other_truths_mean_squares_are_compared(estimators, nothing):
+    pooled, runs = estimators
+    worse = runs[1].load(ERRORS)
+    worse.loc[worse.truth == "true", "error_dps"] = 11.0  # the mean's is 9
+    results = pooled([runs[0], replace(runs[1], load={ERRORS: worse}.__getitem__), runs[2]])
+    bayes = results.iloc[1]
+    for name, off in {"mean": 9, "best_linear": 4.5}.items():
+        ends = [bayes[f"less_{name}_dps2_true{end}"] for end in ("", "_lo", "_hi")]
+        assert ends == pytest.approx(3 * [11**2 - off**2])
+    table = comparison(results, nothing).set_index("Estimator")
+    shown = table["Less best linear, true bias mdps²"]
+    assert shown["empirical_bayes"].startswith("+100750000.000 [+")
+    assert shown["best_linear"] == table["Less mean, true bias mdps²"]["mean"] == "–"
+    assert set(table["Less mean, outside mdps²"]) == {"–"}  # these runs have no such truth
+
+
 def test_what_is_there_is_compared_and_the_command_for_the_rest_is_given(estimators, nothing):
     pooled, runs = estimators
     results = pooled(runs[:2])
@@ -754,3 +780,40 @@ def test_their_figure_has_a_line_for_each_and_the_ceiling(estimators, nothing):
         assert labels == ["mean", *best, "ceiling"]
     elsewhere = results.assign(source="published", simulated=False)
     assert len(sparkfun(results, elsewhere).axes) == 4
+
+
+def test_the_papers_network_is_compared_at_its_last_and_its_best_epoch(
+    estimators, make_run, settings, parameters, nothing
+):
+    _, runs = estimators
+    recordings = range(1, 9)
+    table = errors(recordings, 0.004)  # at the best epoch, 9 deg/s
+    network = make_run("network", recordings, table, study="estimators")
+    study = Study(
+        experiment="estimators",
+        estimators=["mean", "best_linear", CNN],
+        windows_s=[WINDOW_S],
+        sensors={"sparkfun": Grid(method=2, real_gyros=[3])},
+    )
+    given = (study, "simulated", [WINDOW_S], [0], *settings, parameters().evaluation)
+    results = pool_results(*given, [*runs, network])[0].set_index("estimator")
+    assert results.index.tolist() == ["mean", "best_linear", "cnn", "cnn_best"]
+    assert results.test_rmse_dps_all["cnn"] == pytest.approx(rmse([table]))
+    assert results.test_rmse_dps_all["cnn_best"] == pytest.approx(9)
+    assert results.less_best_linear_dps["cnn_best"] > results.less_best_linear_dps["cnn"] > 0
+    assert comparison(results.reset_index(), nothing)["Recommended"].tolist()[2:] == ["no", "no"]
+
+
+def test_the_residual_network_has_columns_beside_the_papers(whole, published):
+    results, _, _ = whole
+    residual = results[results.estimator == CNN].assign(
+        estimator="residual_network", method=0, accuracy_gain_pct_all=61.0, run_ids="residual-run"
+    )
+    both = pd.concat([results, residual], ignore_index=True)
+    table = three_gyroscopes(both, published)
+    assert [text.split(" ")[0] for text in table["Residual network A %"]] == ["61", "61"]
+    assert table["Runs"].tolist() == ["3+0-0123 residual", "3+24-012 residual"]
+    assert table["A %"].tolist() == three_gyroscopes(results, published)["A %"].tolist()
+    assert set(three_gyroscopes(results, published)["Residual network A %"]) == {"–"}
+    both.loc[both.estimator == "residual_network", "missing"] = "make it"
+    assert three_gyroscopes(both, published) == Missing(("make it", "make it"))

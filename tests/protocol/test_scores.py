@@ -44,6 +44,11 @@ def curve_of(times_s, rmse, recordings=1):
     return Curve(np.array(times_s, float), SquaredErrors(sums, np.ones_like(sums)))
 
 
+def scored(errors, mean_errors, curve, window_s, weights):
+    """The scores with the curve resampled alike."""
+    return score(errors, mean_errors, curve.of(weights), window_s, weights)
+
+
 # squares
 
 
@@ -187,7 +192,7 @@ def test_equivalent_times_of_several_curves_do_not_mix():
 
 def test_one_recording_by_hand():
     curve = curve_of([1, 2, 5, 10, 20], [8, 4, 2, 1, 0.5])
-    scores = score(squares([[0.6, 0.8, 0.5**0.5, 0.5**0.5]]), squares([[3, 1]]), curve, 2.0, PLAIN)
+    scores = scored(squares([[0.6, 0.8, 0.5**0.5, 0.5**0.5]]), squares([[3, 1]]), curve, 2.0, PLAIN)
     # RMSE sqrt(2 / 4) against sqrt(10 / 2); the curve falls from 1 to 0.5 between 10 and 20 s
     rmse, mean = np.sqrt(0.5), np.sqrt(5)
     time_s = 10 + 10 * (1 - rmse) / 0.5
@@ -206,7 +211,7 @@ def test_one_recording_by_hand():
 
 
 def test_worse_than_the_mean_is_a_negative_saving_and_gain():
-    scores = score(squares([4.0]), squares([2.0]), curve_of([1, 2, 5], [8, 4, 2]), 5.0, PLAIN)
+    scores = scored(squares([4.0]), squares([2.0]), curve_of([1, 2, 5], [8, 4, 2]), 5.0, PLAIN)
     assert scores["equivalent_time_s"].value == 2
     assert scores["time_saving_pct"].value == pytest.approx(-150)
     assert scores["accuracy_gain_pct"].value == pytest.approx(-100)
@@ -214,7 +219,7 @@ def test_worse_than_the_mean_is_a_negative_saving_and_gain():
 
 @pytest.mark.parametrize(("rmse", "off"), [(9.0, -np.inf), (0.5, np.inf)])
 def test_off_the_curve_there_is_a_gain_but_no_time(rmse, off):
-    scores = score(squares([rmse]), squares([2.0]), curve_of([1, 2, 5], [8, 4, 2]), 5.0, PLAIN)
+    scores = scored(squares([rmse]), squares([2.0]), curve_of([1, 2, 5], [8, 4, 2]), 5.0, PLAIN)
     assert scores["equivalent_time_s"].value == off
     assert scores["time_saving_pct"].value == off
     assert scores["accuracy_gain_pct"].value == pytest.approx(100 * (1 - rmse / 2))
@@ -223,7 +228,7 @@ def test_off_the_curve_there_is_a_gain_but_no_time(rmse, off):
 def test_intervals_hold_the_value_and_pair_the_estimator_with_the_mean():
     generator = np.random.default_rng(1)
     mean = np.exp(generator.normal(size=(25, 1)))  # errors differ much by recording
-    scores = score(
+    scores = scored(
         squares(0.5 * mean),
         squares(mean),
         curve_of([1, 2, 5, 10], [9, 3, 1, 0.1], recordings=25),
@@ -251,7 +256,7 @@ def test_on_the_closed_form_curve_the_ceiling_scores_its_closed_form():
     times_s = np.arange(0.25, RECORDING_S + 0.01, 0.25)
     curve = curve_of(times_s, running_mean_rmse(N, times_s, RECORDING_S, PAPER))
     mean = running_mean_rmse(N, WINDOW_S, RECORDING_S, PAPER)
-    scores = score(squares([RHO * mean]), squares([mean]), curve, WINDOW_S, PLAIN)
+    scores = scored(squares([RHO * mean]), squares([mean]), curve, WINDOW_S, PLAIN)
     saving = 100 * best_saving(RHO, WINDOW_S / RECORDING_S)
     assert scores["time_saving_pct"].value == pytest.approx(saving, abs=0.01)
     assert scores["accuracy_gain_pct"].value == pytest.approx(100 * best_gain(RHO))
@@ -281,7 +286,7 @@ def simulated():
 def test_on_simulated_recordings_the_oracle_scores_the_ceiling(simulated):
     weights = resampled_weights(600, 200, seed=3)
     errors, mean, curve = (simulated[name] for name in ("oracle", "mean", "curve"))
-    scores = score(errors, mean, curve, WINDOW_S, weights)
+    scores = scored(errors, mean, curve, WINDOW_S, weights)
     # within about three standard errors of 1800 squares
     saving = 100 * best_saving(RHO, WINDOW_S / RECORDING_S)
     assert scores["time_saving_pct"].value == pytest.approx(saving, abs=4)
@@ -289,7 +294,7 @@ def test_on_simulated_recordings_the_oracle_scores_the_ceiling(simulated):
     assert scores["time_saving_pct"].hi - scores["time_saving_pct"].lo == pytest.approx(
         2.7, rel=0.3
     )
-    itself = score(mean, mean, curve, WINDOW_S, weights)
+    itself = scored(mean, mean, curve, WINDOW_S, weights)
     assert itself["accuracy_gain_pct"].value == 0
     assert itself["time_saving_pct"].value == pytest.approx(0, abs=0.1)
 
@@ -311,11 +316,11 @@ def test_there_is_no_root_where_the_lower_end_is_negative():
     uncertain = SquaredErrors(np.array([1.0, -0.9, 1.0, -0.9]), np.ones(4))
     sure = squares(np.ones((4, 1)))
     curve, weights = curve_of([1, 2], [2, 1], 4), resampled_weights(4, 300, seed=0)
-    scores = score(uncertain, sure, curve, 1.0, weights)
+    scores = scored(uncertain, sure, curve, 1.0, weights)
     assert set(scores) == {"test_mse_dps2"}
     assert scores["test_mse_dps2"].lo < 0 < scores["test_mse_dps2"].value
-    assert set(score(sure, uncertain, curve, 1.0, weights)) == {"test_mse_dps2"}
-    assert "test_rmse_dps" in score(sure, sure, curve, 1.0, weights)
+    assert set(scored(sure, uncertain, curve, 1.0, weights)) == {"test_mse_dps2"}
+    assert "test_rmse_dps" in scored(sure, sure, curve, 1.0, weights)
 
 
 # the leak check

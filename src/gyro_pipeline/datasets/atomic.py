@@ -28,7 +28,7 @@ def replacing(path: Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary.touch()
     except OSError as error:
-        raise InputError(_in_the_way(path, error)) from error
+        raise InputError(in_the_way(path, error)) from error
     try:
         if path.is_dir():
             raise InputError(f"cannot write {path}: a folder has that name; move it away")
@@ -47,10 +47,10 @@ def check_writable(path: Path) -> None:
     """
     nearest = next(folder for folder in path.parents if folder.exists())
     if not nearest.is_dir() or not os.access(nearest, os.W_OK):
-        raise InputError(_in_the_way(path, PermissionError(errno.EACCES, "no permission to write")))
+        raise InputError(in_the_way(path, PermissionError(errno.EACCES, "no permission to write")))
 
 
-def _in_the_way(path: Path, error: OSError) -> str:
+def in_the_way(path: Path, error: OSError) -> str:
     """Say which of the folders above a path is the trouble, and what to do."""
     nearest = next(folder for folder in path.parents if folder.exists())
     if not nearest.is_dir():

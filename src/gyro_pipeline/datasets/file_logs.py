@@ -47,8 +47,8 @@ class FileLogs(AbstractDataset[Logs, Logs]):
             their order; ``*`` for anything but a slash. Without an IMU all files are of IMU 1;
             without a recording the files of an IMU are numbered in their order.
         reader: How the files are read (:class:`gyro_pipeline.parameters.ReaderOptions`).
-        cache: Folder for what was read of text files, so that an interrupted run goes on where it
-            was; None: nothing is kept.
+        cache: ``{"path": folder}`` for what was read of text files, so that an interrupted run
+            goes on where it was; None: nothing is kept. (Kedro makes a ``path`` absolute.)
         metadata: For other tools, such as Kedro-Viz.
 
     Raises:
@@ -63,7 +63,7 @@ class FileLogs(AbstractDataset[Logs, Logs]):
         path: str,
         pattern: str,
         reader: Mapping[str, Any] | None = None,
-        cache: str | None = None,
+        cache: Mapping[str, str] | None = None,
         metadata: dict[str, Any] | None = None,
     ) -> None:
         self._rate_hz = sensor_entry(sensor, sensors).rate_hz
@@ -76,7 +76,7 @@ class FileLogs(AbstractDataset[Logs, Logs]):
             self._options = ReaderOptions.model_validate(reader or {})
         except ValidationError as error:
             raise InputError(f"{sensor}: reader in the catalog entry: {error}") from error
-        self._cache = None if cache is None else Path(cache)
+        self._cache = None if cache is None else Path(cache["path"])
         self.metadata = metadata
 
     def load(self) -> Logs:

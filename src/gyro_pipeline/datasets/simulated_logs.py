@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from kedro.io import AbstractDataset, DatasetError
-from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 from gyro_pipeline.datasets.array_logs import LAYOUT, ArrayLogs
@@ -20,7 +19,7 @@ from gyro_pipeline.datasets.atomic import replacing
 from gyro_pipeline.datasets.recordings import Recordings, open_recordings
 from gyro_pipeline.logs import Logs
 from gyro_pipeline.parameters import Sensor
-from gyro_pipeline.physics.noise import simulate_noise
+from gyro_pipeline.physics.noise import simulate_noise, warm_up
 
 _LOG = logging.getLogger(__name__)
 
@@ -68,7 +67,10 @@ class SimulatedLogs(AbstractDataset[Logs, Logs]):
         Returns:
             The recordings, and what was drawn, in deg/s: ``true_bias`` (imu, recording, axis),
             ``true_unit_bias`` (imu, axis), ``true_turn_on_spread`` (axis), and ``true_noise``
-            (axis), N in deg/s * sqrt(s).
+            (axis), N in deg/s * sqrt(s). Also ``true_flicker``, B, and ``true_random_walk``, K in
+            deg/s / sqrt(s). With a warm-up its ``true_amplitude`` (imu, recording, axis), and
+            ``true_warm_up`` (figure): the mean and the spread of the amplitude, and the time
+            constant in seconds.
 
         Raises:
             InputError: As the cause of Kedro's ``DatasetError``, files that cannot be written, or
@@ -105,7 +107,12 @@ class SimulatedLogs(AbstractDataset[Logs, Logs]):
 
     def _settings(self) -> str:
         """All that the files depend on."""
+        # without what was left at its default: files of versions that did not know it stay valid
         entry = self._arrays.entry.model_dump(mode="json")
+        known = self._arrays.entry.simulated.model_dump(mode="json")
+        for added, default in (("random_walk_mdps_per_rts", 0.0), ("warm_up", None)):
+            if known[added] == default:
+                del entry["simulated"][added]
         return json.dumps({**entry, "seed": self._seed}, sort_keys=True)
 
     def _settings_on_disk(self) -> str | None:
@@ -126,7 +133,7 @@ class SimulatedLogs(AbstractDataset[Logs, Logs]):
         generator = np.random.default_rng(np.random.SeedSequence([self._seed, name]))
         truth = draw_biases(generator, self._arrays.entry)
         with replacing(self._train) as train, replacing(self._test) as test:
-            write_logs(generator, self._arrays.entry, truth.true_bias.values, train, test)
+            write_logs(generator, self._arrays.entry, truth, train, test)
             # from here on the old mark would vouch for the new arrays
             self._truth.unlink(missing_ok=True)
         truth.attrs = {"settings": self._settings(), "files_hash": self._files_hash()}
@@ -157,6 +164,12 @@ def draw_biases(generator: np.random.Generator, entry: Sensor) -> xr.Dataset:
     limit = model.unit_bias_dps
     unit_bias = generator.uniform(-limit, limit, (entry.imus, len(AXES)))
     turn_on = generator.normal(0, spread, (entry.imus, entry.recordings, len(AXES)))
+    drawn: dict[str, Any] = {}
+    if model.warm_up is not None:
+        figures = model.warm_up.amplitude_mdps * MDPS, model.warm_up.spread_mdps * MDPS
+        amplitude = generator.normal(*figures, turn_on.shape)
+        drawn["true_amplitude"] = (("imu", "recording", "axis"), amplitude)
+        drawn["true_warm_up"] = ("figure", np.array([*figures, model.warm_up.time_constant_s]))
     return xr.Dataset(
         {
             "true_bias": (("imu", "recording", "axis"), unit_bias[:, None] + turn_on),
@@ -164,6 +177,8 @@ def draw_biases(generator: np.random.Generator, entry: Sensor) -> xr.Dataset:
             "true_turn_on_spread": ("axis", spread),
             "true_noise": ("axis", np.array(model.noise_mdps_rts) * MDPS),
             "true_flicker": model.flicker_mdps * MDPS,
+            "true_random_walk": model.random_walk_mdps_per_rts * MDPS,
+            **drawn,
         },
         coords={
             "imu": np.arange(1, entry.imus + 1),
@@ -176,7 +191,7 @@ def draw_biases(generator: np.random.Generator, entry: Sensor) -> xr.Dataset:
 def write_logs(
     generator: np.random.Generator,
     entry: Sensor,
-    bias: NDArray[np.float64],
+    truth: xr.Dataset,
     train: Path,
     test: Path,
 ) -> None:
@@ -185,7 +200,7 @@ def write_logs(
     Args:
         generator: Source of randomness.
         entry: The sensor.
-        bias: (imu, recording, axis), deg/s.
+        truth: From :func:`draw_biases`.
         train: File for the first ``entry.train_recordings`` recordings.
         test: File for the other recordings.
     """
@@ -202,8 +217,13 @@ def write_logs(
             model.noise_mdps_rts[axis] * MDPS,
             lag1_correlation=model.lag1_correlation,
             flicker_dps=model.flicker_mdps * MDPS,
+            random_walk_dps_rts=model.random_walk_mdps_per_rts * MDPS,
         )
-        rates = bias[imu, :, axis, None] + noise
+        rates = truth.true_bias.to_numpy()[imu, :, axis, None] + noise
+        if model.warm_up is not None:
+            amplitude = truth.true_amplitude.to_numpy()[imu, :, axis]
+            constant_s = np.full(amplitude.shape, model.warm_up.time_constant_s)
+            rates += warm_up(amplitude, constant_s, entry.samples, entry.rate_hz)
         train_array[:, gyroscope], test_array[:, gyroscope] = rates[:cut], rates[cut:]
     train_array.flush()
     test_array.flush()

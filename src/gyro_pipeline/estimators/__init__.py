@@ -8,10 +8,11 @@ from gyro_pipeline.estimators.base import (
     Estimates,
     Estimator,
     FittedEstimator,
-    duration_s,
 )
 from gyro_pipeline.estimators.linear import BestLinear, Ridge
+from gyro_pipeline.estimators.networks import ResidualNetwork, WindowMeanNetwork
 from gyro_pipeline.estimators.shrinkage import EmpiricalBayes, LastCalibration, TrainingMean
+from gyro_pipeline.estimators.training import TrainingRecordings
 
 __all__ = [
     "DEFAULT",
@@ -24,11 +25,13 @@ __all__ = [
     "FittedEstimator",
     "LastCalibration",
     "Median",
+    "ResidualNetwork",
     "Ridge",
     "RunningMean",
     "TrainingMean",
+    "TrainingRecordings",
     "TrimmedMean",
-    "duration_s",
+    "WindowMeanNetwork",
 ]
 
 ESTIMATORS: Mapping[str, Callable[[], FittedEstimator]] = {
@@ -45,8 +48,10 @@ ESTIMATORS: Mapping[str, Callable[[], FittedEstimator]] = {
     "best_linear_history": lambda: BestLinear(history=True),
     "ridge": Ridge,
     "ridge_same_time": lambda: Ridge(same_time=True),
+    "window_mean_network": WindowMeanNetwork,
+    "residual_network": ResidualNetwork,
 }
-"""All estimators without a network, by the name that runs and tables give them."""
+"""All estimators but the paper's network, by the name that runs and tables give them."""
 
 DEFAULT = "best_linear"
 """What to use where nothing else is known: its sigma holds on coloured noise as well."""

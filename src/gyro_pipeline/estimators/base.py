@@ -1,5 +1,6 @@
 """The one interface of all estimators, and what they share."""
 
+from dataclasses import dataclass
 from typing import Protocol, Self
 
 import numpy as np
@@ -7,6 +8,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from gyro_pipeline.conventions import BIAS, RECORDING_MEAN, TEST_IMU, InputError
+from gyro_pipeline.estimators.training import TrainingRecordings
 
 Estimates = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Biases (n, 3) and their standard deviations (n, 3), deg/s; NaN where a method has none."""
@@ -52,55 +54,80 @@ class Estimator(Protocol):
         """
 
 
-class FittedEstimator(Estimator, Protocol):
-    """An estimator that learns from training recordings."""
+@dataclass(frozen=True)
+class Windows:
+    """What :meth:`Estimator.estimate` is asked, with a start for every window.
 
-    def fit(self, recordings: xr.Dataset, imu: int = TEST_IMU) -> Self:
+    Attributes:
+        samples: (n, gyroscopes, samples), deg/s.
+        target: BIAS or RECORDING_MEAN.
+        start_s: (n,), seconds after power-on.
+        recording: Number of the recording, or None.
+    """
+
+    samples: NDArray[np.floating]
+    target: str
+    start_s: NDArray[np.float64]
+    recording: int | None
+
+
+class FittedEstimator:
+    """Base of the estimators that learn from training recordings.
+
+    A subclass gives ``_estimate``, ``_fit`` if it learns more than the rate and the length of
+    recordings, and the two marks of :class:`Estimator`.
+    """
+
+    recommended = False
+    uses_prior = False
+    _rate_hz = np.nan
+    _recording_s = np.nan
+
+    def fit(self, recordings: xr.Dataset | TrainingRecordings, imu: int = TEST_IMU) -> Self:
         """Learn from training recordings, and from nothing else.
 
         Args:
-            recordings: As in :mod:`gyro_pipeline.conventions`.
+            recordings: As in :mod:`gyro_pipeline.conventions`; or with the device, to share what
+                is learned with other estimators.
             imu: Whose windows will be seen. A device that is not among the recordings is an unseen
                 one: its prior is the spread from unit to unit.
 
         Returns:
             Itself.
         """
+        if isinstance(recordings, xr.Dataset):
+            recordings = TrainingRecordings(recordings, imu)
+        self._rate_hz, self._recording_s = recordings.rate_hz, recordings.recording_s
+        self._fit(recordings)
+        return self
+
+    def estimate(
+        self,
+        windows: NDArray[np.floating],
+        target: str = BIAS,
+        start_s: ArrayLike = 0.0,
+        recording: int | None = None,
+    ) -> Estimates:
+        """See :class:`Estimator`.
+
+        Raises:
+            InputError: An unknown target.
+        """
+        if target not in (RECORDING_MEAN, BIAS):
+            raise InputError(f"target: expected {RECORDING_MEAN!r} or {BIAS!r}, got {target!r}")
+        starts = np.broadcast_to(np.asarray(start_s, np.float64), len(windows))
+        biases, sigma = self._estimate(Windows(windows, target, starts, recording))
+        shape = windows.shape[:2]
+        return np.broadcast_to(biases, shape), np.broadcast_to(sigma, shape)
+
+    def _fit(self, training: TrainingRecordings) -> None:
+        """Nothing to learn."""
+
+    def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
+        """Biases and their sigma, of any shapes that broadcast to (n, gyroscopes)."""
+        raise NotImplementedError
 
 
 ORIENTATION_NOTE = (
     "uses a stored prior, which holds only in the orientation and at the latitude it was learned in"
 )
-
-
-def check_target(target: str) -> None:
-    """Refuse an unknown target."""
-    if target not in (RECORDING_MEAN, BIAS):
-        raise InputError(f"target: expected {RECORDING_MEAN!r} or {BIAS!r}, got {target!r}")
-
-
-def samples_of(recordings: xr.Dataset, imu: int) -> NDArray[np.floating]:
-    """Recordings of one IMU that it has, (recordings, axes, samples), deg/s."""
-    rates = recordings.angular_rate.sel(imu=imu).transpose("recording", "axis", "sample").to_numpy()
-    return rates[np.isfinite(rates[..., 0]).all(axis=-1)]
-
-
-def labels_of(recordings: xr.Dataset, imu: int) -> tuple[NDArray[np.integer], NDArray[np.float64]]:
-    """Numbers (n,) and means (n, axes), deg/s, of the recordings that an IMU has, in order."""
-    chosen = recordings.angular_rate.sel(imu=imu).transpose("recording", "axis", "sample")
-    means = chosen.mean("sample", dtype=np.float64, skipna=False).to_numpy()
-    present = np.isfinite(means).all(axis=1)
-    numbers = chosen.recording.to_numpy()[present]
-    order = np.argsort(numbers)
-    return numbers[order], means[present][order]
-
-
-def known_imus(recordings: xr.Dataset, imu: int) -> list[int]:
-    """Where to learn about a device: from itself, or from all others if it is an unseen one."""
-    numbers = [int(number) for number in recordings.imu]
-    return [imu] if imu in numbers else numbers
-
-
-def duration_s(recordings: xr.Dataset) -> float:
-    """T, seconds."""
-    return float(recordings.sizes["sample"] / recordings.attrs["rate_hz"])

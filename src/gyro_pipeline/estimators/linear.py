@@ -1,28 +1,19 @@
 """Linear estimators on block means: the best linear predictor, and ridge regression."""
 
 from dataclasses import replace
-from typing import ClassVar, Self
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from gyro_pipeline.conventions import BIAS, PAPER, RECORDING_MEAN, TEST_IMU, TRUE, InputError
-from gyro_pipeline.estimators.base import (
-    Estimates,
-    check_target,
-    known_imus,
-    labels_of,
-    samples_of,
-)
-from gyro_pipeline.estimators.noise import allan_fit
-from gyro_pipeline.physics.allan import NoiseFigures
+from gyro_pipeline.conventions import BIAS, PAPER, RECORDING_MEAN, TRUE, InputError
+from gyro_pipeline.estimators.base import FittedEstimator, Windows
+from gyro_pipeline.estimators.training import TrainingRecordings
 from gyro_pipeline.physics.history import BiasHistory
 from gyro_pipeline.physics.recording_model import (
     BLOCK_S,
     LinearEstimate,
     RecordingModel,
-    best_linear,
+    WindowModel,
     block_edges,
     block_means,
 )
@@ -34,7 +25,51 @@ _FLAT = 1e6
 _PENALTIES, _FOLDS = 41, 10
 
 
-class BestLinear:
+_Place = tuple[int, int, int, str, int | None]
+"""Axis, first sample, samples, target and number of the recording."""
+
+
+class _Linear(FittedEstimator):
+    """Weighted sums of the block means of a window, by the axis and the place of the window."""
+
+    _by_start = True
+    _by_recording = False
+    """Whether the weights depend on when the window starts, and on which recording it is from."""
+
+    def _fit(self, training: TrainingRecordings) -> None:
+        self._lines: dict[_Place, LinearEstimate] = {}
+
+    def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
+        samples = windows.samples
+        starts = np.rint(windows.start_s * self._rate_hz).astype(int) * self._by_start
+        starts, which = np.unique(starts, return_inverse=True)
+        shape = len(starts), samples.shape[1]
+        number = windows.recording if self._by_recording else None
+        lines = [
+            self._remembered(axis, start, samples.shape[-1], windows.target, number)
+            for start in starts.tolist()
+            for axis in range(shape[1])
+        ]
+        weights = np.stack([line.weights for line in lines]).reshape(*shape, -1)
+        constants = np.reshape([line.constant for line in lines], shape)
+        variance = np.reshape([line.variance for line in lines], shape)
+        sigma = np.sqrt(np.maximum(variance, 0.0))  # of a whole recording it is 0, but for rounding
+        means = block_means(samples, lines[0].edges)
+        return np.sum(means * weights[which], axis=-1) + constants[which], sigma[which]
+
+    def _remembered(self, *place: *_Place) -> LinearEstimate:
+        if place not in self._lines:
+            self._lines[place] = self._line(*place)
+        return self._lines[place]
+
+    def _line(
+        self, axis: int, start: int, size: int, target: str, recording: int | None
+    ) -> LinearEstimate:
+        """What is estimated at one place."""
+        raise NotImplementedError
+
+
+class BestLinear(_Linear):
     """The best linear predictor under the fitted noise and prior, axis by axis.
 
     White noise, bias instability, rate random walk, the turn-on spread and, if asked for, a
@@ -50,79 +85,63 @@ class BestLinear:
     then that from unit to unit. Where fewer than three devices are known, the prior is flat.
 
     Args:
-        warm_up: Whether the sensor warms up.
+        warm_up: Whether the sensor warms up; None: if its recordings say so.
         noise: ``"reml"``: N, B and K fitted together with the prior; ``"allan"``: from the Allan
             fit, which does not know of warm-up.
         history: Whether the prior of a recording follows from the device's calibrations before
             it, in their order (:mod:`gyro_pipeline.physics.history`). For a bias that drifts from
             one recording to the next.
+
+    Fitting needs three training recordings at least.
     """
 
-    uses_prior: ClassVar[bool] = True
+    uses_prior = True
 
-    def __init__(self, warm_up: bool = False, noise: str = "reml", history: bool = False) -> None:
+    def __init__(
+        self, warm_up: bool | None = False, noise: str = "reml", history: bool = False
+    ) -> None:
         if noise not in ("reml", "allan"):
             raise InputError(f"noise: expected 'reml' or 'allan', got {noise!r}")
         self.recommended = noise == "reml"  # the Allan fit knows nothing of warm-up
-        self._warm_up, self._noise, self._history = warm_up, noise, history
+        self._warm_up, self._allan, self._by_recording = warm_up, noise == "allan", history
 
-    def fit(self, recordings: xr.Dataset, imu: int = TEST_IMU) -> Self:
-        """See :class:`~gyro_pipeline.estimators.FittedEstimator`.
+    def _fit(self, training: TrainingRecordings) -> None:
+        super()._fit(training)
+        axes = training.rates.swapaxes(0, 1)
+        noise = training.noise_figures if self._allan else [None] * len(axes)
+        self.models = [
+            fit_recording_model(rates, training.rate_hz, self._warm_up, figures)
+            for rates, figures in zip(axes, noise, strict=True)
+        ]
+        """What was fitted, one for each axis."""
+        self._histories: list[BiasHistory] = []
+        if not training.seen:
+            self.models = [_of_unseen(model, len(training.known)) for model in self.models]
+        elif self._by_recording:
+            numbers, labels = training.labels
+            of_axes = zip(labels.T, self.models, strict=True)
+            self._histories = [BiasHistory.fit(numbers, *one) for one in of_axes]
+        self._priors: dict[tuple[int, int | None], RecordingModel] = {}
+        self._windows: dict[tuple[int, int, int, str], WindowModel] = {}
 
-        Raises:
-            InputError: Fewer than three training recordings.
-        """
-        known, rate_hz = known_imus(recordings, imu), float(recordings.attrs["rate_hz"])
-        seen = known == [imu]
-        rates = np.concatenate([samples_of(recordings, one) for one in known])
-        axes = range(rates.shape[1])
-        figures: list[NoiseFigures | None] = [None for _ in axes]
-        if self._noise == "allan":
-            figures = [*allan_fit(recordings, imu)]
-        fits = [fit_recording_model(rates[:, a], rate_hz, self._warm_up, figures[a]) for a in axes]
-        self._axes = fits if seen else [_of_unseen(model, len(known)) for model in fits]
-        self._histories: list[BiasHistory] | None = None
-        if self._history and seen:
-            numbers, labels = labels_of(recordings, imu)
-            self._histories = [
-                BiasHistory.fit(numbers, labels[:, a], model) for a, model in enumerate(fits)
-            ]
-        self._estimates: dict[tuple[int, int, int, str, int | None], LinearEstimate] = {}
-        return self
-
-    def estimate(
-        self,
-        windows: NDArray[np.floating],
-        target: str = BIAS,
-        start_s: ArrayLike = 0.0,
-        recording: int | None = None,
-    ) -> Estimates:
-        """See :class:`~gyro_pipeline.estimators.Estimator`."""
-        check_target(target)
-        rate_hz, size = self._axes[0].rate_hz, windows.shape[-1]
-        starts = np.broadcast_to(np.rint(np.asarray(start_s) * rate_hz).astype(int), len(windows))
-        biases = np.empty(windows.shape[:2])
-        sigma = np.empty(windows.shape[:2])
-        for start in np.unique(starts):
-            chosen = starts == start
-            for axis in range(windows.shape[1]):
-                best = self._best(axis, int(start), size, target, recording)
-                biases[chosen, axis] = best(windows[chosen, axis])
-                sigma[chosen, axis] = np.sqrt(best.variance)
-        return biases, sigma
-
-    def _best(
+    def _line(
         self, axis: int, start: int, size: int, target: str, recording: int | None
     ) -> LinearEstimate:
-        """Weights for one axis and place of the window, worked out once."""
-        key = axis, start, size, target, recording if self._histories else None
-        if key not in self._estimates:
-            model = self._axes[axis]
-            if self._histories:
-                model = self._histories[axis].prior(model, recording)
+        prior = self._prior(axis, recording)
+        key = axis, start, size, target
+        if key not in self._windows:
             truth = PAPER if target == RECORDING_MEAN else TRUE
-            self._estimates[key] = best_linear(model, start, size, truth)
-        return self._estimates[key]
+            self._windows[key] = WindowModel.of(prior, start, size, truth)
+        return self._windows[key].best(prior.mean, prior.covariance)
+
+    def _prior(self, axis: int, recording: int | None) -> RecordingModel:
+        """What is known before a window of this recording is seen."""
+        if not self._histories:
+            return self.models[axis]
+        if (axis, recording) not in self._priors:
+            prior = self._histories[axis].prior(self.models[axis], recording)
+            self._priors[axis, recording] = prior
+        return self._priors[axis, recording]
 
 
 def _of_unseen(model: RecordingModel, devices: int) -> RecordingModel:
@@ -133,7 +152,7 @@ def _of_unseen(model: RecordingModel, devices: int) -> RecordingModel:
     return replace(model, covariance=covariance)
 
 
-class Ridge:
+class Ridge(_Linear):
     """Ridge regression of the target on the block means of the window.
 
     It knows no model: one regression per axis, from all non-overlapping training windows, towards
@@ -145,54 +164,28 @@ class Ridge:
             time after power-on, which a sensor that warms up needs.
     """
 
-    recommended: ClassVar[bool] = False
-    uses_prior: ClassVar[bool] = True
+    uses_prior = True
 
     def __init__(self, same_time: bool = False) -> None:
-        self._same_time = same_time
+        self._by_start = same_time
 
-    def fit(self, recordings: xr.Dataset, imu: int = TEST_IMU) -> Self:
-        """See :class:`~gyro_pipeline.estimators.FittedEstimator`."""
-        self._rate_hz = float(recordings.attrs["rate_hz"])
-        known = [samples_of(recordings, one) for one in known_imus(recordings, imu)]
-        self._rates = np.concatenate(known)
+    def _fit(self, training: TrainingRecordings) -> None:
+        super()._fit(training)
+        self._rates = training.rates
         self._means = self._rates.mean(axis=-1, dtype=np.float64)
-        self._lines: dict[tuple[int, int | None, int, str], LinearEstimate] = {}
-        return self
 
-    def estimate(
-        self,
-        windows: NDArray[np.floating],
-        target: str = BIAS,
-        start_s: ArrayLike = 0.0,
-        recording: int | None = None,
-    ) -> Estimates:
-        """See :class:`~gyro_pipeline.estimators.Estimator`; sigma is NaN."""
-        check_target(target)
-        starts = np.rint(np.asarray(start_s) * self._rate_hz).astype(int)
-        starts = np.broadcast_to(starts if self._same_time else 0, len(windows))
-        biases = np.empty(windows.shape[:2])
-        for start in np.unique(starts):
-            chosen = starts == start
-            for axis in range(windows.shape[1]):
-                line = self._line(axis, int(start), windows.shape[-1], target)
-                biases[chosen, axis] = line(windows[chosen, axis])
-        return biases, np.full(biases.shape, np.nan)
-
-    def _line(self, axis: int, start: int, size: int, target: str) -> LinearEstimate:
-        key = axis, start, size, target
-        if key not in self._lines:
-            edges = block_edges(size, round(BLOCK_S * self._rate_hz))
-            rates, samples = self._rates[:, axis], self._rates.shape[-1]
-            count = 1 if self._same_time else samples // size
-            windows = rates[:, start : start + count * size].reshape(len(rates), count, size)
-            blocks = block_means(windows, edges)
-            aims = np.repeat(self._means[:, axis, None], count, axis=1)
-            if target == BIAS:
-                aims = (aims * samples - blocks @ np.diff(edges)) / (samples - size)
-            weights, constant = ridge_regression(blocks, aims)
-            self._lines[key] = LinearEstimate(edges, weights, constant, np.nan)
-        return self._lines[key]
+    def _line(
+        self, axis: int, start: int, size: int, target: str, recording: int | None
+    ) -> LinearEstimate:
+        edges = block_edges(size, round(BLOCK_S * self._rate_hz))
+        rates, samples = self._rates[:, axis], self._rates.shape[-1]
+        count = 1 if self._by_start else samples // size
+        windows = rates[:, start : start + count * size].reshape(len(rates), count, size)
+        blocks = block_means(windows, edges)
+        aims = np.repeat(self._means[:, axis, None], count, axis=1)
+        if target == BIAS:
+            aims = (aims * samples - blocks @ np.diff(edges)) / (samples - size)
+        return LinearEstimate(edges, *ridge_regression(blocks, aims), np.nan)
 
 
 def ridge_regression(

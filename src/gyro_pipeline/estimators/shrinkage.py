@@ -1,59 +1,31 @@
 """Estimators that know the device's past: a constant, the last calibration, empirical Bayes."""
 
-from typing import ClassVar, Self
-
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from gyro_pipeline.conventions import BIAS, RECORDING_MEAN, TEST_IMU
-from gyro_pipeline.estimators.base import (
-    Estimates,
-    check_target,
-    duration_s,
-    known_imus,
-    labels_of,
-)
-from gyro_pipeline.estimators.noise import white_noise
+from gyro_pipeline.conventions import BIAS, RECORDING_MEAN
+from gyro_pipeline.estimators.base import FittedEstimator, Windows
+from gyro_pipeline.estimators.training import TrainingRecordings
 from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, guarded_spread
 
 
-class TrainingMean:
+class TrainingMean(FittedEstimator):
     """The mean of the training recordings' means: a constant that ignores the window.
 
     For an unseen device it is the mean of the others, which is worth nothing; that is the point.
     """
 
-    recommended: ClassVar[bool] = False
-    uses_prior: ClassVar[bool] = True
+    uses_prior = True
 
-    def fit(self, recordings: xr.Dataset, imu: int = TEST_IMU) -> Self:
-        """See :class:`~gyro_pipeline.estimators.FittedEstimator`."""
-        self._learn(recordings, imu)
-        self._noise = white_noise(recordings, imu)
-        self._recording_s = duration_s(recordings)
-        return self
+    def _fit(self, training: TrainingRecordings) -> None:
+        self._noise = training.white_noise
+        self._numbers, self._labels = training.labels
 
-    def _learn(self, recordings: xr.Dataset, imu: int) -> None:
-        known = [labels_of(recordings, one) for one in known_imus(recordings, imu)]
-        self._numbers = np.concatenate([numbers for numbers, _ in known])
-        self._labels = np.concatenate([means for _, means in known])
-
-    def estimate(
-        self,
-        windows: NDArray[np.floating],
-        target: str = BIAS,
-        start_s: ArrayLike = 0.0,
-        recording: int | None = None,
-    ) -> Estimates:
-        """See :class:`~gyro_pipeline.estimators.Estimator`."""
-        check_target(target)
-        biases, of_estimate = self.constant(recording)
+    def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
+        biases, of_estimate = self.constant(windows.recording)
         scatter = self._labels.var(axis=0, ddof=1) if len(self._labels) > 1 else np.nan
-        own = self._noise**2 / self._recording_s if target == BIAS else 0.0
-        sigma = np.sqrt(np.maximum(scatter - own, 0.0) + of_estimate * scatter)
-        shape = len(windows), self._labels.shape[1]
-        return np.broadcast_to(biases, shape), np.broadcast_to(sigma, shape)
+        own = self._noise**2 / self._recording_s if windows.target == BIAS else 0.0
+        return biases, np.sqrt(np.maximum(scatter - own, 0.0) + of_estimate * scatter)
 
     def constant(self, recording: int | None) -> tuple[NDArray[np.float64], float]:
         """The estimate (3,), and its own variance in units of the scatter of the labels."""
@@ -68,9 +40,9 @@ class LastCalibration(TrainingMean):
     training mean of the others.
     """
 
-    def _learn(self, recordings: xr.Dataset, imu: int) -> None:
-        super()._learn(recordings, imu)
-        if known_imus(recordings, imu) != [imu]:
+    def _fit(self, training: TrainingRecordings) -> None:
+        super()._fit(training)
+        if not training.seen:
             self._numbers = np.full(self._numbers.shape, np.inf)
 
     def constant(self, recording: int | None) -> tuple[NDArray[np.float64], float]:
@@ -81,7 +53,7 @@ class LastCalibration(TrainingMean):
         return self._labels[past][-1], 1.0
 
 
-class EmpiricalBayes:
+class EmpiricalBayes(FittedEstimator):
     """The posterior mean of the bias under a prior learned from training recordings.
 
     The bias of a power-on is Normal(mu, tau^2) and the noise white. With N from the Allan fit, mu
@@ -103,72 +75,62 @@ class EmpiricalBayes:
             alike, worse where they are not, as on the public Memsense recordings.
     """
 
-    uses_prior: ClassVar[bool] = True
+    uses_prior = True
 
     def __init__(self, pooled: bool = False) -> None:
         self.recommended = not pooled
         self._pooled = pooled
 
-    def fit(self, recordings: xr.Dataset, imu: int = TEST_IMU) -> Self:
-        """See :class:`~gyro_pipeline.estimators.FittedEstimator`."""
-        self._noise = white_noise(recordings, imu)
-        self._rate_hz = float(recordings.attrs["rate_hz"])
-        self._recording_s = duration_s(recordings)
-        labels, averaging = self._labels(recordings, imu)
+    def _fit(self, training: TrainingRecordings) -> None:
+        self._noise = training.white_noise
+        labels, averaging = self._labels(training)
         self._mean = labels.mean(axis=0)
-        scatter = self._spread(recordings, labels, averaging) ** 2
+        scatter = self._spread(training, labels, averaging) ** 2
         self._prior = scatter + (scatter + averaging) / len(labels)
-        return self
 
     def _labels(
-        self, recordings: xr.Dataset, imu: int
+        self, training: TrainingRecordings
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Labels (n, 3) of the prior and their averaging noise (3,): recordings or devices."""
-        known = known_imus(recordings, imu)
-        if known == [imu]:
-            return labels_of(recordings, imu)[1], self._noise**2 / self._recording_s
-        means = [labels_of(recordings, one)[1].mean(axis=0) for one in known]
+        if training.seen:
+            return training.labels[1], self._noise**2 / self._recording_s
+        means = [training.of(imu).labels[1].mean(axis=0) for imu in training.known]
         return np.stack(means), np.zeros(len(self._noise))
 
     def _spread(
-        self, recordings: xr.Dataset, labels: NDArray[np.float64], averaging: NDArray[np.float64]
+        self,
+        training: TrainingRecordings,
+        labels: NDArray[np.float64],
+        averaging: NDArray[np.float64],
     ) -> NDArray[np.float64]:
         """The tau of each axis, (3,)."""
         if self._pooled and averaging.any():
-            return np.full(averaging.shape, self._pooled_spread(recordings))
+            return np.full(averaging.shape, self._pooled_spread(training))
         if len(labels) < FEWEST_RECORDINGS:
             return np.full(averaging.shape, np.inf)
         scatter, freedom = labels.var(axis=0) * len(labels), len(labels) - 1
         groups = zip(scatter, averaging, strict=True)
         return np.array([guarded_spread(square, freedom, v) for square, v in groups])
 
-    def _pooled_spread(self, recordings: xr.Dataset) -> float:
+    def _pooled_spread(self, training: TrainingRecordings) -> float:
         scatter, freedom, averaging = [], [], []
-        for imu in recordings.imu.to_numpy():
-            labels = labels_of(recordings, imu)[1]
+        for one in map(training.of, training.imus):
+            labels = one.labels[1]
             scatter.append(labels.var(axis=0) * len(labels))
             freedom.append(np.full(labels.shape[1], len(labels) - 1))
-            averaging.append(white_noise(recordings, imu) ** 2 / self._recording_s)
+            averaging.append(one.white_noise**2 / self._recording_s)
         if np.sum(freedom) < FEWEST_RECORDINGS - 1:
             return np.inf
         return guarded_spread(*map(np.concatenate, (scatter, freedom, averaging)))
 
-    def estimate(
-        self,
-        windows: NDArray[np.floating],
-        target: str = BIAS,
-        start_s: ArrayLike = 0.0,
-        recording: int | None = None,
-    ) -> Estimates:
-        """See :class:`~gyro_pipeline.estimators.Estimator`."""
-        check_target(target)
-        means = windows.mean(axis=-1, dtype=np.float64)
-        window_s = windows.shape[-1] / self._rate_hz
+    def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
+        means = windows.samples.mean(axis=-1, dtype=np.float64)
+        window_s = windows.samples.shape[-1] / self._rate_hz
         averaging = self._noise**2 / window_s
         beta = 1 / (1 + averaging / self._prior)
-        r = window_s / self._recording_s if target == RECORDING_MEAN else 0.0
+        r = window_s / self._recording_s if windows.target == RECORDING_MEAN else 0.0
         variance = (1 - r) ** 2 * beta * averaging
-        if target == RECORDING_MEAN:  # and what the rest of the recording is off from the bias
+        if windows.target == RECORDING_MEAN:  # and what the rest is off from the bias
             variance += (1 - r) * self._noise**2 / self._recording_s
         biases = r * means + (1 - r) * (self._mean + beta * (means - self._mean))
-        return biases, np.broadcast_to(np.sqrt(variance), biases.shape)
+        return biases, np.sqrt(variance)

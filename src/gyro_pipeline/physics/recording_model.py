@@ -17,7 +17,7 @@ than the time at which flicker equals white noise, 2 pi N^2 / B^2 (20 s for N = 
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,6 +92,33 @@ class LinearEstimate:
         return self.constant + block_means(windows, self.edges) @ self.weights
 
 
+def innovations(
+    model: RecordingModel,
+    start: int,
+    windows: NDArray[np.floating],
+    block_s: float = BLOCK_S,
+) -> NDArray[np.float64]:
+    """What each block of a window adds to the blocks before it, in units of its own scatter.
+
+    If the model holds these are independent and normal, with mean 0 and variance 1, and independent
+    of the error of :func:`best_linear`: there is nothing left to learn from them.
+
+    Args:
+        model: What is known before.
+        start: First sample of the windows, counted from power-on.
+        windows: (n, samples), deg/s.
+        block_s: See :func:`best_linear`.
+
+    Returns:
+        (n, m).
+    """
+    window = WindowModel.of(model, start, windows.shape[-1], PAPER, block_s)
+    deviations = block_means(windows, window.edges) - window.design @ model.mean
+    prior = window.design @ model.covariance @ window.design.T
+    root = np.linalg.cholesky(window.covariance + prior)
+    return np.asarray(linalg.solve_triangular(root, deviations.T, lower=True).T)
+
+
 def best_linear(
     model: RecordingModel, start: int, size: int, truth: str, block_s: float = BLOCK_S
 ) -> LinearEstimate:
@@ -112,11 +139,7 @@ def best_linear(
     Raises:
         InputError: A window that is not inside the recording, or an unknown truth.
     """
-    joint = _Joint.of(model, start, size, truth, block_s)
-    weights = linalg.solve(joint.covariance, joint.shared, assume_a="pos")
-    variance = joint.truth_variance - weights @ joint.shared
-    constant = joint.truth_mean - weights @ joint.mean
-    return LinearEstimate(joint.edges - start, weights, float(constant), float(variance))
+    return WindowModel.of(model, start, size, truth, block_s).best(model.mean, model.covariance)
 
 
 def mean_squares(
@@ -141,30 +164,70 @@ def mean_squares(
     Raises:
         InputError: A window that is not inside the recording, or an unknown truth.
     """
-    joint = _Joint.of(model, start, size, truth, block_s)
-    weights = np.diff(joint.edges) / size
-    offset = weights @ joint.mean - joint.truth_mean
-    variance = weights @ (joint.covariance @ weights - 2 * joint.shared) + joint.truth_variance
-    best = best_linear(model, start, size, truth, block_s).variance
-    return best - joint.truth_noise, float(variance + offset**2 - joint.truth_noise)
+    window = WindowModel.of(model, start, size, truth, block_s)
+    weights = np.diff(window.edges) / size
+    off = weights @ window.design - window.coefficients
+    variance = off @ model.covariance @ off + window.own
+    variance += weights @ (window.covariance @ weights - 2 * window.shared)
+    best = window.best(model.mean, model.covariance).variance
+    averaging = window.own if truth == DISJOINT else 0.0
+    return best - averaging, float(variance + (off @ model.mean) ** 2 - averaging)
 
 
-@dataclass(frozen=True)
-class _Joint:
-    """The joint normal distribution of a window's block means and a truth."""
+@lru_cache(maxsize=1 << 16)  # a curve asks for the same in every recording
+def outside_noise(
+    noise: NoiseFigures, samples: int, rate_hz: float, start: int, size: int
+) -> float:
+    """Averaging noise of the mean of the samples outside a window, about the bias.
+
+    Args:
+        noise: N, B and K.
+        samples: Of the whole recording, more than ``size``.
+        rate_hz: Samples per second.
+        start: First sample of the window, counted from power-on.
+        size: Samples of the window.
+
+    Returns:
+        Variance, (deg/s)^2; N^2 / (T - T0) if the noise is white.
+    """
+    if noise.instability == 0 and noise.random_walk == 0:
+        return noise.white**2 * rate_hz / (samples - size)
+    edges = np.unique([0, start, start + size, samples])
+    lengths = np.where(edges[:-1] == start, 0, np.diff(edges))
+    figures = noise.white, noise.instability, noise.random_walk
+    covariance = np.tensordot(
+        np.square(figures), noise_covariances(edges, samples, rate_hz), axes=1
+    )
+    return float(lengths @ covariance @ lengths) / (samples - size) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class WindowModel:
+    """A window's block means y and a truth, before anything is known of bias and amplitude c.
+
+    y = X c + e and the truth is g c + f, with the noise e and f.
+
+    Attributes:
+        edges: Of the blocks within the window, (m + 1,), samples.
+        design: X, (m, 1) or (m, 2).
+        coefficients: g, (1,) or (2,).
+        covariance: Of e, (m, m), (deg/s)^2.
+        shared: Covariance of e and f, (m,).
+        own: Variance of f.
+    """
 
     edges: NDArray[np.integer]
-    mean: NDArray[np.float64]
+    design: NDArray[np.float64]
+    coefficients: NDArray[np.float64]
     covariance: NDArray[np.float64]
     shared: NDArray[np.float64]
-    truth_mean: float
-    truth_variance: float
-    truth_noise: float
+    own: float
 
     @classmethod
     def of(
-        cls, model: RecordingModel, start: int, size: int, truth: str, block_s: float
-    ) -> "_Joint":
+        cls, model: RecordingModel, start: int, size: int, truth: str, block_s: float = BLOCK_S
+    ) -> "WindowModel":
+        """The same for every prior of the model; see :func:`best_linear`."""
         stop = start + size
         if not 0 <= start < stop <= model.samples:
             raise InputError(
@@ -175,32 +238,55 @@ class _Joint:
         edges = np.unique([0, *inner, model.samples])
         inside = (edges[:-1] >= start) & (edges[1:] <= stop)
         profile, noise = model.profiles(edges), model.noise_covariance(edges)
-        lengths = np.diff(edges)
-        # the truth is coefficients @ (bias, amplitude) + averaging @ (noise of all blocks)
-        if truth == PAPER:
-            averaging = lengths / model.samples
-        elif truth == DISJOINT and size < model.samples:
-            averaging = np.where(inside, 0, lengths) / (model.samples - size)
-        elif truth == TRUE:
-            averaging = np.zeros(lengths.size)
-        else:
-            raise InputError(
-                f"truth: expected {PAPER!r}, {DISJOINT!r} (for a window shorter than the "
-                f"recording) or {TRUE!r}, got {truth!r}"
-            )
-        coefficients = np.eye(model.mean.size)[0] if truth == TRUE else averaging @ profile
-        covariance = profile @ model.covariance @ profile.T + noise
-        shared = profile @ model.covariance @ coefficients + noise @ averaging
-        own = averaging @ noise @ averaging
+        averaging = _averaging(np.diff(edges), inside, truth)
         return cls(
-            inner,
-            (profile @ model.mean)[inside],
-            covariance[np.ix_(inside, inside)],
-            shared[inside],
-            float(coefficients @ model.mean),
-            float(coefficients @ model.covariance @ coefficients + own),
-            float(own) if truth == DISJOINT else 0.0,
+            inner - start,
+            profile[inside],
+            np.eye(model.mean.size)[0] if truth == TRUE else averaging @ profile,
+            noise[np.ix_(inside, inside)],
+            (noise @ averaging)[inside],
+            float(averaging @ noise @ averaging),
         )
+
+    @cached_property
+    def _solved(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The inverse of the covariance of e times ``shared``, (m,), and times X."""
+        both = np.column_stack([self.shared, self.design])
+        solved = linalg.solve(self.covariance, both, assume_a="pos")
+        return solved[:, 0], solved[:, 1:]
+
+    def best(self, mean: NDArray[np.float64], covariance: NDArray[np.float64]) -> LinearEstimate:
+        """The conditional mean of the truth given y, under a normal prior of c.
+
+        Args:
+            mean: Of the prior, (1,) or (2,), deg/s.
+            covariance: Of the prior, (deg/s)^2; may be singular.
+        """
+        of_noise, of_design = self._solved
+        information = self.design.T @ of_design
+        posterior = np.linalg.solve(np.eye(mean.size) + covariance @ information, covariance)
+        rest = self.coefficients - self.design.T @ of_noise  # how the truth depends on c, given y
+        weights = of_noise + of_design @ (posterior @ rest)
+        constant = rest @ (mean - posterior @ information @ mean)
+        variance = self.own - of_noise @ self.shared + rest @ posterior @ rest
+        return LinearEstimate(self.edges, weights, float(constant), float(variance))
+
+
+def _averaging(
+    lengths: NDArray[np.integer], inside: NDArray[np.bool_], truth: str
+) -> NDArray[np.float64]:
+    """Weights with which the noise of all blocks, (m,), enters a truth."""
+    if truth == PAPER:
+        return lengths / lengths.sum()
+    if truth == DISJOINT and not inside.all():
+        outside = np.where(inside, 0, lengths)
+        return outside / outside.sum()
+    if truth == TRUE:
+        return np.zeros(lengths.size)
+    raise InputError(
+        f"truth: expected {PAPER!r}, {DISJOINT!r} (for a window shorter than the recording) or "
+        f"{TRUE!r}, got {truth!r}"
+    )
 
 
 def block_edges(size: int, block: int) -> NDArray[np.integer]:

@@ -17,9 +17,12 @@ everything to the mean. Therefore log tau + log s is added, the weak prior of Ch
 recordings nowhere else than without it.
 """
 
+from dataclasses import dataclass
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import linalg, optimize
+from scipy import linalg, optimize, stats
 from threadpoolctl import threadpool_limits
 
 from gyro_pipeline.conventions import InputError
@@ -38,6 +41,7 @@ FEWEST_RECORDINGS = 3
 _BLOCK_S = 0.5
 _RANGE = 1e4  # of a standard deviation about its first guess
 _STEP = 1e-3  # of the numerical gradient, in logarithms
+_CHANCE = 0.2  # of fitting a warm-up, to no avail, where there is none
 _TIME_CONSTANTS = (0.02, 0.1, 0.3, 1.0, 3.0)  # of the recording: limits, and where searches start
 
 
@@ -45,7 +49,7 @@ _TIME_CONSTANTS = (0.02, 0.1, 0.3, 1.0, 3.0)  # of the recording: limits, and wh
 def fit_recording_model(
     recordings: NDArray[np.floating],
     rate_hz: float,
-    warm_up: bool = False,
+    warm_up: bool | None = False,
     noise: NoiseFigures | None = None,
 ) -> RecordingModel:
     """Fit the model of one gyroscope to whole recordings.
@@ -53,7 +57,9 @@ def fit_recording_model(
     Args:
         recordings: (n, samples), deg/s, from power-on; no NaN.
         rate_hz: Samples per second.
-        warm_up: Whether there is one; its time constant is the same in all recordings.
+        warm_up: Whether there is one; its time constant is the same in all recordings. None: if
+            the recordings say so, by the Bayesian information criterion (Schwarz 1978, Annals of
+            Statistics 6).
         noise: Known N, B and K; fitted together with the rest if None.
 
     Returns:
@@ -69,19 +75,46 @@ def fit_recording_model(
             f"{len(recordings)}; with fewer, use an estimator without a prior"
         )
     samples = recordings.shape[-1]
-    likelihood = _Likelihood(recordings, rate_hz, warm_up, noise)
-    best = min(
-        (likelihood.maximise(share * samples / rate_hz) for share in _TIME_CONSTANTS[1:-1])
-        if warm_up
-        else [likelihood.maximise(np.inf)],
-        key=lambda result: result.fun,
-    )
-    figures, spreads, time_constant_s = likelihood.unpack(best.x)
-    _, mean, uncertainty = likelihood.deviance(best.x)
+    means = block_means(recordings, block_edges(samples, round(_BLOCK_S * rate_hz)))
+    given = means.tobytes(), len(means), samples, rate_hz
+    stationary = _fitted(*given, bool(warm_up), noise)
+    if warm_up is not None or not stationary.warms_up:
+        return stationary.model
+    return min(stationary, _fitted(*given, True, noise), key=lambda fit: fit.criterion).model
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A model, its information criterion, and whether its residuals look like a warm-up."""
+
+    model: RecordingModel
+    criterion: float
+    warms_up: bool
+
+
+@lru_cache(maxsize=256)  # several estimators ask for the same
+def _fitted(  # noqa: PLR0917 - what a fit depends on
+    means: bytes,
+    count: int,
+    samples: int,
+    rate_hz: float,
+    warm_up: bool,
+    noise: NoiseFigures | None,
+) -> _Fit:
+    """Fit to the block means of so many recordings, float64."""
+    table = np.frombuffer(means).reshape(count, -1)
+    likelihood = _Likelihood(table, samples, rate_hz, warm_up, noise)
+    starts_s = [np.inf]
+    if warm_up:
+        starts_s = [share * samples / rate_hz for share in _TIME_CONSTANTS[1:-1]]
+    x = min(map(likelihood.maximise, starts_s), key=lambda result: result.fun).x
+    figures, spreads, time_constant_s = likelihood.unpack(x)
+    _, mean, uncertainty = likelihood.deviance(x)
     mean[0] += likelihood.offset
     covariance = np.diag(np.square(spreads)) + uncertainty
     fitted = noise or NoiseFigures(*map(float, figures))
-    return RecordingModel(samples, rate_hz, fitted, mean, covariance, time_constant_s)
+    model = RecordingModel(samples, rate_hz, fitted, mean, covariance, time_constant_s)
+    return _Fit(model, likelihood.criterion(x), not warm_up and likelihood.warms_up(x))
 
 
 def guarded_spread(scatter: ArrayLike, freedom: ArrayLike, averaging: ArrayLike) -> float:
@@ -121,16 +154,15 @@ class _Likelihood:
     warm-up of s and the time constant.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0917 - what a likelihood depends on
         self,
-        recordings: NDArray[np.floating],
+        means: NDArray[np.float64],
+        samples: int,
         rate_hz: float,
         warm_up: bool,
         noise: NoiseFigures | None,
     ) -> None:
-        samples = recordings.shape[-1]
         self.edges = block_edges(samples, round(_BLOCK_S * rate_hz))
-        means = block_means(recordings, self.edges)
         self.offset = float(means.mean())
         self.means = means - self.offset
         self.rate_hz, self.duration_s, self.warm_up = rate_hz, samples / rate_hz, warm_up
@@ -176,6 +208,38 @@ class _Likelihood:
         deviance += np.linalg.slogdet(information)[1]
         deviance += np.sum((y - (z @ mean)[:, None]) ** 2) - 2 * np.log(spreads).sum()
         return float(deviance), mean, np.linalg.inv(information)
+
+    def criterion(self, x: NDArray[np.float64]) -> float:
+        """-2 times the log-likelihood, plus log n for each parameter, spreads and means."""
+        deviance, mean, uncertainty = self.deviance(x)
+        _, spreads, _ = self.unpack(x)
+        # without what restricts it and without the weak prior
+        deviance += np.linalg.slogdet(uncertainty)[1] + 2 * np.log(spreads).sum()
+        return float(deviance + (x.size + mean.size) * np.log(len(self.means)))
+
+    def warms_up(self, x: NDArray[np.float64]) -> bool:
+        """Whether a decay from power-on explains more of the recordings than chance would.
+
+        Each recording's amplitude, fitted by generalised least squares, is normal with a known
+        variance if there is no warm-up; the squares of their sum and of each are then chi-squared.
+        """
+        figures, spreads, _ = self.unpack(x)
+        covariance = np.tensordot(np.square(figures), self.unit, axes=1) + spreads[0] ** 2
+        _, mean, _ = self.deviance(x)
+        root = np.linalg.cholesky(covariance)
+        shares = _TIME_CONSTANTS[1:-1]
+        decays = [
+            profiles(self.edges, self.rate_hz, share * self.duration_s)[:, 1] for share in shares
+        ]
+        both = np.column_stack([(self.means - mean[0]).T, *decays])
+        white = linalg.solve_triangular(root, both, lower=True, check_finite=False)
+        y, decay = white[:, : len(self.means)], white[:, len(self.means) :]
+        amplitudes = decay.T @ y / np.sqrt(np.sum(decay**2, axis=0))[:, None]  # in their sigma
+        count, looks = len(self.means), 2 * len(shares)
+        alike = np.abs(amplitudes.sum(axis=1)).max() / np.sqrt(count)
+        scatter = np.sum(amplitudes**2, axis=1).max()
+        chances = stats.chi2.sf([alike**2, scatter], [1, count])
+        return bool(chances.min() < _CHANCE / looks)
 
     def maximise(self, time_constant_s: float) -> optimize.OptimizeResult:
         """Search from the guess with this time constant."""

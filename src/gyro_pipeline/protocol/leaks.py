@@ -132,7 +132,7 @@ def strided_scores(
     """
     tested = curve[curve.recording.isin(errors.recording)]
     squares = strided_errors(errors), strided_errors(errors, "mean")
-    return score(*squares, curve_errors(tested, PAPER, ALL), window_s, weights)
+    return score(*squares, curve_errors(tested, PAPER, ALL).of(weights), window_s, weights)
 
 
 def _chosen(numbers: Sequence[int], starts: np.ndarray, mask: np.ndarray) -> dict[int, np.ndarray]:

@@ -79,6 +79,23 @@ class Curve:
     times_s: np.ndarray
     squares: SquaredErrors
 
+    def of(self, weights: np.ndarray) -> "ResampledCurve":
+        """The curve for each weighting of the recordings, (resamples, recordings)."""
+        return ResampledCurve(self.times_s, np.sqrt(np.maximum(self.squares.mean(weights), 0.0)))
+
+
+@dataclass(frozen=True)
+class ResampledCurve:
+    """RMSE of the running mean against its length, for each resample of the recordings.
+
+    Attributes:
+        times_s: Shape (times,), increasing, seconds.
+        rmse: Shape (resamples, times), deg/s.
+    """
+
+    times_s: np.ndarray
+    rmse: np.ndarray
+
 
 def curve_errors(curve: pd.DataFrame, truth: str, windows: str) -> Curve:
     """The chosen running-mean curve by recording, in order of recording number.
@@ -151,7 +168,7 @@ def equivalent_time(times_s: np.ndarray, curves: np.ndarray, levels: np.ndarray)
 def score(
     errors: SquaredErrors,
     mean_errors: SquaredErrors,
-    curve: Curve,
+    curve: ResampledCurve,
     window_s: float,
     weights: np.ndarray,
 ) -> dict[str, Estimate]:
@@ -160,7 +177,7 @@ def score(
     Args:
         errors: Of the estimator judged.
         mean_errors: Of the running mean on the same windows.
-        curve: Of the running mean.
+        curve: Of the running mean, for the same weights.
         window_s: T0, seconds.
         weights: From :func:`resampled_weights`.
 
@@ -176,12 +193,10 @@ def score(
     lowest = [s.lo if s.lo is not None else s.value for s in map(with_interval, (mse, mean_mse))]
     if min(lowest) < 0:
         return scores
-    rmse, mean_rmse, curves = (
-        np.sqrt(np.maximum(square, 0.0)) for square in (mse, mean_mse, curve.squares.mean(weights))
-    )
+    rmse, mean_rmse = (np.sqrt(np.maximum(square, 0.0)) for square in (mse, mean_mse))
     scores["test_rmse_dps"] = with_interval(rmse)
     scores["mean_rmse_dps"] = with_interval(mean_rmse)
-    times = equivalent_time(curve.times_s, curves, rmse)
+    times = equivalent_time(curve.times_s, curve.rmse, rmse)
     savings = np.where(np.isfinite(times), 1 - window_s / times, times)
     scores["equivalent_time_s"] = with_interval(times)
     scores["time_saving_pct"] = with_interval(100 * savings)

@@ -1,12 +1,17 @@
 """The truths an estimate is judged against, and the running mean's error against each."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import ALL, AXES, DISJOINT, FIRST, PAPER, TRUE
+from gyro_pipeline.physics.allan import NoiseFigures
+from gyro_pipeline.physics.recording_model import outside_noise
 
 CURVE_STEP_S = 0.25
 """Resolution of the running-mean curve; the equivalent time is interpolated between points."""
@@ -23,14 +28,14 @@ class TestRecording:
         number: Recording number.
         samples: Shape (3, n), deg/s.
         rate_hz: Sample rate, Hz.
-        noise: N per axis from training recordings (drawn, if simulated), (3,), deg/s sqrt(s).
+        noise: N, B and K of each axis from training recordings, or as drawn if simulated.
         true_bias: Drawn bias, shape (3,), deg/s; None on measured data.
     """
 
     number: int
     samples: np.ndarray
     rate_hz: float
-    noise: np.ndarray
+    noise: tuple[NoiseFigures, ...]
     true_bias: np.ndarray | None
 
     @cached_property
@@ -48,58 +53,84 @@ class TestRecording:
         """The truth for every window, with that truth's own averaging variance.
 
         ``PAPER``, the mean of the whole recording, counts as exact (the paper's definition).
-        ``DISJOINT``, the mean of the samples outside the window, is off by N^2 / (T - T0), which
-        is to be taken off the squared error. ``TRUE`` is the drawn bias of simulated data.
+        ``DISJOINT``, the mean of the samples outside the window, has an averaging noise of its own,
+        N^2 / (T - T0) if it is white, which is to be taken off the squared error. If noise is
+        coloured, what window and truth share stays in it. ``TRUE`` is the drawn bias of simulated
+        data.
 
         Args:
             size: Samples per window.
 
         Returns:
-            For each truth its value, shape (windows, 3) in deg/s, and variance, shape (3,).
+            For each truth its value in deg/s and its variance, both of shape (windows, 3).
         """
         n = self.samples.shape[-1]
         sums, total = self.window_sums(size), self.running_sums[:, -1]
-        exact = np.zeros(len(AXES))
+        exact = np.zeros(sums.shape)
         truths = {PAPER: (np.broadcast_to(total / n, sums.shape), exact)}
         if size < n:
-            variance = self.noise**2 * self.rate_hz / (n - size)
-            truths[DISJOINT] = ((total - sums) / (n - size), variance)
+            variance = [
+                [outside_noise(axis, n, self.rate_hz, window * size, size) for axis in self.noise]
+                for window in range(len(sums))
+            ]
+            truths[DISJOINT] = ((total - sums) / (n - size), np.array(variance))
         if self.true_bias is not None:
             truths[TRUE] = (np.broadcast_to(self.true_bias, sums.shape), exact)
         return truths
 
 
-def error_table(
-    recording: TestRecording, size: int, estimates: np.ndarray, sigma: np.ndarray | None = None
-) -> pd.DataFrame:
+Columns = Mapping[str, NDArray[Any]]
+"""Equally long arrays by the name of their column."""
+
+
+def error_columns(
+    recording: TestRecording, size: int, truth: str, estimates: np.ndarray, sigma: np.ndarray
+) -> Columns:
+    """Errors of the estimates on one recording against one truth, a row per window and axis.
+
+    Args:
+        recording: What was estimated.
+        size: Samples per window.
+        truth: One that the recording has.
+        estimates: Shape (windows, 3), deg/s.
+        sigma: The standard deviations that the estimator states, same shape; NaN for none.
+
+    Returns:
+        Columns of an error table, see :func:`error_table`; several are put below one another by
+        :func:`stacked`.
+    """
+    value, variance = recording.truths(size)[truth]
+    n = len(estimates)
+    return {
+        "recording": np.full(n * len(AXES), recording.number),
+        "window": np.repeat(np.arange(n), len(AXES)),
+        "axis": np.tile(AXES, n),
+        "truth": np.full(n * len(AXES), truth),
+        "error_dps": (estimates - value).ravel(),
+        "truth_variance": variance.ravel(),
+        "sigma_dps": np.ravel(sigma),
+    }
+
+
+def stacked(parts: Sequence[Columns]) -> pd.DataFrame:
+    """Put columns below one another; much faster than making a table of each first."""
+    return pd.DataFrame({name: np.concatenate([one[name] for one in parts]) for name in parts[0]})
+
+
+def error_table(recording: TestRecording, size: int, estimates: np.ndarray) -> pd.DataFrame:
     """Errors of the estimates on one recording, a row per window, axis and truth.
 
     Args:
         recording: What was estimated.
         size: Samples per window.
         estimates: Shape (windows, 3), deg/s.
-        sigma: The standard deviations that the estimator states, same shape; NaN for none.
 
     Returns:
-        Columns ``recording, window, axis, truth, error_dps, truth_variance``, and ``sigma_dps``
-        where they are given.
+        Columns ``recording, window, axis, truth, error_dps, truth_variance, sigma_dps``.
     """
-    n = len(estimates)
-    stated = {} if sigma is None else {"sigma_dps": sigma.ravel()}
-    return pd.concat(
-        pd.DataFrame(
-            {
-                "recording": recording.number,
-                "window": np.repeat(np.arange(n), len(AXES)),
-                "axis": np.tile(AXES, n),
-                "truth": truth,
-                "error_dps": (estimates - value).ravel(),
-                "truth_variance": np.tile(variance, n),
-                **stated,
-            }
-        )
-        for truth, (value, variance) in recording.truths(size).items()
-    )
+    sigma = np.full(estimates.shape, np.nan)
+    truths = recording.truths(size)
+    return stacked([error_columns(recording, size, truth, estimates, sigma) for truth in truths])
 
 
 def running_mean_curve(recording: TestRecording, size: int) -> pd.DataFrame:

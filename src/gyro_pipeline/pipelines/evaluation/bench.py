@@ -1,7 +1,7 @@
 """The test bench: one sensor, window and fold, on which every estimator is judged alike."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 
@@ -28,7 +28,7 @@ from gyro_pipeline.conventions import (
 )
 from gyro_pipeline.estimators import Estimator, RunningMean
 from gyro_pipeline.parameters import Evaluation
-from gyro_pipeline.physics.allan import SHORTEST_FIT_SAMPLES, fit_noise
+from gyro_pipeline.physics.allan import SHORTEST_FIT_SAMPLES, NoiseFigures, fit_noise
 from gyro_pipeline.physics.ceiling import (
     best_gain,
     best_saving,
@@ -38,12 +38,21 @@ from gyro_pipeline.physics.ceiling import (
     running_mean_rmse,
     turn_on_spread,
 )
+from gyro_pipeline.physics.recording_model import (
+    LinearEstimate,
+    RecordingModel,
+    best_linear,
+    mean_squares,
+)
+from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, fit_recording_model
 from gyro_pipeline.protocol.scores import (
-    Curve,
     Estimate,
+    ResampledCurve,
+    SquaredErrors,
     beats_oracle,
     coverage,
     curve_errors,
+    equivalent_time,
     resampled_weights,
     score,
     squared_errors,
@@ -52,13 +61,15 @@ from gyro_pipeline.protocol.scores import (
 from gyro_pipeline.protocol.truths import (
     CURVE_STEP_S,
     TestRecording,
-    error_table,
+    error_columns,
     running_mean_curve,
+    stacked,
 )
 from gyro_pipeline.protocol.windows import cut_windows, window_size
 from gyro_pipeline.tracking import metric_name
 
 _CEILING_RESAMPLES = 400
+_CURVE_POINTS = 30  # of the expected running mean, to interpolate between
 
 
 @dataclass(frozen=True)
@@ -69,13 +80,21 @@ class TestDevice:
         noise: N, shape (resamples, 3), deg/s sqrt(s); the first row is the estimate itself.
         spread: Turn-on spread tau, same shape, deg/s.
         unit_bias: Drawn prior mean, shape (3,), deg/s; None on measured data.
-        white: Whether the ceiling is the exact limit, so that beating it is a defect.
+        models: Of each axis, where its noise is not white or its bias warms up; drawn if simulated,
+            else fitted.
     """
 
     noise: np.ndarray
     spread: np.ndarray
     unit_bias: np.ndarray | None
-    white: bool
+    models: tuple[RecordingModel, ...] | None = None
+
+    @property
+    def figures(self) -> tuple[NoiseFigures, ...]:
+        """N, B and K of each axis."""
+        if self.models is not None:
+            return tuple(model.noise for model in self.models)
+        return tuple(NoiseFigures(float(white), 0.0, 0.0) for white in self.noise[0])
 
 
 def describe_device(
@@ -95,7 +114,7 @@ def describe_device(
             noise=recordings.true_noise.to_numpy()[None],
             spread=recordings.true_turn_on_spread.to_numpy()[None],
             unit_bias=recordings.true_unit_bias.sel(imu=TEST_IMU).to_numpy(),
-            white=float(recordings.true_flicker) == 0,
+            models=_drawn_models(recordings),
         )
     duration_s = recordings.sizes["sample"] / recordings.attrs["rate_hz"]
     means = bias[bias.imu == TEST_IMU].pivot(index="recording", columns="axis", values="bias_dps")
@@ -113,7 +132,48 @@ def describe_device(
         noise.append([fit.white for fit in fits])
         values = means.loc[list(numbers)].to_numpy()[chosen]
         spread.append(turn_on_spread(values, np.array(noise[-1]), duration_s))
-    return TestDevice(np.array(noise), np.array(spread), None, white=False)
+    models = _fitted_models(recordings, numbers, np.array(spread[0]))
+    return TestDevice(np.array(noise), np.array(spread), None, models)
+
+
+def _drawn_models(recordings: xr.Dataset) -> tuple[RecordingModel, ...] | None:
+    """What each axis of the test IMU was drawn from; None for white noise without a warm-up."""
+    drawn = {
+        name: float(recordings.get(f"true_{name}", 0.0)) for name in ("flicker", "random_walk")
+    }
+    warm_up = recordings.get("true_warm_up")
+    if not any(drawn.values()) and warm_up is None:
+        return None
+    models = []
+    for axis in recordings.axis.to_numpy():
+        one = recordings.sel(imu=TEST_IMU, axis=axis)
+        noise = NoiseFigures(float(one.true_noise), drawn["flicker"], drawn["random_walk"])
+        mean, spread = [float(one.true_unit_bias)], [float(one.true_turn_on_spread)]
+        constant_s = np.inf
+        if warm_up is not None:
+            amplitude, scatter, constant_s = warm_up.to_numpy().tolist()
+            mean, spread = [*mean, amplitude], [*spread, scatter]
+        covariance = np.diag(np.square(spread))
+        place = recordings.sizes["sample"], float(recordings.attrs["rate_hz"])
+        models.append(RecordingModel(*place, noise, np.array(mean), covariance, constant_s))
+    return tuple(models)
+
+
+def _fitted_models(
+    recordings: xr.Dataset, numbers: Sequence[int], spread: np.ndarray
+) -> tuple[RecordingModel, ...] | None:
+    """Models of the test IMU's axes with a spread found otherwise; None of too few recordings."""
+    if len(numbers) < FEWEST_RECORDINGS:
+        return None
+    rates = recordings.angular_rate.sel(imu=TEST_IMU, recording=list(numbers))
+    rates = rates.transpose("axis", "recording", "sample").to_numpy()
+    models = []
+    for axis, tau in zip(rates, spread, strict=True):
+        model = fit_recording_model(axis, float(recordings.attrs["rate_hz"]), warm_up=None)
+        covariance = np.diag(np.diag(model.covariance))
+        covariance[0, 0] = tau**2
+        models.append(replace(model, covariance=covariance))
+    return tuple(models)
 
 
 @dataclass(frozen=True)
@@ -155,7 +215,7 @@ class Bench:
                 number=int(one.recording),
                 samples=one.angular_rate.to_numpy(),
                 rate_hz=chosen.attrs["rate_hz"],
-                noise=self.device.noise[0],
+                noise=self.device.figures,
                 true_bias=one.true_bias.to_numpy() if known else None,
             )
             for one in (chosen.sel(recording=number) for number in self.numbers)
@@ -174,7 +234,7 @@ class Bench:
             InputError: If it gives no estimate for some window.
         """
         seen = self.recordings.angular_rate.sel(imu=slice(TEST_IMU, TEST_IMU + imus - 1))
-        tables = []
+        parts = []
         for recording in self.tested:
             samples = (
                 recording.samples
@@ -184,12 +244,18 @@ class Bench:
             windows = cut_windows(samples, self.size)
             windows = windows.transpose(1, 0, 2)
             start_s = np.arange(len(windows)) * self.size / self.recordings.attrs["rate_hz"]
-            for target in (RECORDING_MEAN, BIAS):
-                given = estimator.estimate(windows, target, start_s, recording.number)
-                judged = (values[:, : len(AXES)] for values in given)
-                table = error_table(recording, self.size, *judged)
-                tables.append(table[table.truth.map(TARGET_OF) == target])
-        errors = pd.concat(tables, ignore_index=True)
+            judged = {
+                target: [
+                    values[:, : len(AXES)]
+                    for values in estimator.estimate(windows, target, start_s, recording.number)
+                ]
+                for target in (RECORDING_MEAN, BIAS)
+            }
+            parts += [
+                error_columns(recording, self.size, truth, *judged[TARGET_OF[truth]])
+                for truth in recording.truths(self.size)
+            ]
+        errors = stacked(parts)
         for number in errors.recording[errors.error_dps.isna()].unique():
             raise InputError(
                 f"{self.recordings.attrs['sensor']} recording {number}: expected an estimate for "
@@ -204,52 +270,133 @@ class Bench:
         return self.errors(RunningMean())
 
     @cached_property
+    def _means(self) -> dict[tuple[str, str], SquaredErrors]:
+        """Squares of the running mean's errors by truth and windows."""
+        return _by_view(self.mean_errors)
+
+    @cached_property
+    def _oracles(self) -> dict[tuple[str, str], SquaredErrors]:
+        """The same of the best possible estimator; empty where it is not known."""
+        return {} if self.oracle_errors is None else _by_view(self.oracle_errors)
+
+    @cached_property
+    def _resampled(self) -> np.ndarray:
+        """Weights of the recordings in each resample."""
+        drawn = self.evaluation.resamples, self.evaluation.bootstrap_seed
+        return resampled_weights(len(self.numbers), *drawn)
+
+    @cached_property
     def curve(self) -> pd.DataFrame:
         """The running-mean curve of every test recording."""
         curves = [running_mean_curve(recording, self.size) for recording in self.tested]
         return pd.concat(curves, ignore_index=True)
 
     @cached_property
-    def curves(self) -> dict[tuple[str, str], Curve]:
-        """The same by truth and windows."""
+    def curves(self) -> dict[tuple[str, str], ResampledCurve]:
+        """The same by truth and windows, for every resample."""
         views = product(self.curve.truth.unique(), (FIRST, ALL))
-        return {view: curve_errors(self.curve, *view) for view in views}
+        return {view: curve_errors(self.curve, *view).of(self._resampled) for view in views}
 
     @cached_property
     def oracle_errors(self) -> pd.DataFrame | None:
         """Errors of the best possible estimator for each truth; None where it is not known."""
-        if self.device.unit_bias is None or not self.device.white:
+        if self.device.unit_bias is None:
             return None
-        known = (self.device.unit_bias, self.device.spread[0], self.device.noise[0])
-        tables = []
+        parts = []
         for recording in self.tested:
-            means = recording.window_sums(self.size) / self.size
-            for truth in (PAPER, DISJOINT, TRUE):
-                best = oracle(means, *known, self.window_s, self.recording_s, truth)
-                table = error_table(recording, self.size, best)
-                tables.append(table[table.truth == truth])
-        return pd.concat(tables, ignore_index=True)
+            for truth in recording.truths(self.size):
+                best = self._best(recording, truth)
+                sigma = np.full(best.shape, np.nan)
+                parts.append(error_columns(recording, self.size, truth, best, sigma))
+        return stacked(parts)
+
+    def _best(self, recording: TestRecording, truth: str) -> np.ndarray:
+        """Estimates by one who knows what was drawn, (windows, 3), deg/s."""
+        device, size = self.device, self.size
+        if device.models is None:
+            assert device.unit_bias is not None
+            means = recording.window_sums(size) / size
+            known = (device.unit_bias, device.spread[0], device.noise[0])
+            return oracle(means, *known, self.window_s, self.recording_s, truth)
+        windows = cut_windows(recording.samples, size)
+        return np.stack(
+            [
+                [
+                    float(self._line(axis, i * size, truth)(one[None])[0])
+                    for i, one in enumerate(rows)
+                ]
+                for axis, rows in enumerate(windows)
+            ],
+            axis=-1,
+        )
+
+    @cached_property
+    def _lines(self) -> dict[tuple[int, int, str], LinearEstimate]:
+        return {}
+
+    def _line(self, axis: int, start: int, truth: str) -> LinearEstimate:
+        """The best linear estimate of a window under the device's model, worked out once."""
+        assert self.device.models is not None
+        key = axis, start, truth
+        if key not in self._lines:
+            self._lines[key] = best_linear(self.device.models[axis], start, self.size, truth)
+        return self._lines[key]
 
     @property
     def ceiling_basis(self) -> str:
         """In words, what the ceilings are computed from."""
-        if self.device.unit_bias is None:
-            return "estimated from recordings, white noise"
-        return "drawn values" if self.device.white else "drawn values, without the flicker noise"
+        if self.device.unit_bias is not None:
+            return "drawn values"
+        noise = "white noise" if self.device.models is None else "fitted N, B and K"
+        return f"estimated from recordings, {noise}"
 
-    def ceilings(self, truth: str) -> dict[str, Estimate]:
-        """What no estimator can be better than; exact, without an interval, on simulated data."""
+    def ceilings(self, truth: str, windows: str) -> dict[str, Estimate]:
+        """What no estimator can be better than; exact, without an interval, on simulated data.
+
+        On measured data the interval is that of N and the turn-on spread.
+        """
         times = (self.window_s, self.recording_s)
         limit = pooled(ceiling_rmse(self.device.noise, self.device.spread, *times, truth))
         mean = pooled(running_mean_rmse(self.device.noise, *times, truth))
+        ratio, saving = limit / mean, None
+        if truth == PAPER:
+            saving = best_saving(ratio, self.window_s / self.recording_s)
+        if self.device.models is not None:
+            squares, means = self._expected(truth, windows, self.size)
+            if squares <= 0 or means <= 0:  # the truth's own noise was taken off
+                return {}
+            limit = limit * np.sqrt(squares) / limit[0]
+            ratio = ratio * np.sqrt(squares / means) / ratio[0]
+            if saving is not None:
+                saving = saving + self._expected_saving(windows, squares) - saving[0]
         ceilings = {
             "ceiling_rmse_dps": with_interval(limit),
-            "ceiling_accuracy_gain_pct": with_interval(100 * best_gain(limit / mean)),
+            "ceiling_accuracy_gain_pct": with_interval(100 * best_gain(ratio)),
         }
-        if truth == PAPER:
-            saving = best_saving(limit / mean, self.window_s / self.recording_s)
+        if saving is not None:
             ceilings["ceiling_time_saving_pct"] = with_interval(100 * saving)
         return ceilings
+
+    def _expected(self, truth: str, windows: str, size: int) -> tuple[float, float]:
+        """Mean squares of the best linear estimate and the running mean, over axes and windows."""
+        assert self.device.models is not None
+        starts = range(0, self.recordings.sizes["sample"] - size + 1, size)
+        squares = [
+            mean_squares(model, start, size, truth)
+            for model in self.device.models
+            for start in (starts[:1] if windows == FIRST else starts)
+        ]
+        best, mean = np.mean(squares, axis=0)
+        return float(best), float(mean)
+
+    def _expected_saving(self, windows: str, squares: float) -> float:
+        """1 - T0 / t*, where the running mean of t* is expected to have these squares."""
+        samples = self.recordings.sizes["sample"]
+        sizes = np.unique(np.geomspace(self.size, samples, _CURVE_POINTS).astype(int))
+        # of the whole recording it is 0, but for rounding
+        curve = [max(self._expected(PAPER, windows, int(size))[1], 0.0) for size in sizes]
+        reached = equivalent_time(sizes, np.sqrt([curve]), np.sqrt([squares]))[0]
+        return float(1 - self.size / reached) if np.isfinite(reached) else 0.0
 
     def metrics(self, errors: pd.DataFrame, weights: str) -> dict[str, float]:
         """All figures of merit of one set of errors, by metric name; only finite ones.
@@ -258,9 +405,6 @@ class Bench:
             errors: From :meth:`errors`.
             weights: ``last`` or ``best``; part of the names.
         """
-        resampled = resampled_weights(
-            len(self.numbers), self.evaluation.resamples, self.evaluation.bootstrap_seed
-        )
         metrics: dict[str, float] = {}
         for truth in errors.truth.unique():
             if truth != DISJOINT and errors.sigma_dps.notna().any():
@@ -268,15 +412,11 @@ class Bench:
                     name = metric_name(f"coverage_{sigmas}sigma", ALL, weights, truth)
                     metrics[name] = coverage(errors, truth, sigmas)
             for windows in (FIRST, ALL):
-                scores = score(
-                    squared_errors(errors, truth, windows),
-                    squared_errors(self.mean_errors, truth, windows),
-                    self.curves[truth, windows],
-                    self.window_s,
-                    resampled,
-                )
+                own, mean = squared_errors(errors, truth, windows), self._means[truth, windows]
+                curve = self.curves[truth, windows]
+                scores = score(own, mean, curve, self.window_s, self._resampled)
                 if weights == LAST:
-                    scores |= self.ceilings(truth)
+                    scores |= self.ceilings(truth, windows)
                 for base, estimate in scores.items():
                     named = {"": estimate.value, "lo": estimate.lo, "hi": estimate.hi}
                     metrics |= {
@@ -284,13 +424,15 @@ class Bench:
                         for bound, value in named.items()
                         if value is not None and np.isfinite(value)
                     }
-                if self.oracle_errors is not None and len(self.numbers) > 1:
-                    p = beats_oracle(
-                        squared_errors(errors, truth, windows),
-                        squared_errors(self.oracle_errors, truth, windows),
-                    )
+                if self._oracles and len(self.numbers) > 1:
+                    p = beats_oracle(own, self._oracles[truth, windows])
                     metrics[metric_name("beats_oracle_p", windows, weights, truth)] = p
         return metrics
+
+
+def _by_view(errors: pd.DataFrame) -> dict[tuple[str, str], SquaredErrors]:
+    views = product(errors.truth.unique(), (FIRST, ALL))
+    return {view: squared_errors(errors, *view) for view in views}
 
 
 def off_the_curve(metrics: Mapping[str, float]) -> dict[str, str]:

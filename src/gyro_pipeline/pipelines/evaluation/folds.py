@@ -7,8 +7,15 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from gyro_pipeline.conventions import BIAS, TEST, InputError
-from gyro_pipeline.estimators import ESTIMATORS, Estimates, Estimator, FittedEstimator
+from gyro_pipeline.conventions import BIAS, TEST, TEST_IMU, InputError
+from gyro_pipeline.estimators import (
+    ESTIMATORS,
+    Estimates,
+    Estimator,
+    FittedEstimator,
+    TrainingRecordings,
+)
+from gyro_pipeline.studies import RESIDUAL_NETWORK
 
 
 class Fitted:
@@ -17,34 +24,65 @@ class Fitted:
     Args:
         recordings: Of all IMUs; estimators get the samples alone, without drawn values.
         roles: Which recordings test, in each fold.
+        virtual: Virtual recordings, where a cell asks for some.
     """
 
-    def __init__(self, recordings: xr.Dataset, roles: pd.DataFrame) -> None:
-        self._recordings, self._roles = recordings[["angular_rate"]], roles
-        self._samples: dict[int, xr.Dataset] = {}
-        self._folds: dict[tuple[str, int], FittedEstimator] = {}
+    def __init__(
+        self, recordings: xr.Dataset, roles: pd.DataFrame, virtual: xr.Dataset | None = None
+    ) -> None:
+        self._recordings, self._roles, self._virtual = recordings[["angular_rate"]], roles, virtual
+        self._training: dict[tuple[int, int, int], TrainingRecordings] = {}
+        self._folds: dict[tuple[str, int, int, int], FittedEstimator] = {}
 
-    def estimator(self, name: str) -> "OfFolds":
-        """By its name; fitted once, whatever the window."""
+    def estimator(self, name: str, real_imus: int, virtual_imus: int) -> "OfFolds":
+        """An estimator; fitted once, whatever the window.
+
+        Args:
+            name: As in ``ESTIMATORS``.
+            real_imus: IMUs that a residual network learns from; others take what they use of all.
+            virtual_imus: The same, of virtual ones.
+        """
         tested = self._roles[self._roles.role == TEST]
         places = zip(tested.recording.tolist(), tested.fold.tolist(), strict=True)
-        return OfFolds({number: self._fit(name, fold) for number, fold in places})
+        imus = (real_imus, virtual_imus) if name == RESIDUAL_NETWORK else (0, 0)
+        return OfFolds({number: self._fit(name, fold, *imus) for number, fold in places})
 
-    def _fit(self, name: str, fold: int) -> FittedEstimator:
-        if (name, fold) not in self._folds:
+    def _fit(self, name: str, fold: int, real_imus: int, virtual_imus: int) -> FittedEstimator:
+        key = name, fold, real_imus, virtual_imus
+        if key not in self._folds:
             roles = self._roles[self._roles.fold == fold]
             numbers = sorted(roles.recording[roles.role != TEST].tolist())
-            if fold not in self._samples:
-                self._samples = {fold: self._recordings.sel(recording=numbers).load()}
             try:
-                self._folds[name, fold] = ESTIMATORS[name]().fit(self._samples[fold])
+                self._folds[key] = ESTIMATORS[name]().fit(self._samples(key[1:], numbers))
             except InputError as error:
                 sensor = self._recordings.attrs["sensor"]
                 raise InputError(
                     f"{sensor} fold {fold}: {name} cannot be fitted to {len(numbers)} recordings: "
                     f"{error}; bring more recordings or leave it out of the study"
                 ) from error
-        return self._folds[name, fold]
+        return self._folds[key]
+
+    def _samples(self, key: tuple[int, int, int], numbers: list[int]) -> TrainingRecordings:
+        """Recordings of a fold with so many real and virtual IMUs; 0 real ones are all of them."""
+        fold, real_imus, virtual_imus = key
+        if key not in self._training:
+            self._training = {k: known for k, known in self._training.items() if k[0] == fold}
+            samples = self._recordings.sel(recording=numbers)
+            if real_imus:
+                samples = samples.sel(imu=slice(TEST_IMU, TEST_IMU + real_imus - 1))
+            if virtual_imus:
+                samples = self._with_virtual(samples, virtual_imus)
+            self._training[key] = TrainingRecordings(samples.load())
+        return self._training[key]
+
+    def _with_virtual(self, samples: xr.Dataset, imus: int) -> xr.Dataset:
+        """Real recordings, and those of virtual IMUs that train, numbered after all real IMUs."""
+        if self._virtual is None:
+            raise InputError("virtual gyroscopes asked of a pipeline that makes none")
+        last = self._virtual.attrs["train_recordings"]
+        drawn = self._virtual[["angular_rate"]].sel(imu=slice(1, imus), recording=slice(1, last))
+        drawn = drawn.assign_coords(imu=drawn.imu + int(self._recordings.imu.max()))
+        return xr.concat([samples, drawn], "imu", join="outer").assign_attrs(samples.attrs)
 
 
 class OfFolds:

@@ -1,6 +1,5 @@
 """Nodes of the leak study's evaluation: errors in the windows that each leak calls its test."""
 
-import logging
 from collections.abc import Iterator
 
 import numpy as np
@@ -25,6 +24,7 @@ from gyro_pipeline.physics import ceiling
 from gyro_pipeline.physics.ceiling import oracle
 from gyro_pipeline.pipelines.evaluation import bench as bench_module
 from gyro_pipeline.pipelines.evaluation.bench import Bench, describe_device
+from gyro_pipeline.pipelines.evaluation.waiting import waiting
 from gyro_pipeline.protocol import leaks, scores
 from gyro_pipeline.protocol import truths as truths_module
 from gyro_pipeline.protocol import windows as windows_module
@@ -35,13 +35,10 @@ from gyro_pipeline.tracking import (
     CURVE,
     ERRORS,
     EVALUATED_WITH,
-    FINGERPRINT,
     WEIGHTS,
     EvaluatedRun,
     StoredRun,
 )
-
-logger = logging.getLogger(__name__)
 
 _CODE = (allan_module, ceiling, bench_module, leaks, scores, truths_module, windows_module)
 
@@ -72,24 +69,15 @@ def evaluate_leakage(  # noqa: PLR0917 - a node's arguments are its datasets
         Metrics, those of the network named ``..._strided``, and the errors of every test window.
         The check against the oracle is not among them: a leak is meant to beat it.
     """
-    trained = {run.fingerprint: run for run in reversed(runs)}
     judged_with = fingerprint([code_hash(_CODE), evaluation.model_dump()])
     numbers = tuple(recordings.recording.to_numpy()[: leakage.recordings].tolist())
     device = describe_device(recordings, bias, allan, numbers, evaluation.bootstrap_seed)
     bench = Bench(recordings, device, numbers, leakage.window_s, evaluation)
-    judged = 0
-    for cell in cells.to_dict("records"):
-        run = trained[cell[FINGERPRINT]]
-        if run.finished and run.tags.get(EVALUATED_WITH) == judged_with:
-            continue
+    label = f"leakage {recordings.attrs['sensor']}"
+    for cell, run in waiting(cells, runs, judged_with, label):
         place = (cell["leak"], cell["fold"], cell["window_stride_s"])
         divided = divide_windows(*place, recordings, leakage, splits.split_seed)
         yield _judged(run, bench, divided, judged_with)
-        judged += 1
-    logger.info(
-        "leakage %s: %d runs evaluated, %d skipped",
-        *(recordings.attrs["sensor"], judged, len(cells) - judged),
-    )
 
 
 def _judged(run: StoredRun, bench: Bench, divided: Division, judged_with: str) -> EvaluatedRun:
@@ -104,7 +92,7 @@ def _judged(run: StoredRun, bench: Bench, divided: Division, judged_with: str) -
     scored = {f"{base}_strided": estimate for base, estimate in scored.items()}
     metrics = {
         name: value
-        for base, estimate in (scored | bench.ceilings(PAPER)).items()
+        for base, estimate in (scored | bench.ceilings(PAPER, ALL)).items()
         for name, value in (
             (base, estimate.value),
             (f"{base}_lo", estimate.lo),
@@ -143,7 +131,7 @@ def strided_error_table(estimator: Estimator, bench: Bench, divided: Division) -
         seen = cut_windows(one.samples, bench.size, starts).transpose(1, 0, 2)
         estimated, _ = estimator.estimate(seen, RECORDING_MEAN)
         estimates = {"": estimated, "mean_": means, "constant_": constant}
-        if device.unit_bias is not None and device.white:
+        if device.unit_bias is not None and device.models is None:
             known = (device.unit_bias, device.spread[0], device.noise[0])
             estimates["oracle_"] = oracle(means, *known, bench.window_s, bench.recording_s, PAPER)
         of = {"recording": one.number, "start": np.repeat(starts, len(AXES))}

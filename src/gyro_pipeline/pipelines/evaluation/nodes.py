@@ -6,17 +6,19 @@ from collections.abc import Iterator
 import pandas as pd
 import xarray as xr
 
-from gyro_pipeline.conventions import ALL, BEST, FIRST, LAST
+from gyro_pipeline.conventions import ALL, AXES, BEST, FIRST, LAST
 from gyro_pipeline.estimators import (
     ORIENTATION_NOTE,
     Estimator,
     averages,
     base,
     linear,
-    noise,
+    networks,
     shrinkage,
+    training,
 )
 from gyro_pipeline.fingerprints import code_hash, fingerprint
+from gyro_pipeline.learning import perceptrons
 from gyro_pipeline.learning.jobs import NetworkEstimator
 from gyro_pipeline.parameters import Evaluation
 from gyro_pipeline.physics import allan as allan_module
@@ -31,13 +33,13 @@ from gyro_pipeline.pipelines.evaluation.bench import (
     test_recordings,
 )
 from gyro_pipeline.pipelines.evaluation.folds import Fitted
+from gyro_pipeline.pipelines.evaluation.waiting import waiting
 from gyro_pipeline.protocol import scores, truths, windows
 from gyro_pipeline.studies import MEAN, NETWORKS
 from gyro_pipeline.tracking import (
     CURVE,
     ERRORS,
     EVALUATED_WITH,
-    FINGERPRINT,
     WEIGHTS,
     EvaluatedRun,
     StoredRun,
@@ -48,7 +50,7 @@ logger = logging.getLogger(__name__)
 
 _CODE = (
     *(allan_module, ceiling, recording_model, reml, history),
-    *(averages, base, linear, noise, shrinkage),
+    *(averages, base, linear, networks, perceptrons, shrinkage, training),
     *(bench_module, folds, scores, truths, windows),
 )
 
@@ -61,6 +63,7 @@ def evaluate(
     allan: xr.Dataset,
     roles: pd.DataFrame,
     evaluation: Evaluation,
+    virtual: xr.Dataset | None = None,
 ) -> Iterator[EvaluatedRun]:
     """Judge every run of the plan that was not judged this way before.
 
@@ -72,46 +75,38 @@ def evaluate(
         allan: Their Allan variances.
         roles: Which recordings test, in each fold.
         evaluation: Resamples and seed of the intervals.
+        virtual: Virtual recordings, where the study uses some.
 
     Yields:
         Metrics and per-window errors, to be added to each run.
     """
-    trained = {run.fingerprint: run for run in reversed(runs)}
-    fitted = Fitted(recordings, roles)
+    fitted = Fitted(recordings, roles, virtual)
     judged_with = fingerprint([code_hash(_CODE), evaluation.model_dump()])
     seed = evaluation.bootstrap_seed
     device = describe_device(recordings, bias, allan, known_recordings(roles), seed)
     benches: dict[tuple[float, int], Bench] = {}
-    skipped = 0
-    for cell in cells.to_dict("records"):
-        run = trained[cell[FINGERPRINT]]
-        if run.finished and run.tags.get(EVALUATED_WITH) == judged_with:
-            skipped += 1
-            continue
+    for cell, run in waiting(cells, runs, judged_with, recordings.attrs["sensor"]):
         key = cell["window_s"], cell["fold"]
         if key not in benches:
             numbers = test_recordings(roles, cell["fold"])
             benches[key] = Bench(recordings, device, numbers, cell["window_s"], evaluation)
         yield _judge(run, benches[key], fitted, judged_with)
-    logger.info(
-        "%s: %d runs evaluated, %d skipped",
-        recordings.attrs["sensor"],
-        len(cells) - skipped,
-        skipped,
-    )
 
 
 def _judge(run: StoredRun, bench: Bench, fitted: Fitted, judged_with: str) -> EvaluatedRun:
     artifacts = {}
     name = run.params["estimator"]
+    real_imus, virtual_imus = (
+        int(run.params[gyros]) // len(AXES) for gyros in ("real_gyros", "virtual_gyros")
+    )
     if name not in NETWORKS:
-        judged: dict[str, Estimator] = {LAST: fitted.estimator(name)}
+        judged: dict[str, Estimator] = {LAST: fitted.estimator(name, real_imus, virtual_imus)}
     else:
         stored = run.load(WEIGHTS)
         judged = {which: NetworkEstimator(stored, which) for which in (LAST, BEST) if stored[which]}
     if name == MEAN:
         artifacts[CURVE] = bench.curve
-    side_by_side = int(run.params["real_gyros"]) // 3 if run.params["method"] == "1" else 1
+    side_by_side = real_imus if run.params["method"] == "1" else 1
     metrics: dict[str, float] = {}
     tables = []
     for which, estimator in judged.items():

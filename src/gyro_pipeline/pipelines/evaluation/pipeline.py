@@ -7,8 +7,15 @@ from gyro_pipeline.pipelines.evaluation.nodes import evaluate
 from gyro_pipeline.studies import LEAKAGE
 
 
-def create_pipeline(study: str, sensor: str) -> Pipeline:
-    """Evaluation of one study's runs on one sensor."""
+def create_pipeline(study: str, sensor: str, virtual: bool) -> Pipeline:
+    """Evaluation of one study's runs on one sensor.
+
+    Args:
+        study: Its name.
+        sensor: Its name.
+        virtual: Whether virtual gyroscopes take part.
+    """
+    drawn = {"virtual": f"{sensor}.virtual_gyros.recordings"} if virtual else {}
     return Pipeline(
         [
             Node(
@@ -21,7 +28,8 @@ def create_pipeline(study: str, sensor: str) -> Pipeline:
                     "allan": f"{sensor}.ground_truth.allan",
                     "roles": f"{sensor}.windowed_splits.roles",
                     "evaluation": "params:evaluation",
-                },
+                }
+                | drawn,
                 f"{study}.{sensor}.evaluation.runs",
                 name=f"evaluate_{study}_{sensor}",
                 namespace="evaluation",

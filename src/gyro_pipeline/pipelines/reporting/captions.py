@@ -89,17 +89,13 @@ CAPTIONS = {
         "real2real",
     ),
     "figures/estimators_sparkfun": Caption(
-        "SparkFun: estimators without a network against the window length",
+        "SparkFun: estimators against the window length",
         _ESTIMATORS,
         "estimators",
     ),
-    "figures/estimators_dot": Caption(
-        "DOT: estimators without a network", _ESTIMATORS, "estimators"
-    ),
-    "figures/estimators_ng": Caption("NG: estimators without a network", _ESTIMATORS, "estimators"),
-    "figures/estimators_memsense": Caption(
-        "Memsense: estimators without a network", _ESTIMATORS, "estimators"
-    ),
+    "figures/estimators_dot": Caption("DOT: estimators", _ESTIMATORS, "estimators"),
+    "figures/estimators_ng": Caption("NG: estimators", _ESTIMATORS, "estimators"),
+    "figures/estimators_memsense": Caption("Memsense: estimators", _ESTIMATORS, "estimators"),
     "figures/input_channels_input_channels": Caption(
         "Method 1: more gyroscopes as input channels",
         f"{_ON_CURVE} Paper, section IV-C.",

@@ -9,22 +9,26 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gyro_pipeline.conventions import ALL, FIRST, HOLD_OUT, LAST, PAPER
+from gyro_pipeline.conventions import ALL, BEST, FIRST, HOLD_OUT, LAST, PAPER
 from gyro_pipeline.estimators import DEFAULT
 from gyro_pipeline.parameters import Evaluation
 from gyro_pipeline.protocol.scores import (
     Estimate,
     curve_errors,
+    paired_difference,
     resampled_weights,
     rmse_difference,
     score,
     squared_errors,
 )
-from gyro_pipeline.studies import CNN, MEAN, Cell, run_params
+from gyro_pipeline.studies import CNN, MEAN, RESIDUAL_NETWORK, Cell, run_params
 from gyro_pipeline.tracking import CURVE, ERRORS, StoredRun, metric_name
 
 ROW = ["sensor", "source", "estimator", "method", "real_gyros", "virtual_gyros", "window_s"]
 """What names a result."""
+
+CNN_BEST = "cnn_best"
+"""In a comparison of estimators: the paper's network at its best validation epoch."""
 
 COVERAGES = [metric_name(f"coverage_{sigmas}sigma", ALL) for sigmas in (1, 2)]
 
@@ -79,14 +83,26 @@ def pool(
         row["folds"] = int(found[0].params["folds"])
         row["run_ids"] = " ".join(run.run_id for run in found)
         results.append(row)
+        if key in defaults and cell.estimator == CNN:
+            best = [best_epoch(run) for run in found]
+            scores = network_row(best, means[key], cell.window_s, evaluation)
+            less = differences(best, references, evaluation)
+            results.append(row | scores | less | {"estimator": CNN_BEST})
     return results, {sensor: mean for (sensor, _), mean in reversed(means.items())}
+
+
+def best_epoch(run: StoredRun) -> StoredRun:
+    """The run as if its weights at the best validation epoch had been its last ones."""
+    errors = run.load(ERRORS)
+    errors = errors[errors.weights == BEST].assign(weights=LAST)
+    return replace(run, load={ERRORS: errors}.__getitem__)
 
 
 def command_for(cells: Sequence[Cell]) -> str:
     """The command that makes the runs of a row."""
     cell = cells[0]
     only = {"sensor": cell.sensor, "window_s": f"{cell.window_s:g}"}
-    if cell.estimator == CNN:
+    if cell.estimator in (CNN, RESIDUAL_NETWORK):
         only |= {"real_gyros": str(cell.real_gyros), "virtual_gyros": str(cell.virtual_gyros)}
     if len(cells) == 1 and cell.estimator == CNN:
         only["seed"] = str(cell.seed)
@@ -194,7 +210,7 @@ def network_row(
             return score(
                 squared_errors(table, PAPER, windows),
                 squared_errors(mean_errors, PAPER, windows),
-                curve_errors(curve, PAPER, windows),
+                curve_errors(curve, PAPER, windows).of(weights),
                 window_s,
                 weights,
             )
@@ -217,9 +233,7 @@ def network_row(
 def differences(
     runs: Sequence[StoredRun], references: Mapping[str, pd.DataFrame], evaluation: Evaluation
 ) -> dict[str, Any]:
-    """RMSE less that of other estimators on the same windows, paired over recordings.
-
-    Over all windows, against the mean of the recording.
+    """Errors less those of other estimators on all the same windows, paired over recordings.
 
     Args:
         runs: All seeds and folds of the row.
@@ -227,14 +241,24 @@ def differences(
         evaluation: Resamples and seed of the intervals.
 
     Returns:
-        ``less_<name>_dps`` with its interval, ``_lo`` and ``_hi``.
+        ``less_<name>_dps``, of the RMSEs against the mean of the recording, and
+        ``less_<name>_dps2_<truth>``, of the mean squares against the other truths, whose own noise
+        may leave none to take the root of. Each with its interval, ``_lo`` and ``_hi``.
     """
-    own = squared_errors(_errors(runs), PAPER, ALL)
-    weights = resampled_weights(len(own.sums), evaluation.resamples, evaluation.bootstrap_seed)
+    table = _errors(runs)
+    weights = resampled_weights(
+        table.recording.nunique(), evaluation.resamples, evaluation.bootstrap_seed
+    )
     row: dict[str, Any] = {}
-    for name, errors in references.items():
-        less = rmse_difference(own, squared_errors(errors, PAPER, ALL), weights)
-        row |= {f"less_{name}_dps{end}": value for end, value in _ends(less).items()}
+    for truth in table.truth.unique():
+        own = squared_errors(table, truth, ALL)
+        for name, errors in references.items():
+            other = squared_errors(errors, truth, ALL)
+            if truth == PAPER:
+                less, key = rmse_difference(own, other, weights), f"less_{name}_dps"
+            else:
+                less, key = paired_difference(own, other, weights), f"less_{name}_dps2_{truth}"
+            row |= {key + end: value for end, value in _ends(less).items()}
     return row
 
 

@@ -29,6 +29,8 @@ _FAMILIES = {
     COLOURS[1]: ("training_mean", "last_calibration"),
     COLOURS[2]: ("empirical_bayes", "empirical_bayes_pooled"),
     COLOURS[3]: ("ridge", "ridge_same_time"),
+    "#56B4E9": ("residual_network",),
+    "#D3B300": ("cnn", "cnn_best", "window_mean_network"),
 }
 """Estimators that share a colour; they differ in their markers."""
 

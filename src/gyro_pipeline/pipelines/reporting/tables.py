@@ -10,11 +10,14 @@ import xarray as xr
 
 from gyro_pipeline.conventions import (
     ALL,
+    DISJOINT,
     FIRST,
     MDPS,
+    PAPER,
     TEST,
     TEST_IMU,
     TRAIN,
+    TRUE,
     VALIDATION,
     InputError,
     Missing,
@@ -26,7 +29,7 @@ from gyro_pipeline.parameters import (
     PublishedResult,
     PublishedSpecification,
 )
-from gyro_pipeline.studies import CNN, MEAN
+from gyro_pipeline.studies import CNN, MEAN, RESIDUAL_NETWORK
 
 logger = logging.getLogger(__name__)
 
@@ -67,7 +70,8 @@ def comparison(results: pd.DataFrame, elsewhere: pd.DataFrame) -> pd.DataFrame |
     """Estimators side by side, over all windows against the mean of the recording.
 
     Differences are of RMSEs on the same windows, with 95 % intervals over recordings; negative ones
-    are in favour of the row's estimator.
+    are in favour of the row's estimator. Against the samples outside the window, truth (b), and the
+    drawn bias, truth (c), they are of mean squares.
 
     Args:
         results: From ``pool_results``.
@@ -101,6 +105,11 @@ def _compared(row: pd.Series, group: pd.DataFrame) -> dict[str, Any]:
         "RMSE / running mean's": round(row.test_rmse_dps_all / mean, 3),
         "Less running mean mdps": _difference(row, MEAN),
         f"Less {DEFAULT} mdps": _difference(row, DEFAULT),
+        **{
+            f"Less {name.replace('_', ' ')}, {text} mdps²": _difference(row, name, truth)
+            for truth, text in ((DISJOINT, "outside"), (TRUE, "true bias"))
+            for name in (MEAN, DEFAULT)
+        },
         "Ceiling mdps": round(row.ceiling_rmse_dps_all / MDPS, 3),
         "Within ±1σ %": _covered(row.coverage_1sigma_all),
         "Within ±2σ %": _covered(row.coverage_2sigma_all),
@@ -114,14 +123,17 @@ def _covered(fraction: float | None) -> float | None:
     return None if fraction is None else round(100 * fraction, 1)
 
 
-def _difference(row: pd.Series, name: str) -> str:
-    value, lo, hi = (row.get(f"less_{name}_dps{end}") for end in ("", "_lo", "_hi"))
+def _difference(row: pd.Series, name: str, truth: str = PAPER) -> str:
+    key, unit = f"less_{name}_dps", MDPS
+    if truth != PAPER:
+        key, unit = f"less_{name}_dps2_{truth}", MDPS**2
+    value, lo, hi = (row.get(key + end) for end in ("", "_lo", "_hi"))
     if value is None or pd.isna(value) or name == row.estimator:
         return "–"
     ends = (
-        "" if lo is None or hi is None or pd.isna(lo) else f" [{lo / MDPS:+.3f}, {hi / MDPS:+.3f}]"
+        "" if lo is None or hi is None or pd.isna(lo) else f" [{lo / unit:+.3f}, {hi / unit:+.3f}]"
     )
-    return f"{value / MDPS:+.3f}{ends}"
+    return f"{value / unit:+.3f}{ends}"
 
 
 def three_gyroscopes(results: pd.DataFrame, published: Published) -> pd.DataFrame | Missing:
@@ -148,13 +160,16 @@ def generalization(
     return _result_table(results, published.of_table("generalization"), elsewhere)
 
 
-def find_result(results: pd.DataFrame, published: PublishedResult) -> pd.Series:
+def find_result(
+    results: pd.DataFrame, published: PublishedResult, estimator: str = CNN
+) -> pd.Series:
     """Our result for a published one.
 
     Raises:
         InputError: If its study has none.
     """
     match = np.all([results[key] == getattr(published, key) for key in _KEYS], axis=0)
+    match &= results.estimator == estimator
     if not match.any():
         raise InputError(
             f"published result {published.approach!r} of {published.sensor} is no cell of its "
@@ -163,10 +178,12 @@ def find_result(results: pd.DataFrame, published: PublishedResult) -> pd.Series:
     return results[match].iloc[0]
 
 
-def measured_elsewhere(elsewhere: pd.DataFrame, published: PublishedResult) -> list[pd.Series]:
+def measured_elsewhere(
+    elsewhere: pd.DataFrame, published: PublishedResult, estimator: str = CNN
+) -> list[pd.Series]:
     """For each other source the result that comes closest to a published one in gyroscopes."""
     alike = elsewhere[
-        (elsewhere.estimator == CNN)
+        (elsewhere.estimator == estimator)
         & (elsewhere.sensor == published.sensor)
         & (elsewhere.window_s == published.window_s)
         & (elsewhere.virtual_gyros == published.virtual_gyros)
@@ -191,18 +208,26 @@ def _result_table(
     wanted: Sequence[PublishedResult],
     elsewhere: pd.DataFrame | None = None,
 ) -> pd.DataFrame | Missing:
-    ours = [find_result(results, published) for published in wanted]
-    lacking = tuple(row.missing for row in ours if pd.notna(row.missing))
+    # a study may do without the second
+    estimators = [one for one in (CNN, RESIDUAL_NETWORK) if one in {CNN, *results.estimator}]
+    ours = {one: [find_result(results, row, one) for row in wanted] for one in estimators}
+    lacking = tuple(row.missing for rows in ours.values() for row in rows if pd.notna(row.missing))
     if lacking:
         return Missing(lacking)
     rows = []
-    for published, own in zip(wanted, ours, strict=True):
-        others = [] if elsewhere is None else measured_elsewhere(elsewhere, published)
-        rows += [_result_row(published, row) for row in (own, *others)]
+    for place, published in enumerate(wanted):
+        found = {one: [ours[one][place]] for one in estimators}
+        if elsewhere is not None:
+            for one in estimators:
+                found[one] += measured_elsewhere(elsewhere, published, one)
+        residual = {row.source: row for row in found.get(RESIDUAL_NETWORK, [])}
+        rows += [_result_row(published, row, residual.get(row.source)) for row in found[CNN]]
     return pd.DataFrame(rows)
 
 
-def _result_row(published: PublishedResult, row: pd.Series) -> dict[str, Any]:
+def _result_row(
+    published: PublishedResult, row: pd.Series, residual: pd.Series | None
+) -> dict[str, Any]:
     theirs, ours = _gyroscopes(published), _gyroscopes(row)
     claim = f"{published.time_saving_pct:.0f}/{published.accuracy_gain_pct:.0f}"
     return {
@@ -216,6 +241,8 @@ def _result_row(published: PublishedResult, row: pd.Series) -> dict[str, Any]:
         "A %": _interval(row, "accuracy_gain_pct", ALL),
         "Paper's way S %": _interval(row, "time_saving_pct", FIRST),
         "Paper's way A %": _interval(row, "accuracy_gain_pct", FIRST),
+        "Residual network S %": _interval(residual, "time_saving_pct", ALL),
+        "Residual network A %": _interval(residual, "accuracy_gain_pct", ALL),
         "Ceiling S %": _interval(row, "ceiling_time_saving_pct", FIRST),
         "Ceiling A %": _interval(row, "ceiling_accuracy_gain_pct", FIRST),
         "Seeds": int(row.seeds),
@@ -223,7 +250,7 @@ def _result_row(published: PublishedResult, row: pd.Series) -> dict[str, Any]:
         "Spread of A over seeds": _spread(row, "accuracy_gain_pct"),
         "Recordings": int(row.recordings),
         "Section": published.section,
-        "Runs": _short(row.run_ids),
+        "Runs": _short(" ".join(one.run_ids for one in (row, residual) if one is not None)),
     }
 
 
@@ -236,7 +263,9 @@ def _split(folds: float) -> str:
     return "hold-out" if folds == 1 else f"k-fold, {folds:.0f} folds"
 
 
-def _interval(row: pd.Series, base: str, windows: str) -> str:
+def _interval(row: pd.Series | None, base: str, windows: str) -> str:
+    if row is None:
+        return "–"
     suffix = "" if windows == FIRST else f"_{windows}"
     value, lo, hi = (row[f"{base}{suffix}{end}"] for end in ("", "_lo", "_hi"))
     ends = "" if pd.isna(lo) else f" [{percent(lo)}, {percent(hi)}]"
@@ -333,7 +362,7 @@ def _hours(
     if published.virtual:
         recordings = stored[f"{sensor}_virtual"]
         train = _gyroscope_recordings(recordings) & (
-            recordings.recording <= recordings.attrs["train_recordings"]
+            recordings.recording <= _train_recordings(recordings, sensor)
         )
         test = xr.zeros_like(train)
     else:
@@ -364,6 +393,17 @@ def _hours(
         "_lo": fast,
         "_hi": slow,
     }
+
+
+def _train_recordings(virtual: xr.Dataset, sensor: str) -> int:
+    """How many virtual recordings train, as their file says."""
+    if "train_recordings" not in virtual.attrs:
+        raise InputError(
+            f"virtual recordings of {sensor}: expected the attribute train_recordings, got a file "
+            "without it, of an older version; make it anew: kedro run --pipeline=virtual_gyros "
+            f"--params=only.sensor={sensor}"
+        )
+    return int(virtual.attrs["train_recordings"])
 
 
 def _gyroscope_recordings(recordings: xr.Dataset) -> xr.DataArray:

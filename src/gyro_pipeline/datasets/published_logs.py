@@ -1,0 +1,104 @@
+"""The files that the paper's authors publish."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from kedro.io import AbstractDataset, DatasetError
+from pydantic import Field, ValidationError
+
+from gyro_pipeline.conventions import InputError
+from gyro_pipeline.datasets.array_logs import ArrayLogs
+from gyro_pipeline.datasets.download import ensure
+from gyro_pipeline.parameters import Parameter
+
+_LOG = logging.getLogger(__name__)
+
+
+class PublishedFile(Parameter):
+    """A file of a public git repository."""
+
+    # Not `path`: Kedro takes a value of that name for a local path, and makes it an absolute one.
+    remote: str = Field(min_length=1, description="its path below the base address")
+    blob: str = Field(pattern="^[0-9a-f]{40}$", description="git blob id of its content")
+
+    @property
+    def name(self) -> str:
+        """Its name in the local folder."""
+        return PurePosixPath(self.remote).name
+
+
+class PublishedLogs(AbstractDataset[Any, Any]):
+    """Array files that are fetched once, verified at every load, and read as any such files.
+
+    Args:
+        sensor: Name of the sensor the files are of.
+        sensors: All sensors, as in ``conf/base/globals.yml``.
+        source: Where the logs come from, as stored paths name it.
+        address: Base address, to which the files' paths are relative.
+        path: Local folder of the files. Those already there are verified, not fetched.
+        files: ``remote`` (path below the address) and ``blob`` (git blob id) of each:
+            ``{"train": …, "test": …}``, or ``{"all": …}``.
+        axes_order: As :class:`~.array_logs.ArrayLogs` takes it.
+        metadata: For other tools, such as Kedro-Viz.
+
+    Raises:
+        InputError: An unknown sensor, or an entry that is not as described here.
+    """
+
+    def __init__(
+        self,
+        sensor: str,
+        sensors: Mapping[str, Mapping[str, Any]],
+        source: str,
+        address: str,
+        path: str,
+        files: Mapping[str, Mapping[str, str]],
+        axes_order: Sequence[str] | None = None,
+        metadata: dict[str, Any] | None = None,
+    ) -> None:
+        self._files = {split: _published(sensor, split, files[split]) for split in files}
+        names = {split: file.name for split, file in self._files.items()}
+        self._arrays = ArrayLogs(sensor, sensors, source, path, names, axes_order)
+        self._sensor = sensor
+        self._address = address.rstrip("/")
+        self._path = Path(path)
+        self.metadata = metadata
+
+    def load(self) -> Any:
+        """Fetch what is not there, verify all of it, and read it.
+
+        Returns:
+            What :meth:`ArrayLogs.load` returns.
+
+        Raises:
+            InputError: As the cause of Kedro's ``DatasetError``, a file that cannot be fetched, is
+                another one than was published, or cannot be used.
+        """
+        for file in self._files.values():
+            url = f"{self._address}/{file.remote}"
+            ensure(url, self._path / file.name, file.blob)
+        _LOG.info("published %s files verified: %s", self._sensor, self._path)
+        return self._arrays.load()
+
+    def save(self, data: Any) -> None:
+        """Refuse: logs are read only."""
+        raise DatasetError(f"{self._sensor}: logs are read only, {self._path} is not written to")
+
+    def _exists(self) -> bool:
+        return self._arrays.exists()
+
+    def _describe(self) -> dict[str, Any]:
+        files = {split: file.model_dump() for split, file in self._files.items()}
+        return self._arrays._describe() | {"address": self._address, "files": files}
+
+
+def _published(sensor: str, split: str, file: Mapping[str, str]) -> PublishedFile:
+    try:
+        return PublishedFile.model_validate(file)
+    except ValidationError as error:
+        raise InputError(
+            f"{sensor}: files: {split}: expected remote, a path below the address, and blob, 40 "
+            f"hexadecimal digits: {error}"
+        ) from error

@@ -1,0 +1,100 @@
+"""Small networks trained side by side, each on its own part of the same examples."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+_HIDDEN, _BATCH, _LEARNING_RATE, _WEIGHT_DECAY = 32, 256, 3e-3, 1e-2
+
+
+@dataclass(frozen=True)
+class Perceptrons:
+    """Networks with two hidden layers of 32 tanh units; K of them, float64.
+
+    Attributes:
+        layers: Weights (K, inputs, outputs) and offsets (K, 1, outputs) of each layer.
+    """
+
+    layers: list[tuple[Tensor, Tensor]]
+
+    @torch.no_grad()
+    def __call__(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Outputs of all networks for the same inputs, (n, d) to (K, n, outputs)."""
+        networks = len(self.layers[0][0])
+        return self.forward(torch.from_numpy(inputs).expand(networks, -1, -1)).numpy()
+
+    def forward(self, values: Tensor) -> Tensor:
+        """(K, n, d) to (K, n, outputs)."""
+        *hidden, (weights, offsets) = self.layers
+        for inner, inner_offsets in hidden:
+            values = torch.tanh(torch.baddbmm(inner_offsets, values, inner))
+        return torch.baddbmm(offsets, values, weights)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """On networks so small, more than one thread only wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@_one_thread()
+def train_perceptrons(
+    inputs: NDArray[np.float64],
+    aims: NDArray[np.float64],
+    used: NDArray[np.bool_],
+    steps: int = 800,
+    seed: int = 0,
+) -> Perceptrons:
+    """Train networks with squared errors and AdamW, on a learning rate that rises and falls.
+
+    Args:
+        inputs: (n, d), of the order of 1.
+        aims: (n, outputs), of the order of 1.
+        used: (K, n), which examples each network is trained on; at least one.
+        steps: Of the optimiser, with a batch of 256 drawn for each network.
+        seed: Of the weights and batches; nothing else is random.
+
+    Returns:
+        The networks; before training they give 0.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    x, y = torch.from_numpy(inputs), torch.from_numpy(aims)
+    rows = [torch.from_numpy(np.flatnonzero(one)) for one in used]
+    networks = Perceptrons(_initial(len(used), inputs.shape[1], aims.shape[1], generator))
+    parameters = [one for layer in networks.layers for one in layer]
+    optimizer = torch.optim.AdamW(parameters, _LEARNING_RATE, weight_decay=_WEIGHT_DECAY)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _LEARNING_RATE, total_steps=steps)
+    for _ in range(steps):
+        drawn = [one[torch.randint(len(one), (_BATCH,), generator=generator)] for one in rows]
+        batch = torch.stack(drawn)
+        loss = torch.square(networks.forward(x[batch]) - y[batch]).mean(dim=(1, 2)).sum()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    return networks
+
+
+def _initial(
+    networks: int, inputs: int, outputs: int, generator: torch.Generator
+) -> list[tuple[Tensor, Tensor]]:
+    sizes = [(inputs, _HIDDEN), (_HIDDEN, _HIDDEN), (_HIDDEN, outputs)]
+    layers = []
+    for i, (incoming, outgoing) in enumerate(sizes):
+        shape = (networks, incoming, outgoing)
+        weights = torch.randn(shape, generator=generator, dtype=torch.float64) / np.sqrt(incoming)
+        if i == len(sizes) - 1:
+            weights = torch.zeros_like(weights)
+        offsets = torch.zeros((networks, 1, outgoing), dtype=torch.float64)
+        layers.append((weights.requires_grad_(), offsets.requires_grad_()))
+    return layers
