@@ -70,7 +70,7 @@ class Sensor(Parameter):
 
 
 RateUnits = Literal["deg/s", "rad/s", "mdps", "raw"]
-TimeUnits = Literal["s", "ms", "us"]
+TimeUnits = Literal["s", "ms", "us", "ns"]
 Column = Annotated[str | Annotated[int, Field(ge=0)], Field(description="a name, or from 0")]
 
 

@@ -38,7 +38,7 @@ def put(folder, *names):
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         rows = (f"{row / 120:.6f},{place},{row},0.5\n" for row in range(10))
-        path.write_text("Time,w_x,w_y,w_z\n" + "".join(rows))
+        path.write_text("Time (s),w_x (deg/s),w_y (deg/s),w_z (deg/s)\n" + "".join(rows))
 
 
 def numbers(logs):
@@ -185,7 +185,7 @@ def read_all(logs):
 def test_what_was_read_before_is_not_read_again_and_the_same(tmp_path, counted, caplog):
     names, log = counted
     put(tmp_path, "1.csv", "2.csv")
-    logs = file_logs(tmp_path, "{imu}.csv", cache=str(tmp_path / ".read"))
+    logs = file_logs(tmp_path, "{imu}.csv", cache={"path": str(tmp_path / ".read")})
     logs.load().entries[0].read()  # and then it was interrupted
     with caplog.at_level(logging.INFO, "gyro_pipeline"):
         again, _ = read_all(logs)
@@ -209,7 +209,7 @@ def touch(path):
 @pytest.mark.parametrize("change", [rewrite, touch])
 def test_a_changed_file_is_read_anew_and_its_old_reading_removed(tmp_path, counted, change):
     put(tmp_path, "1.csv", "2.csv")
-    logs = file_logs(tmp_path, "{imu}.csv", cache=str(tmp_path / ".read"))
+    logs = file_logs(tmp_path, "{imu}.csv", cache={"path": str(tmp_path / ".read")})
     read_all(logs)
     change(tmp_path / "1.csv")
     read_all(logs)
@@ -219,7 +219,7 @@ def test_a_changed_file_is_read_anew_and_its_old_reading_removed(tmp_path, count
 
 def test_other_options_and_other_readers_read_anew(tmp_path, counted, monkeypatch):
     put(tmp_path, "1.csv")
-    cache = {"cache": str(tmp_path / ".read")}
+    cache = {"cache": {"path": str(tmp_path / ".read")}}
     read_all(file_logs(tmp_path, "{imu}.csv", **cache))
     slow = {"dot": SENSORS["dot"] | {"recording_s": 20}}
     read_all(file_logs(tmp_path, "{imu}.csv", **cache, sensors=slow))
@@ -230,7 +230,7 @@ def test_other_options_and_other_readers_read_anew(tmp_path, counted, monkeypatc
 
 def test_a_damaged_reading_is_none(tmp_path, counted):
     put(tmp_path, "1.csv")
-    logs = file_logs(tmp_path, "{imu}.csv", cache=str(tmp_path / ".read"))
+    logs = file_logs(tmp_path, "{imu}.csv", cache={"path": str(tmp_path / ".read")})
     read_all(logs)
     (kept,) = (tmp_path / ".read").iterdir()
     kept.write_bytes(kept.read_bytes()[:-30])
@@ -241,6 +241,6 @@ def test_a_damaged_reading_is_none(tmp_path, counted):
 def test_files_that_cannot_be_used_and_binary_ones_are_not_kept(tmp_path, counted):
     (tmp_path / "1.csv").write_text("bad")
     put(tmp_path, "2.parquet")
-    logs = file_logs(tmp_path, "{imu}.*", cache=str(tmp_path / ".read"))
+    logs = file_logs(tmp_path, "{imu}.*", cache={"path": str(tmp_path / ".read")})
     assert [log is None for log in read_all(logs)] == [True, False]
     assert not (tmp_path / ".read").exists()

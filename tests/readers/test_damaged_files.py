@@ -6,6 +6,7 @@ of the good file come back, which are NaN, and the findings.
 
 import gzip
 import io
+import re
 import zipfile
 from dataclasses import dataclass, field
 
@@ -90,6 +91,18 @@ def in_quotes(text, delimiter=";"):
     return '"' + text.strip().replace(delimiter, f'"{delimiter}"').replace("\n", '"\n"') + '"\n'
 
 
+def dated(between, zone):
+    """Dates in place of the milliseconds."""
+
+    def change(text):
+        def date(milliseconds):
+            return f"2024-03-01{between}10:00:0{int(milliseconds[1]) / 1000:.2f}{zone};"
+
+        return re.sub(r"(?m)^(\d+);", date, text.replace("t_ms", "time"))
+
+    return change
+
+
 def joined(all_lines):
     return [*all_lines[:10], all_lines[10][:-1], all_lines[11][1:], *all_lines[12:]]
 
@@ -153,6 +166,17 @@ CASES = {
         Refused("separated by ;, got none"),
     ),
     "an enormous field that is not needed": (ANGLES, cell(20, 4, "7" * 3_000_000), Read()),
+    "dates for times": (GENERAL, dated("T", ""), Read(rate_hz=100)),
+    "dates for times in UTC, one of them unreadable": (
+        GENERAL,
+        lambda t: cell(9, 0, "2024-03-0x", ";")(dated(" ", "Z")(t)),
+        Read(rate_hz=100, findings=(UNREADABLE,)),
+    ),
+    "a clock time unreadable": (
+        ARTEMIS,
+        cell(9, 1, "12:xx"),
+        Read(rate_hz=100, findings=(("unreadable rows", "repaired"),)),
+    ),
     "NaN and infinity in words": (
         ANGLES,
         lambda t: cell(9, 7, " NaN")(cell(7, 8, "-Infinity")(t)),
@@ -175,6 +199,11 @@ CASES = {
         ANGLES,
         lambda t: t.encode() + bytes(4096),
         Read(findings=(CUT,)),
+    ),
+    "the last line is cut, fields are quoted": (
+        GENERAL,
+        lambda t: in_quotes(t)[:-6],
+        Read(BUT_LAST, findings=(CUT,), rate_hz=100),
     ),
     "text in a number column": (
         ANGLES,
@@ -439,3 +468,24 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path, read):
         read(lambda path: None)
     with pytest.raises(InputError, match="cannot be read: Is a directory"):
         read(lambda path: path.mkdir())
+
+
+@pytest.mark.parametrize(("rows", "most"), [(100, 3), (400, 4), (1000, 10)])
+def test_one_row_in_a_hundred_may_be_unreadable_but_no_more(rows, most, read):
+    good = ["x_dps,y_dps,z_dps", *["1,2,3"] * rows]
+    broken = [*good[: rows - most], *["1,2"] * most, "4,5,6"]
+    log = read("\n".join(broken) + "\n")
+    assert np.isnan(log.samples).all(axis=1).sum() == most
+    assert log.samples[-1].tolist() == [4, 5, 6]
+    with pytest.raises(InputError, match=f"got {most + 1} of {rows} that are not"):
+        read("\n".join([*broken[:-1], "1,2"]) + "\n")
+
+
+def test_a_finding_says_which_row_and_line_and_why(good, read):
+    text = cell(9, 8, "error")(good[ANGLES])
+    for content, line in ((text, 11), (text.replace("\n", "\n\n"), 21)):
+        (finding,) = read(content, 120).findings
+        assert finding.detail == (
+            f"1 of 60 rows cannot be read and are NaN: row 9 (line {line}): w_y: expected a "
+            "number, got 'error'"
+        )

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.io
+from pydantic import ValidationError
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.parameters import ReaderOptions
@@ -180,6 +181,20 @@ def test_an_unknown_unit_in_the_header_is_refused_even_of_a_known_format(unit, g
         read(text)
 
 
+def test_raw_counts_and_their_scale_go_together():
+    for options in ({"units": "raw"}, {"scale_dps": 0.01}, {"units": "mdps", "scale_dps": 0.01}):
+        with pytest.raises(ValidationError, match="units: raw and scale_dps go together"):
+            ReaderOptions(**options)
+
+
+def test_counts_that_the_header_names_are_scaled(rates, read):
+    rows = "\n".join(f"{k},{k + 1},{-k}" for k in range(60)) + "\n"
+    log = read("x (LSB),y (LSB),z (LSB)\n" + rows, units="raw", scale_dps=1 / 131)
+    np.testing.assert_allclose(log.samples[:, 1], np.arange(1, 61) / 131)
+    with pytest.raises(InputError, match="raw counts: give units: raw and scale_dps"):
+        read("x (LSB),y (LSB),z (LSB)\n" + rows)
+
+
 def test_a_format_can_be_forced_and_a_wrong_one_is_refused(good, read):
     options = {"columns": ("Acc_X", "Acc_Y", "Acc_Z"), "units": "mdps"}
     forced = read(good["movella_dot"], format="general", **options)
@@ -203,7 +218,12 @@ def test_a_new_format_is_a_class_and_an_entry(monkeypatch, rates, read):
 REAL = os.environ.get("GYRO_PIPELINE_REAL_DATA")
 
 
-@pytest.mark.skipif(not REAL, reason="GYRO_PIPELINE_REAL_DATA names no folder of real recordings")
+needs_real = pytest.mark.skipif(
+    not REAL, reason="GYRO_PIPELINE_REAL_DATA names no folder of real recordings"
+)
+
+
+@needs_real
 @pytest.mark.parametrize(
     ("unit", "rows"), [(1, 14461), (2, 14469), (3, 14464), (4, 14460), (5, 14468)]
 )
@@ -218,3 +238,28 @@ def test_real_dot_files_are_read_as_numpy_reads_them(unit, rows):
     assert not log.findings
     assert not len(log.gap_rows)
     assert np.isinf(log.samples).any(axis=1).nonzero()[0].tolist() == ([13001] if unit == 1 else [])
+
+
+@needs_real
+@pytest.mark.parametrize(
+    "copy", ["rad/s in the header", "rad/s in the options", "Artemis", "Parquet"]
+)
+def test_copies_of_a_real_file_give_the_same_biases(copy, read):
+    table = pd.read_csv(Path(REAL) / "dot_x_stat_2.csv", skipinitialspace=True).iloc[:, :10]
+    names = ["w_x", "w_y", "w_z"]
+    truth = table[names].to_numpy()
+    options = {"units": "rad/s"} if copy == "rad/s in the options" else {}
+    if copy.startswith("rad/s"):
+        table[names] = np.radians(table[names])
+    if copy == "rad/s in the header":
+        table = table.rename(columns={name: f"{name} (rad/s)" for name in names})
+    if copy == "Artemis":
+        times = pd.Timestamp("2024-03-01 23:59:00") + pd.to_timedelta(table.Time, unit="s")
+        table = table.rename(columns=dict(zip(names, ["gX", "gY", "gZ"], strict=True)))
+        table.insert(0, "rtcTime", times.dt.strftime("%H:%M:%S.%f").str[:-4])
+    save = table.to_parquet if copy == "Parquet" else lambda path: table.to_csv(path, index=False)
+    log = read(save, 120, **options)
+    np.testing.assert_allclose(log.samples.mean(axis=0), truth.mean(axis=0), rtol=0, atol=1e-12)
+    assert log.rate_hz == pytest.approx(120, rel=1e-4)  # stamps of hundredths in 120 s
+    assert not len(log.gap_rows)
+    assert {finding.check for finding in log.findings} <= {"wrap-around"}

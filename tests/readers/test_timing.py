@@ -24,7 +24,7 @@ def test_even_stamps_give_their_rate_exactly():
     assert not len(timing.gap_rows)
 
 
-@pytest.mark.parametrize(("unit_s", "scale"), [(1.0, 1), (1e-3, 1e3), (1e-6, 1e6)])
+@pytest.mark.parametrize(("unit_s", "scale"), [(1.0, 1), (1e-3, 1e3), (1e-6, 1e6), (1e-9, 1e9)])
 def test_units_of_time_give_the_same_rate(unit_s, scale):
     assert from_stamps(np.arange(N) / 50 * scale, unit_s).rate_hz == pytest.approx(50)
 

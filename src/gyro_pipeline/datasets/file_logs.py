@@ -47,8 +47,8 @@ class FileLogs(AbstractDataset[Logs, Logs]):
             their order; ``*`` for anything but a slash. Without an IMU all files are of IMU 1;
             without a recording the files of an IMU are numbered in their order.
         reader: How the files are read (:class:`gyro_pipeline.parameters.ReaderOptions`).
-        cache: Folder for what was read of text files, so that an interrupted run goes on where it
-            was; None: nothing is kept.
+        cache: ``{"path": folder}`` for what was read of text files, so that an interrupted run
+            goes on where it was; None: nothing is kept. (Kedro makes a ``path`` absolute.)
         metadata: For other tools, such as Kedro-Viz.
 
     Raises:
@@ -63,7 +63,7 @@ class FileLogs(AbstractDataset[Logs, Logs]):
         path: str,
         pattern: str,
         reader: Mapping[str, Any] | None = None,
-        cache: str | None = None,
+        cache: Mapping[str, str] | None = None,
         metadata: dict[str, Any] | None = None,
     ) -> None:
         self._rate_hz = sensor_entry(sensor, sensors).rate_hz
@@ -76,7 +76,7 @@ class FileLogs(AbstractDataset[Logs, Logs]):
             self._options = ReaderOptions.model_validate(reader or {})
         except ValidationError as error:
             raise InputError(f"{sensor}: reader in the catalog entry: {error}") from error
-        self._cache = None if cache is None else Path(cache)
+        self._cache = None if cache is None else Path(cache["path"])
         self.metadata = metadata
 
     def load(self) -> Logs:
@@ -150,7 +150,7 @@ class FileLogs(AbstractDataset[Logs, Logs]):
             if self._cache is not None and path.suffix.lower() not in _BINARY:
                 state = path.stat()
                 key = fingerprint([str(path), state.st_size, state.st_mtime_ns, settings])
-                kept_as = self._cache / f"{key}.npz"
+                kept_as = self._cache / f"{key}.npy"
             found[name] = Reading(path, self._options, self._rate_hz, kept_as)
         return found
 
@@ -158,7 +158,7 @@ class FileLogs(AbstractDataset[Logs, Logs]):
         """Say what is there of an earlier run, and remove what is of other files."""
         if self._cache is None:
             return
-        there = set(self._cache.glob("*.npz"))
+        there = set(self._cache.glob("*.npy"))
         for path in there.difference(wanted):
             path.unlink()
         before = len(there.intersection(wanted))

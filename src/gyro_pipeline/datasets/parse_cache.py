@@ -1,9 +1,8 @@
 """Text files that were read once, kept in a form that is read in a hundredth of the time."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -47,28 +46,26 @@ class Reading:
 
 
 def _save(log: Log, path: Path) -> None:
-    known = {"rate_hz": log.rate_hz, "findings": [asdict(finding) for finding in log.findings]}
-    arrays: dict[str, Any] = {"gap_rows": log.gap_rows, "known": np.array(json.dumps(known))}
+    """Arrays one after the other, which takes half the time of an archive of them."""
+    findings = [[finding.check, finding.outcome, finding.detail] for finding in log.findings]
     with np.errstate(over="ignore"):
-        arrays["samples"] = log.samples.astype(np.float32)
+        arrays = [log.samples.astype(np.float32), log.gap_rows]
+    arrays.append(np.array(json.dumps([log.rate_hz, findings])))
     if log.temperature_c is not None:
-        arrays["temperature_c"] = log.temperature_c.astype(np.float32)
-    with replacing(path) as temporary:
-        np.savez(temporary, **arrays)
+        arrays.append(log.temperature_c.astype(np.float32))
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        for array in arrays:
+            np.save(file, array)
 
 
 def _load(path: Path) -> Log | None:
     """None where there is none that can be read."""
     try:
-        with np.load(path) as kept:  # never unpickles
-            known = json.loads(str(kept["known"]))
-            warmth = kept["temperature_c"].astype(np.float64) if "temperature_c" in kept else None
-            return Log(
-                kept["samples"].astype(np.float64),
-                known["rate_hz"],
-                kept["gap_rows"],
-                warmth,
-                tuple(Finding(**finding) for finding in known["findings"]),
-            )
+        with path.open("rb") as file:
+            samples, gap_rows, known = (np.load(file) for _ in range(3))  # never unpickles
+            warmth = np.load(file).astype(np.float64) if file.peek(1) else None
+        rate_hz, findings = json.loads(str(known))
+        found = tuple(Finding(*finding) for finding in findings)
+        return Log(samples.astype(np.float64), rate_hz, gap_rows, warmth, found)
     except Exception:  # a damaged file fails in many ways, and is read anew in all of them
         return None

@@ -2,11 +2,17 @@
 
 import csv
 import re
+from typing import Any
+
+import pyarrow as pa
 
 DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab"}
 
-_CLOCK = re.compile(r"\d{1,2}:\d\d:\d\d(\.\d+)?")
-_DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\.\d+)?)?")
+_TIMES = {
+    re.compile(r"\d{1,2}:\d\d:\d\d(\.\d+)?"): pa.time64("us"),
+    re.compile(r"\d{4}-\d\d-\d\d[T ][\d:.]+"): pa.timestamp("us"),
+    re.compile(r"\d{4}-\d\d-\d\d[T ][\d:.]+(Z|[+-]\d\d:?\d\d)"): pa.timestamp("us", "UTC"),
+}
 
 
 def split(line: str, delimiter: str) -> list[str]:
@@ -26,14 +32,9 @@ def is_number(field: str) -> bool:
     return True
 
 
-def is_clock(field: str) -> bool:
-    """Whether it is a time of day."""
-    return _CLOCK.fullmatch(field) is not None
-
-
-def is_date(field: str) -> bool:
-    """Whether it is a date with a time of day, as ISO 8601 has it."""
-    return _DATE.fullmatch(field) is not None
+def time_type(field: str) -> Any:
+    """Arrow's type of a time of day, or of a date with one as ISO 8601 has it; else None."""
+    return next((kind for times, kind in _TIMES.items() if times.fullmatch(field)), None)
 
 
 def is_header(fields: list[str]) -> bool:

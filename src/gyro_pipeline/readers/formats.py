@@ -13,9 +13,9 @@ from gyro_pipeline.logs import KEPT, Finding
 from gyro_pipeline.parameters import Column, RateUnits, ReaderOptions, TimeUnits
 from gyro_pipeline.readers.headers import (
     DEG_PER_S,
-    RATE_UNITS,
     SECONDS,
     TIME_UNITS,
+    UNITS,
     axes,
     find,
     listed,
@@ -119,7 +119,7 @@ class Reader:
 
     def _scale(self, headers: Sequence[str], options: ReaderOptions, where: str) -> float:
         """deg/s in one unit of the rates."""
-        said = {split_unit(header, RATE_UNITS)[1] for header in headers}
+        said = {split_unit(header, UNITS)[1] for header in headers}
         found = {rate_unit(header) for header in headers}
         if len(found) > 1:
             raise InputError(
@@ -152,7 +152,7 @@ class Reader:
         if time in table.in_seconds:
             return 1.0, ()
         header = table.names[time]
-        said = split_unit(header, TIME_UNITS)[1]
+        said = split_unit(header, UNITS)[1]
         unit = TIME_UNITS.get(said or "")
         if said and unit is None and options.time_units is None:
             raise InputError(
@@ -167,7 +167,9 @@ class Reader:
         if unit:
             return SECONDS[unit], ()
         if options.time_column is not None:
-            raise InputError(f"{where}: {header!r} has no unit; give time_units: s, ms or us")
+            raise InputError(
+                f"{where}: {header!r} has no unit; give time_units: {', '.join(SECONDS)}"
+            )
         text = f"{header!r} has no unit and is not used; give time_units to have the rate checked"
         return 1.0, (Finding("timestamps", KEPT, text),)
 
@@ -188,7 +190,8 @@ class MovellaDot(Reader):
 
     def claims(self, table: Table) -> bool:
         """Whether it is; MT Manager writes the same names and rad/s, below lines of ``//``."""
-        return super().claims(table) and "//" not in table.preamble
+        comments = any(line.startswith("//") for line in table.preamble.splitlines())
+        return super().claims(table) and not comments
 
 
 class MovellaDotAngles(Reader):
@@ -238,7 +241,7 @@ class General(Reader):
         rates = [n for n, name in enumerate(table.names) if rate_unit(name) not in (None, "raw")]
         if not rates and len(table.names) == len(AXES):
             return range(len(AXES))
-        stems = [split_unit(table.names[n], RATE_UNITS)[0] for n in rates]
+        stems = [split_unit(table.names[n], UNITS)[0] for n in rates]
         if len(rates) != len(AXES) or (order := axes(stems)) is None:
             raise InputError(
                 f"{where}: expected columns of angular rate about x, y, z with their unit, got "
@@ -248,7 +251,7 @@ class General(Reader):
 
     def time_column(self, table: Table) -> Column | None:
         """The first column that is named time or timestamp."""
-        stems = [split_unit(name, TIME_UNITS)[0].lower() for name in table.names]
+        stems = [split_unit(name, UNITS)[0].lower() for name in table.names]
         return next((n for n, stem in enumerate(stems) if stem in ("time", "timestamp", "t")), None)
 
     def temperature_column(self, table: Table) -> Column | None:

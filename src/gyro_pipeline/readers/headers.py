@@ -1,7 +1,8 @@
 """Column headers: names and units."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from functools import lru_cache
 from itertools import permutations
 from math import pi
 
@@ -11,7 +12,7 @@ from gyro_pipeline.parameters import Column
 DEG_PER_S = {"deg/s": 1.0, "rad/s": 180 / pi, "mdps": MDPS}
 """deg/s in one of each unit of angular rate but raw counts."""
 
-SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Seconds in one of each unit of time."""
 
 _SPELLINGS = {
@@ -22,15 +23,19 @@ _SPELLINGS = {
     "s": "s sec secs second seconds",
     "ms": "ms msec millisecond milliseconds",
     "us": "us µs μs usec microsecond microseconds",  # two different signs for micro
+    "ns": "ns nsec nanosecond nanoseconds",
 }
 RATE_UNITS = {text: unit for unit in (*DEG_PER_S, "raw") for text in _SPELLINGS[unit].split()}
 TIME_UNITS = {text: unit for unit in SECONDS for text in _SPELLINGS[unit].split()}
+UNITS = (*RATE_UNITS, *TIME_UNITS)
+"""All spellings."""
 
 _BRACKETED = re.compile(r"\s*[(\[]([^()\[\]]*)[)\]]\s*$")
 _AXIS = re.compile(r"\.[xyz]$")  # of an array of three columns
 
 
-def split_unit(header: str, spellings: Iterable[str]) -> tuple[str, str | None]:
+@lru_cache(1 << 12)  # a folder's files have the same headers
+def split_unit(header: str, spellings: tuple[str, ...]) -> tuple[str, str | None]:
     """Part a header into its name and its unit as written.
 
     Args:
@@ -54,7 +59,7 @@ def split_unit(header: str, spellings: Iterable[str]) -> tuple[str, str | None]:
 
 def rate_unit(header: str) -> str | None:
     """Unit of an angular rate as its header has it; None if it says none or an unknown one."""
-    return RATE_UNITS.get(split_unit(header, RATE_UNITS)[1] or "")
+    return RATE_UNITS.get(split_unit(header, UNITS)[1] or "")
 
 
 def find(names: Sequence[str], column: Column, where: str) -> int:
@@ -90,8 +95,7 @@ def find(names: Sequence[str], column: Column, where: str) -> int:
 def matching(names: Sequence[str], column: str) -> list[int]:
     """Numbers of the columns with a name, as a whole or else without the unit behind it."""
     exact = [number for number, name in enumerate(names) if name == column]
-    known = {*RATE_UNITS, *TIME_UNITS}
-    return exact or [n for n, name in enumerate(names) if split_unit(name, known)[0] == column]
+    return exact or [n for n, name in enumerate(names) if split_unit(name, UNITS)[0] == column]
 
 
 def axes(names: Sequence[str]) -> list[int] | None:

@@ -6,9 +6,10 @@ Where that leaves a choice, the file is refused.
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from gyro_pipeline.conventions import AXES, InputError
-from gyro_pipeline.readers.fields import DELIMITERS, is_clock, is_date, is_number, split
+from gyro_pipeline.readers.fields import DELIMITERS, is_number, split, time_type
 from gyro_pipeline.readers.headers import listed
 from gyro_pipeline.readers.text import TextTable
 
@@ -21,8 +22,7 @@ _WITH_COMMA = re.compile(r"(?:^|[;\t\n])\s*\"?[+-]?(\d+),(\d+)(?=[eE;\t\r\n\" ]|
 _WITH_BOTH = re.compile(r"\d,\d{3}\.\d|\d\.\d{3},\d")
 
 
-@dataclass(frozen=True)
-class _Line:
+class _Line(NamedTuple):
     number: int  # in the file, from 1
     end: int  # offset of what follows
     text: str
@@ -63,8 +63,7 @@ def open_text(path: Path) -> TextTable:
         delimiter=rows.delimiter,
         quoted='"' in lines[rows.at].text,
         decimal_point=_decimal_point(path, head, rows.delimiter),
-        clocks=frozenset(n for n, field in enumerate(rows.fields) if is_clock(field)),
-        dates=frozenset(n for n, field in enumerate(rows.fields) if is_date(field)),
+        times={n: kind for n, field in enumerate(rows.fields) if (kind := time_type(field))},
     )
 
 

@@ -223,8 +223,9 @@ def _open_mat5(path: Path) -> _Arrays:
 
 def _open_hdf5(path: Path) -> _Arrays:
     """MATLAB 7.3, which stores arrays transposed; other HDF5 as it is."""
+    with path.open("rb") as start:
+        matlab = start.read(len(_MATLAB)) == _MATLAB
     with h5py.File(path) as file:
-        matlab = path.open("rb").read(len(_MATLAB)) == _MATLAB
         arrays = {
             name: data[()].T if matlab or "MATLAB_class" in data.attrs else data[()]
             for name, data in file.items()

@@ -4,7 +4,7 @@ A file that Arrow cannot read as numbers is read once more as text, and looked a
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -47,8 +47,7 @@ class TextTable:
         delimiter: Between fields.
         quoted: Whether fields are in quotes; if not, a stray quote is one more damaged field.
         decimal_point: A point or a comma.
-        clocks: Columns of times of day.
-        dates: Columns of dates with times.
+        times: Arrow's type of the columns of times of day and of dates with times.
     """
 
     path: Path
@@ -60,13 +59,12 @@ class TextTable:
     delimiter: str
     quoted: bool
     decimal_point: str
-    clocks: frozenset[int]
-    dates: frozenset[int]
+    times: Mapping[int, Any]
 
     @property
     def in_seconds(self) -> frozenset[int]:
         """Columns that are read as seconds, whatever the header says."""
-        return self.clocks | self.dates
+        return frozenset(self.times)
 
     def read(self, columns: Sequence[int], lenient: int | None = None) -> Values:
         """Read columns (see ``readers.tables.Table``)."""
@@ -75,7 +73,7 @@ class TextTable:
         if not self.data.isascii():  # Arrow would drop odd rows that are not UTF-8 without a word
             body = memoryview(bytes(body).decode("utf-8", "replace").encode())
         try:
-            table, odd = self._parse(body, {n: self._kind(n) for n in columns})
+            table, odd = self._parse(body, {n: self.times.get(n, pa.float64()) for n in columns})
             values, unreadable = [_numbers(table[str(n)]) for n in columns], {}
         except pa.ArrowInvalid:
             table, odd = self._parse(body, dict.fromkeys(columns, pa.string()))
@@ -108,19 +106,13 @@ class TextTable:
             raise InputError(f"{self.path}: expected rows of numbers, got none but a cut one")
         return end, findings
 
-    def _kind(self, column: int) -> Any:
-        if column in self.clocks:
-            return pa.time64("us")
-        return pa.timestamp("us") if column in self.dates else pa.float64()
-
     def _parse(self, body: memoryview, kinds: dict[int, Any]) -> tuple[Any, Odd]:
         """Let Arrow parse; rows of another number of fields are left out of the table."""
         odd: Odd = {}
 
         def skip(row: Any) -> str:
-            odd[row.number - 1] = (
-                f"expected {row.expected_columns} fields, got {row.actual_columns}"
-            )
+            text = f"expected {row.expected_columns} fields, got {row.actual_columns}"
+            odd[row.number - 1] = text
             return "skip"
 
         table = pyarrow.csv.read_csv(
@@ -135,20 +127,20 @@ class TextTable:
                 quote_char='"' if self.quoted else False,
                 invalid_row_handler=skip,
             ),
-            pyarrow.csv.ConvertOptions(
-                include_columns=[str(number) for number in kinds],
-                column_types={str(number): kind for number, kind in kinds.items()},
-                null_values=_NULLS,
-                strings_can_be_null=True,
-                decimal_point=self.decimal_point,
-            ),
+            self._conversion(kinds),
         )
-        if self.quoted and (rows := table.num_rows + len(odd)) != len(self._lines):
-            raise InputError(
-                f"{self.path}: expected a row on each line, got {rows} rows on {len(self._lines)} "
-                "lines: a quoted field does not end on its line; correct it"
-            )
+        if self.quoted:
+            self._refuse_rows_over_lines(table.num_rows + len(odd), body)
         return table, odd
+
+    def _conversion(self, kinds: dict[int, Any]) -> Any:
+        return pyarrow.csv.ConvertOptions(
+            include_columns=[str(number) for number in kinds],
+            column_types={str(number): kind for number, kind in kinds.items()},
+            null_values=_NULLS,
+            strings_can_be_null=True,
+            decimal_point=self.decimal_point,
+        )
 
     def _converted(self, table: Any, columns: Sequence[int], lenient: int | None) -> Any:
         """Turn text into numbers where it is one; say in which rows it is not."""
@@ -156,38 +148,47 @@ class TextTable:
         unreadable: Odd = {}
         for number in columns:
             texts = pc.utf8_trim_whitespace(table[str(number)])
-            if number in self.in_seconds:
-                column = self._seconds(texts, number)
-                wrong = np.isnan(column) & ~texts.is_null().to_numpy()
-            else:
-                points = pc.replace_substring(texts, self.decimal_point, ".")
-                good = pc.match_substring_regex(points, _NUMBER)
-                if self.decimal_point != ".":  # a point separates thousands there
-                    good = pc.and_(good, pc.invert(pc.match_substring(texts, ".")))
-                column = _numbers(pc.if_else(good, points, None).cast(pa.float64()))
-                wrong = pc.fill_null(pc.invert(good), False).to_numpy()
+            column = self._seconds(texts, number) if number in self.times else self._number(texts)
             values.append(column)
+            rows = np.flatnonzero(np.isnan(column) & ~texts.is_null().to_numpy())
+            found = zip(rows.tolist(), texts.take(pa.array(rows)).to_pylist(), strict=True)
+            wrong = {row: text for row, text in found if text.lower().lstrip("+-") != "nan"}
+            what = self.names[number] or f"column {number}"
+            self._refuse_thousands(wrong.values(), what)
             if number != lenient:
-                rows = np.flatnonzero(wrong)
-                found = texts.take(pa.array(rows)).to_pylist()
-                what = self.names[number] or f"column {number}"
                 unreadable |= {
-                    int(row): f"{what}: expected a number, got {text[:40]!r}"
-                    for row, text in zip(rows, found, strict=True)
+                    row: f"{what}: expected a number, got {text[:40]!r}"
+                    for row, text in wrong.items()
                 }
-                self._refuse_thousands(found, what)
         return values, unreadable
 
+    def _number(self, texts: Any) -> NDArray[np.float64]:
+        """Numbers; NaN where there is none. Where commas are decimal, a point is no part of one."""
+        points = pc.replace_substring(texts, self.decimal_point, ".")
+        good = pc.match_substring_regex(points, _NUMBER)
+        if self.decimal_point != ".":
+            good = pc.and_(good, pc.invert(pc.match_substring(texts, ".")))
+        return _numbers(pc.if_else(good, points, None).cast(pa.float64()))
+
     def _seconds(self, texts: Any, number: int) -> NDArray[np.float64]:
+        """Seconds since midnight, or since the first date; NaN where there is neither."""
         series = pd.Series(texts.to_pylist(), dtype="object")
-        if number in self.clocks:
+        if pa.types.is_time(self.times[number]):
             since = pd.to_timedelta(series, errors="coerce")
         else:
             times = pd.to_datetime(series, errors="coerce", format="ISO8601", utc=True)
             since = times - times.min()
         return np.asarray(since.dt.total_seconds(), np.float64)
 
-    def _refuse_thousands(self, texts: Sequence[str], what: str) -> None:
+    def _refuse_rows_over_lines(self, rows: int, body: memoryview) -> None:
+        lines = sum(map(bool, bytes(body).splitlines()))
+        if rows != lines:
+            raise InputError(
+                f"{self.path}: expected a row on each line, got {rows} rows on {lines} lines: a "
+                "quoted field does not end on its line; correct it"
+            )
+
+    def _refuse_thousands(self, texts: Iterable[str], what: str) -> None:
         for text in texts:
             if _THOUSANDS.fullmatch(text):
                 raise InputError(

@@ -45,6 +45,7 @@ class _Steps:
         lost: (k,), rows without a stamp in between.
         steps: (k,), wraps of a counter undone.
         wraps: (k,), where.
+        median: Of the steps; NaN if there are none.
         resolution: Decimal unit that all stamps are multiples of; 0 if small beside the steps.
     """
 
@@ -52,25 +53,29 @@ class _Steps:
     lost: Rows
     steps: Floats
     wraps: Mask
+    median: float
     resolution: float
 
     @classmethod
     def between(cls, stamps: Floats, unit_s: float) -> "_Steps":
         rows = np.flatnonzero(np.isfinite(stamps))
         steps, wraps = _unwrapped(np.diff(stamps[rows]), unit_s)
-        resolution = _resolution(stamps[rows], steps) if len(steps) else 0.0
-        return cls(rows[1:], np.diff(rows) - 1, steps, wraps, resolution)
+        median = float(np.median(steps)) if len(steps) else np.nan
+        resolution = _resolution(stamps[rows], median) if len(steps) else 0.0
+        return cls(rows[1:], np.diff(rows) - 1, steps, wraps, median, resolution)
 
     def near_median(self) -> Mask:
         """Steps within half of the median step, and the resolution, of it."""
-        median = np.median(self.steps)
-        return np.abs(self.steps - median * (1 + self.lost)) <= median / 2 + self.resolution
+        away = np.abs(self.steps - self.median * (1 + self.lost))
+        return away <= self.median / 2 + self.resolution
 
-    def are_bursts(self) -> bool:
+    def are_bursts(self, far: Mask) -> bool:
         """Whether many steps are far from the median: within bursts short, between them long."""
+        if not far.any():
+            return False
         forward = np.maximum(self.steps, 0)
-        far = ~self.near_median() & (self.steps >= 0)
-        long = far & (forward > np.median(self.steps))
+        far = far & (self.steps >= 0)
+        long = far & (forward > self.median)
         lasts = forward[long].sum() > _LONG_TIME * forward.sum()
         return bool((far & ~long).mean() > _SHORT or (lasts and long.mean() > _LONG))
 
@@ -101,8 +106,9 @@ def from_stamps(stamps: Floats, unit_s: float) -> Timing:
     if not (steps > 0).any():
         text = "timestamps do not advance: the rate is not measured"
         return Timing(findings=(Finding("timestamps", KEPT, text),))
-    bursty = found.are_bursts()
-    ordinary = found.within_bursts() if bursty else found.near_median()
+    ordinary = found.near_median()
+    if bursty := found.are_bursts(~ordinary):
+        ordinary = found.within_bursts()
     step = steps[ordinary].sum() / (1 + found.lost[ordinary]).sum()
     back, gaps = steps < 0, (steps > step) & ~ordinary
     scatter = np.std(steps[ordinary & (found.lost == 0)])
@@ -111,7 +117,7 @@ def from_stamps(stamps: Floats, unit_s: float) -> Timing:
         *_at("time order", found, back, "time goes back"),
         *_at("gaps", found, gaps, f"samples are missing, {steps[gaps].sum() * unit_s:.4g} s"),
     ]
-    if bursty or found.resolution > step:
+    if bursty or found.resolution > 1.5 * step:
         text = "timestamps are coarse or come in bursts: the rate is the count over the duration"
         findings.append(Finding("timestamps", KEPT, text))
     elif found.resolution < step / 2:
@@ -177,11 +183,11 @@ def _unwrapped(steps: Floats, unit_s: float) -> tuple[Floats, Mask]:
     return steps, wraps
 
 
-def _resolution(stamps: Floats, steps: Floats) -> float:
+def _resolution(stamps: Floats, step: float) -> float:
     """Decimal unit that all stamps are multiples of, but for how floats are rounded."""
     rounded = 4 * np.spacing(np.abs(stamps).max())
     for unit in (1.0, 0.1, 0.01, 1e-3, 1e-4):
-        if unit < np.median(steps) / 100:
+        if unit < step / 100:
             break
         if (np.abs(stamps - unit * np.rint(stamps / unit)) <= rounded).all():
             return unit

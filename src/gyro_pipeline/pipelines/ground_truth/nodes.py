@@ -63,7 +63,10 @@ def measure_bias(
         {
             "bias_dps": _per_recording(recording_mean, samples),
             "standard_error_dps": white / np.sqrt(duration_s),
-            "sample_sigma_dps": samples.std("sample", ddof=1, dtype=np.float64),
+            # xarray's own would skip NaN, and round deviations to float32 on the way
+            "sample_sigma_dps": _per_recording(
+                lambda x: x.std(-1, ddof=1, dtype=np.float64), samples
+            ),
             "settling_time_s": _per_recording(
                 lambda x: settling_time_s(x, rate_hz, tolerance_dps), samples
             ),

@@ -21,7 +21,7 @@ from gyro_pipeline.pipelines.raw_logs.stack import Stack
 
 logger = logging.getLogger(__name__)
 
-_WORTH_PROCESSES = 2 * 10**8
+_WORTH_PROCESSES = 10**8
 """Bytes to read; fewer are read by this process before others have started."""
 
 _NAMED = 10

@@ -1,0 +1,151 @@
+"""The five public DOT files, and copies of them in other formats, through the raw-logs stage."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from gyro_pipeline.datasets.file_logs import FileLogs
+from gyro_pipeline.datasets.recordings import open_recordings
+from gyro_pipeline.parameters import Execution
+from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs
+
+IMUS, RATE_HZ = (1, 2, 3, 4, 5), 120.0
+START, STOP = 1, 13_000
+"""Rows that are used of every file: from behind the row of zeros to the shortest one's end, which
+is the dropout of file 1 in rows 13000 and 13001."""
+
+
+@pytest.fixture(scope="module")
+def folder():
+    """Of the files."""
+    named = os.environ.get("GYRO_PIPELINE_REAL_DATA")
+    if not named or not Path(named, "dot_x_stat_1.csv").is_file():
+        pytest.skip("GYRO_PIPELINE_REAL_DATA names no folder of real recordings")
+    return Path(named)
+
+
+@pytest.fixture(scope="module")
+def rows(folder):
+    """Angular rates of each IMU as its file has them, (rows, 3), parsed here."""
+    parsed = {}
+    for imu in IMUS:
+        _, *lines = (folder / f"dot_x_stat_{imu}.csv").read_text().splitlines()
+        parsed[imu] = np.array([[float(cell) for cell in line.split(",")[7:10]] for line in lines])
+    return parsed
+
+
+@pytest.fixture(scope="module")
+def ran(new_project, folder):
+    """``kedro run --pipeline=ground_truth --env=dot_real``: the project, and what it said."""
+    project = new_project()
+    place = project.folder / "data/01_raw/dot_real"
+    place.mkdir(parents=True)
+    for imu in IMUS:
+        (place / f"dot_x_stat_{imu}.csv").symlink_to(folder / f"dot_x_stat_{imu}.csv")
+    return project, project.run_here("ground_truth", "dot_real")
+
+
+@pytest.fixture(scope="module")
+def bias(ran):
+    """The bias table: (imu, axis)."""
+    table = pd.read_csv(ran[0].folder / "data/03_primary/dot_real/dot/bias.csv")
+    return table.set_index(["imu", "axis"])
+
+
+def test_each_row_of_zeros_and_the_dropout_are_found_and_cut(ran):
+    project, done = ran
+    assert done.code == 0, done.output
+    assert "dot: 5 recordings, 4 kept, 1 repaired, 0 rejected" in done.output
+    table = pd.read_csv(project.folder / "data/02_intermediate/dot_real/dot/quality.csv")
+    assert table.outcome.tolist() == ["repaired", "kept", "kept", "kept", "kept"]
+    assert table.rows.tolist() == [14461, 14469, 14464, 14460, 14468]
+    assert (table.start == START).all()
+    assert (table.stop == STOP).all()
+    assert table.findings.str.contains("zero rows: row 0, cut").all()
+    assert "non-finite values: axes x, y, z, row 13001, cut" in table.findings[0]
+    assert "dropouts: row 13000, cut" in table.findings[0]
+    assert table.rate_hz.tolist() == [RATE_HZ] * 5
+
+
+def test_rows_that_are_cut_are_what_they_are_called(rows):
+    assert all((rows[imu][0] == 0).all() for imu in IMUS)
+    assert not np.isfinite(rows[1][13001]).any()
+    np.testing.assert_allclose(rows[1][13000], rows[1][12999] / 2, rtol=0.1)  # half scale
+    assert all(np.isfinite(rows[imu][START:STOP]).all() for imu in IMUS)
+
+
+def test_the_rate_is_that_of_the_time_column(ran):
+    recordings = open_recordings(ran[0].folder / "data/02_intermediate/dot_real/dot/recordings.nc")
+    assert recordings.attrs["rate_hz"] == RATE_HZ
+    assert dict(recordings.sizes) == {"imu": 5, "recording": 1, "axis": 3, "sample": STOP - START}
+
+
+def test_biases_and_noise_are_those_of_numpy_to_ten_digits(bias, rows):
+    for imu in IMUS:
+        used = rows[imu][START:STOP]
+        found = bias.loc[imu]
+        np.testing.assert_allclose(found.bias_dps, used.mean(axis=0), rtol=5e-11)
+        np.testing.assert_allclose(found.sample_sigma_dps, used.std(axis=0, ddof=1), rtol=5e-11)
+
+
+def as_rad_per_s(table, path):
+    rates = {f"Gyroscope {axis} (rad/s)": np.deg2rad(table[f"w_{axis.lower()}"]) for axis in "XYZ"}
+    pd.DataFrame({"Time (s)": table.Time, **rates}).to_csv(path, index=False, na_rep="NaN")
+
+
+def as_artemis(table, path):
+    """Times of day in hundredths of a second, as that logger writes them."""
+    times = pd.Timestamp("2024-05-06 12:00") + pd.to_timedelta(table.Time, unit="s")
+    written = {
+        "rtcDate": times.dt.strftime("%m/%d/%Y"),
+        "rtcTime": times.dt.strftime("%H:%M:%S.%f").str[:-4],
+        **{f"a{axis}": table[f"f_{axis.lower()}"] * 1000 for axis in "XYZ"},
+        **{f"g{axis}": table[f"w_{axis.lower()}"] for axis in "XYZ"},
+        "imu_degC": 25.5,
+        "output_Hz": RATE_HZ,
+    }
+    pd.DataFrame(written).to_csv(path, index=False, na_rep="NaN")
+
+
+def as_parquet(table, path):
+    names = {"Time": "time_s", **{f"w_{axis}": f"rate {axis} [mdps]" for axis in "xyz"}}
+    renamed = table[[*names]].rename(columns=names)
+    renamed.loc[:, renamed.columns[1:]] *= 1000
+    renamed.to_parquet(path)
+
+
+@pytest.mark.parametrize(
+    ("write", "name", "reader"),
+    [
+        (as_rad_per_s, "rad_{imu}.csv", {}),
+        (as_artemis, "artemis_{imu}.csv", {}),
+        (as_parquet, "dot_{imu}.parquet", {"time_column": "time_s", "time_units": "s"}),
+    ],
+)
+def test_copies_in_other_formats_and_units_give_the_same_biases(
+    folder, bias, parameters, tmp_path, write, name, reader
+):
+    for imu in IMUS:
+        table = pd.read_csv(
+            folder / f"dot_x_stat_{imu}.csv", index_col=False, skipinitialspace=True
+        )
+        write(table, tmp_path / name.format(imu=imu))
+    sensors = yaml.safe_load((Path(__file__).parents[1] / "conf/base/globals.yml").read_text())
+    source = FileLogs(
+        "dot",
+        {"dot": sensors["sensors"]["dot"] | {"samples": 14448, "recording_s": 120.4}},
+        *("copies", str(tmp_path), name, reader),
+    )
+    asked = parameters("dot_real").quality
+    serial = Execution(executor="serial", workers=None)
+    recordings, table = inspect_logs(source.load(), asked, serial)
+    assert table.outcome.tolist() == ["repaired", "kept", "kept", "kept", "kept"]
+    assert recordings.sizes["sample"] == STOP - START
+    assert recordings.attrs["rate_hz"] == pytest.approx(RATE_HZ, rel=1e-3)
+    means = recordings.angular_rate.squeeze("recording").mean("sample", dtype=np.float64)
+    expected = bias.bias_dps.to_numpy().reshape(5, 3)
+    np.testing.assert_allclose(means, expected, rtol=0, atol=1e-6)
