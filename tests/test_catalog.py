@@ -28,6 +28,7 @@ PIPELINES = {
     "leakage",
     "real2real",
     "reporting",
+    "unseen_devices",
     "virtual_gyros",
 }
 MEMORY = "kedro.io.MemoryDataset"

@@ -13,10 +13,12 @@ from gyro_pipeline.pipelines.reporting.figures import (
     gyroscopes_10s,
     input_channels,
     saving_against_turn_on_spread,
-    sparkfun,
     sparkfun_3_real,
     sparkfun_12_real,
     training_data,
+)
+from gyro_pipeline.pipelines.reporting.figures import (
+    estimators as estimators_figure,
 )
 from gyro_pipeline.pipelines.reporting.nodes import (
     missing_results,
@@ -36,6 +38,7 @@ from gyro_pipeline.pipelines.reporting.tables import (
     dataset_hours,
     generalization,
     multiple_gyroscopes,
+    ratios,
     results_table,
     sensor_specifications,
     three_gyroscopes,
@@ -705,14 +708,15 @@ def estimators(make_run, mean, settings, parameters):
         for name, table in tables.items()
     ]
     runs = [replace(run, metrics={**run.metrics, "coverage_1sigma_all": 0.68}) for run in runs]
-    study = Study(
-        experiment="estimators",
-        estimators=["mean", *tables],
-        windows_s=[WINDOW_S],
-        sensors={"sparkfun": Grid(method=2, real_gyros=[3])},
-    )
 
-    def pooled(runs):
+    def pooled(runs, unseen=False):
+        study = Study(
+            experiment="unseen_devices" if unseen else "estimators",
+            protocol="leave_one_device_out" if unseen else "by_recording",
+            estimators=["mean", *tables],
+            windows_s=[WINDOW_S],
+            sensors={"sparkfun": Grid(method=2, real_gyros=[3])},
+        )
         given = (study, "simulated", [30.0], [0], *settings, parameters().evaluation)
         return pool_results(*given, runs)[0]
 
@@ -767,19 +771,61 @@ def test_what_is_there_is_compared_and_the_command_for_the_rest_is_given(estimat
     assert table["Estimator"].tolist() == ["mean", "empirical_bayes"]
     assert (table["Less best_linear mdps"] == "–").all()
     assert comparison(pooled([]), nothing) == Missing(tuple([command] * 3))
-    assert sparkfun(results, nothing) == Missing((command,))
+    assert estimators_figure(results, nothing, "sparkfun") == Missing((command,))
+
+
+def test_their_errors_relative_to_the_mean_are_a_compact_table(estimators, nothing):
+    pooled, runs = estimators
+    results = pooled(runs)
+    table = ratios(results, nothing, "sparkfun").set_index("Estimator")
+    assert table.columns.tolist() == ["Source", "10 s", "Split"]
+    names = ["empirical bayes (recommended)", "best linear (recommended)"]
+    assert table.index.tolist() == ["running mean, RMSE in mdps", *names, "ceiling"]
+    bayes = results.set_index("estimator").loc["empirical_bayes"]
+    value, hi, lo = (1 - bayes[f"accuracy_gain_pct_all{end}"] / 100 for end in ("", "_lo", "_hi"))
+    assert lo <= value <= hi
+    assert table["10 s"].iloc[0] == f"{results.test_rmse_dps_all[0] / 1e-3:.3f}"
+    assert table["10 s"].iloc[1] == f"{value:.3f} [{lo:.3f}, {hi:.3f}]"
+    assert (table.Split == "hold-out").all()
+    elsewhere = results.assign(source="published", simulated=False)
+    both = ratios(results, elsewhere, "sparkfun")
+    assert both.Source.unique().tolist() == ["simulated", "published (measured)"]
+    lacking = pooled(runs[:2])
+    assert ratios(lacking, nothing, "sparkfun") == Missing(tuple(lacking.missing.dropna()))
+
+
+def test_unseen_devices_are_called_so_and_are_what_is_resampled(estimators, nothing):
+    pooled, runs = estimators
+
+    def of_devices(run):
+        by_imu = [run.load(ERRORS).assign(imu=imu) for imu in (1, 2)]
+        curve = [run.load(CURVE).assign(imu=imu) for imu in (1, 2)]
+        loaded = {ERRORS: pd.concat(by_imu), CURVE: pd.concat(curve)}
+        params = {**run.params, "study": "unseen_devices", "folds": "2"}
+        return replace(run, study="unseen_devices", params=params, load=loaded.__getitem__)
+
+    results = pooled([of_devices(run) for run in runs], unseen=True)
+    assert (results.recordings[1:] == 16).all()
+    assert (results.protocol == "leave_one_device_out").all()
+    # both devices have the same errors, so that resamples of devices are all alike
+    bayes = results.set_index("estimator").loc["empirical_bayes"]
+    assert bayes.accuracy_gain_pct_all_lo == pytest.approx(bayes.accuracy_gain_pct_all_hi)
+    table = ratios(results, nothing, "sparkfun")
+    assert (table.Split == "leave-one-device-out, 2 devices").all()
+    title = estimators_figure(results, nothing, "sparkfun").get_suptitle()
+    assert title == "sparkfun, unseen devices: error against window length, all windows"
 
 
 def test_their_figure_has_a_line_for_each_and_the_ceiling(estimators, nothing):
     pooled, runs = estimators
     results = pooled(runs)
-    figure = sparkfun(results, nothing)
+    figure = estimators_figure(results, nothing, "sparkfun")
     for ax in figure.axes:
         labels = ax.get_legend_handles_labels()[1]
         best = [f"{name} (recommended)" for name in ("empirical bayes", "best linear")]
         assert labels == ["mean", *best, "ceiling"]
     elsewhere = results.assign(source="published", simulated=False)
-    assert len(sparkfun(results, elsewhere).axes) == 4
+    assert len(estimators_figure(results, elsewhere, "sparkfun").axes) == 4
 
 
 def test_the_papers_network_is_compared_at_its_last_and_its_best_epoch(

@@ -167,7 +167,8 @@ def _marked(name: str) -> str:
 
 def _ratio(row: pd.Series, gain: str) -> str:
     """One less an accuracy gain, whose interval turns round; 1 is the running mean."""
-    value, hi, lo = (1 - row.get(f"{gain}{end}", np.nan) / 100 for end in ("", "_lo", "_hi"))
+    gains = [row.get(f"{gain}{end}") for end in ("", "_lo", "_hi")]
+    value, hi, lo = (1 - np.array(gains, np.float64) / 100).tolist()
     if pd.isna(value):
         return "–"
     return f"{value:.3f}" if pd.isna(lo) else f"{value:.3f} [{lo:.3f}, {hi:.3f}]"

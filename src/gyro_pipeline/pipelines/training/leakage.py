@@ -15,6 +15,7 @@ from gyro_pipeline.learning.jobs import TrainingJob
 from gyro_pipeline.parameters import Execution, Leakage, Only, Splits, Training
 from gyro_pipeline.pipelines.training.nodes import (
     check_cell,
+    check_present,
     labelled_bias,
     train_missing,
     training_code,
@@ -60,6 +61,7 @@ def plan_leakage(
         if any(getattr(cell, key) != value for key, value in wanted.items()):
             continue
         check_cell(cell, recordings, sizes)
+        check_present(cell, recordings)
         divide_windows(*_division(cell), recordings, leakage, splits.split_seed)
         content = cell.content | {
             "recordings": recordings.attrs["data_hash"],

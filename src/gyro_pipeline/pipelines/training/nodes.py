@@ -80,6 +80,8 @@ def plan(
     cells = over_folds(cells, folds, only)
     for cell in cells:
         check_cell(cell, recordings, training)
+        if not study.unseen_devices:
+            check_present(cell, recordings)
     code = training_code()
     rows = []
     for cell in cells:
@@ -273,7 +275,7 @@ def check_cell(cell: Cell, recordings: xr.Dataset, training: Training) -> None:
     """Refuse a cell that the recordings cannot give.
 
     Raises:
-        InputError: A window that does not fit, or IMUs that are not there.
+        InputError: A window that does not fit, or more IMUs than there are.
     """
     if cell.estimator not in (*NETWORKS, *ESTIMATORS):
         raise InputError(
@@ -290,6 +292,14 @@ def check_cell(cell: Cell, recordings: xr.Dataset, training: Training) -> None:
             f"{cell.sensor}: {cell.real_gyros} gyroscopes asked by {cell.study}, the "
             f"{cell.source} recordings hold {available}; narrow with --params=only.real_gyros=..."
         )
+
+
+def check_present(cell: Cell, recordings: xr.Dataset) -> None:
+    """Refuse a recording that the test IMU, or one seen beside it, lacks.
+
+    Raises:
+        InputError: Naming the recording.
+    """
     side_by_side = recordings.imu <= (cell.real_imus if cell.method == 1 else TEST_IMU)
     absent = recordings.angular_rate.isel(sample=0, imu=side_by_side.to_numpy()).isnull()
     for number in recordings.recording[absent.any(["imu", "axis"]).to_numpy()].to_numpy():
