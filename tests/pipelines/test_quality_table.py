@@ -34,11 +34,11 @@ def five():
 def test_counts_come_first_then_what_is_not_simply_kept_the_worst_first(five):
     table, lacking = recording_quality(dot_quality=five, ng_quality=LACKING)
     assert lacking == ()
-    assert table.to_dict("list") == {
+    assert table.fillna("").to_dict("list") == {
         "Sensor": ["dot"] * 4,
         "IMU": ["all 5", "3", "4", "1"],
         "Recording": ["all 5", "1", "1", "1"],
-        "File": [None, "3.csv", "4.csv", "1.csv"],
+        "File": ["", "3.csv", "4.csv", "1.csv"],
         "Outcome": ["3 kept, 1 repaired, 1 rejected", "rejected", "repaired", "kept"],
         "Rows used": ["119 of each", "none of 130", "1 to 119 of 130", "1 to 119 of 130"],
         "Findings": [
