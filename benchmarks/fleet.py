@@ -2,7 +2,7 @@
 
     python benchmarks/fleet.py [--files 2000] [--processes 2]
 
-Writes the files to a temporary folder (1.3 GB for 2,000), reads them once so that both sides find
+Writes the files to a temporary folder (2.3 GB for 2,000), reads them once so that both sides find
 them in memory as far as it goes, and then, on as many processes each:
 
 * a bare loop of ``pandas.read_csv``, of which nothing is kept;

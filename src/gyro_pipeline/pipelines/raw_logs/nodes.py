@@ -152,12 +152,11 @@ def _labelled(
     if any(splits.values()):
         coordinates["given_split"] = ("recording", [splits[number] for number in recordings])
     logs = xr.Dataset({"angular_rate": (DIMENSIONS, rates, {"units": "deg/s"})}, coordinates)
-    measured = [judged.rate_hz for _, judged in used if judged.rate_hz is not None]
     logs.attrs = {
         "sensor": files.sensor,
         "source": files.source,
         "simulated": 0,
-        "rate_hz": _rounded(np.median(measured)) if measured else files.rate_hz,
+        "rate_hz": _agreed_rate(used, files.rate_hz),
     }
     labels = {str(name): label.values.tolist() for name, label in logs.coords.items()}
     # of the measured samples alone, as runs in the store know it
@@ -186,6 +185,12 @@ def _described(sensor: str, row: Row, length: int) -> dict[str, Any]:
         "rate_hz": None if judged.rate_hz is None else _rounded(judged.rate_hz),
         "findings": "; ".join(f"{one.check}: {one.detail}" for one in judged.findings) or None,
     }
+
+
+def _agreed_rate(used: Sequence[Row], expected_hz: float) -> float:
+    """The median of the measured rates; the reader has rejected those far from the expected one."""
+    measured = [judged.rate_hz for _, judged in used if judged.rate_hz is not None]
+    return _rounded(np.median(measured)) if measured else expected_hz
 
 
 def _rounded(rate_hz: np.floating | float) -> float:
