@@ -132,7 +132,7 @@ def test_of_a_study_without_networks_it_says_how_many_estimators(write, rows):
     rows[1:] = [result(1, 60.0, estimator="best_linear", method=0)]
     content, _ = write(runs=[stored(0, "mean"), stored(1, "best_linear")])
     facts = dict(content["facts"])
-    assert facts["Estimators"] == "1 besides it, windows of 10 s"
+    assert facts["Estimators"] == "1 besides the mean and the network, windows of 10 s"
     assert not {"Networks", "Seeds", "Windows"} & set(facts)
     labels = [row["label"] for study in content["studies"] for row in study["rows"]]
     assert labels == ["sparkfun, running mean, 10 s", "sparkfun, best_linear, 10 s: A 60 %"]
