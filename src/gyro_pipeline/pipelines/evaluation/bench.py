@@ -80,8 +80,8 @@ class TestDevice:
         noise: N, shape (resamples, 3), deg/s sqrt(s); the first row is the estimate itself.
         spread: Turn-on spread tau, same shape, deg/s.
         unit_bias: Drawn prior mean, shape (3,), deg/s; None on measured data.
-        models: Of each axis, where its noise is not white or its bias warms up; drawn if simulated,
-            else fitted.
+        models: Of each axis, where its noise is not white or its bias warms up; drawn if simulated
+            (a time constant is then that of the recording at hand), else fitted.
     """
 
     noise: np.ndarray
@@ -95,6 +95,13 @@ class TestDevice:
         if self.models is not None:
             return tuple(model.noise for model in self.models)
         return tuple(NoiseFigures(float(white), 0.0, 0.0) for white in self.noise[0])
+
+    def priors(self, axis: int) -> np.ndarray:
+        """Covariances of the model's prior for each of ``spread``, (resamples, k, k)."""
+        assert self.models is not None
+        covariances = np.repeat(self.models[axis].covariance[None], len(self.spread), axis=0)
+        covariances[:, 0, 0] = self.spread[:, axis] ** 2
+        return covariances
 
 
 def describe_device(
@@ -120,6 +127,8 @@ def describe_device(
     means = bias[bias.imu == TEST_IMU].pivot(index="recording", columns="axis", values="bias_dps")
     variances = allan.allan_variance.sel(imu=TEST_IMU, recording=list(numbers))
     variances = variances.transpose("recording", "axis", "time_s").to_numpy()
+    models = _fitted_models(recordings, numbers)
+    beyond_white = _beyond_white(models, duration_s)
     generator = np.random.default_rng(seed)
     draws = generator.integers(len(numbers), size=(_CEILING_RESAMPLES, len(numbers)))
     noise, spread = [], []
@@ -131,8 +140,8 @@ def describe_device(
         ]
         noise.append([fit.white for fit in fits])
         values = means.loc[list(numbers)].to_numpy()[chosen]
-        spread.append(turn_on_spread(values, np.array(noise[-1]), duration_s))
-    models = _fitted_models(recordings, numbers, np.array(spread[0]))
+        averaging = np.square(noise[-1]) / duration_s + beyond_white
+        spread.append(turn_on_spread(values, averaging))
     return TestDevice(np.array(noise), np.array(spread), None, models)
 
 
@@ -149,31 +158,35 @@ def _drawn_models(recordings: xr.Dataset) -> tuple[RecordingModel, ...] | None:
         one = recordings.sel(imu=TEST_IMU, axis=axis)
         noise = NoiseFigures(float(one.true_noise), drawn["flicker"], drawn["random_walk"])
         mean, spread = [float(one.true_unit_bias)], [float(one.true_turn_on_spread)]
-        constant_s = np.inf
         if warm_up is not None:
-            amplitude, scatter, constant_s = warm_up.to_numpy().tolist()
+            amplitude, scatter = warm_up.to_numpy().tolist()
             mean, spread = [*mean, amplitude], [*spread, scatter]
         covariance = np.diag(np.square(spread))
         place = recordings.sizes["sample"], float(recordings.attrs["rate_hz"])
-        models.append(RecordingModel(*place, noise, np.array(mean), covariance, constant_s))
+        models.append(RecordingModel(*place, noise, np.array(mean), covariance))
     return tuple(models)
 
 
 def _fitted_models(
-    recordings: xr.Dataset, numbers: Sequence[int], spread: np.ndarray
+    recordings: xr.Dataset, numbers: Sequence[int]
 ) -> tuple[RecordingModel, ...] | None:
-    """Models of the test IMU's axes with a spread found otherwise; None of too few recordings."""
+    """Models of the test IMU's axes; None of too few recordings."""
     if len(numbers) < FEWEST_RECORDINGS:
         return None
     rates = recordings.angular_rate.sel(imu=TEST_IMU, recording=list(numbers))
     rates = rates.transpose("axis", "recording", "sample").to_numpy()
     models = []
-    for axis, tau in zip(rates, spread, strict=True):
+    for axis in rates:
         model = fit_recording_model(axis, float(recordings.attrs["rate_hz"]), warm_up=None)
-        covariance = np.diag(np.diag(model.covariance))
-        covariance[0, 0] = tau**2
-        models.append(replace(model, covariance=covariance))
+        models.append(replace(model, covariance=np.diag(np.diag(model.covariance))))
     return tuple(models)
+
+
+def _beyond_white(models: tuple[RecordingModel, ...] | None, duration_s: float) -> np.ndarray:
+    """Variance by which recordings' means scatter beyond tau and N^2 / T, by axis."""
+    if models is None:
+        return np.zeros(len(AXES))
+    return np.array([one.averaging_variance() - one.noise.white**2 / duration_s for one in models])
 
 
 @dataclass(frozen=True)
@@ -319,84 +332,118 @@ class Bench:
             known = (device.unit_bias, device.spread[0], device.noise[0])
             return oracle(means, *known, self.window_s, self.recording_s, truth)
         windows = cut_windows(recording.samples, size)
-        return np.stack(
+        estimates = [
             [
-                [
-                    float(self._line(axis, i * size, truth)(one[None])[0])
-                    for i, one in enumerate(rows)
-                ]
-                for axis, rows in enumerate(windows)
-            ],
-            axis=-1,
-        )
+                self._line(model, axis, i * size, truth)(one[None])[0]
+                for i, one in enumerate(windows[axis])
+            ]
+            for axis, model in enumerate(self._models(recording.number))
+        ]
+        return np.stack(estimates, axis=-1)
+
+    def _models(self, number: int) -> tuple[RecordingModel, ...]:
+        """The device's models for one recording: with the time constants of its power-on."""
+        models, drawn = self.device.models, self.recordings.get("true_time_constant")
+        assert models is not None
+        if drawn is None:
+            return models
+        constants_s = drawn.sel(imu=TEST_IMU, recording=number).to_numpy().tolist()
+        both = zip(models, constants_s, strict=True)
+        return tuple(replace(model, time_constant_s=constant) for model, constant in both)
 
     @cached_property
-    def _lines(self) -> dict[tuple[int, int, str], LinearEstimate]:
+    def _distinct(self) -> dict[tuple[int, float], RecordingModel]:
+        """All models that differ, by axis and time constant."""
+        return {
+            (axis, model.time_constant_s): model
+            for number in self.numbers
+            for axis, model in enumerate(self._models(number))
+        }
+
+    @cached_property
+    def _lines(self) -> dict[tuple[int, float, int, str], LinearEstimate]:
         return {}
 
-    def _line(self, axis: int, start: int, truth: str) -> LinearEstimate:
-        """The best linear estimate of a window under the device's model, worked out once."""
-        assert self.device.models is not None
-        key = axis, start, truth
+    def _line(self, model: RecordingModel, axis: int, start: int, truth: str) -> LinearEstimate:
+        """The best linear estimate of a window under the model of its axis, worked out once."""
+        key = axis, model.time_constant_s, start, truth
         if key not in self._lines:
-            self._lines[key] = best_linear(self.device.models[axis], start, self.size, truth)
+            self._lines[key] = best_linear(model, start, self.size, truth)
         return self._lines[key]
 
     @property
     def ceiling_basis(self) -> str:
         """In words, what the ceilings are computed from."""
-        if self.device.unit_bias is not None:
-            return "drawn values"
-        noise = "white noise" if self.device.models is None else "fitted N, B and K"
-        return f"estimated from recordings, {noise}"
+        if self.device.unit_bias is None:
+            noise = "white noise" if self.device.models is None else "fitted N, B and K"
+            return f"estimated from recordings, {noise}"
+        if self.device.models is not None and len(self._distinct) > len(self.device.models):
+            return (
+                "drawn values, the time constant of each warm-up among them: nobody who must learn "
+                "it from the window can come this far"
+            )
+        return "drawn values"
 
     def ceilings(self, truth: str, windows: str) -> dict[str, Estimate]:
         """What no estimator can be better than; exact, without an interval, on simulated data.
 
-        On measured data the interval is that of N and the turn-on spread.
+        On measured data the interval is that of the turn-on spread (if noise is white that of N,
+        too). Nothing is returned for a truth whose own noise, taken off, leaves no square to take
+        the root of.
         """
-        times = (self.window_s, self.recording_s)
-        limit = pooled(ceiling_rmse(self.device.noise, self.device.spread, *times, truth))
-        mean = pooled(running_mean_rmse(self.device.noise, *times, truth))
-        ratio, saving = limit / mean, None
-        if truth == PAPER:
-            saving = best_saving(ratio, self.window_s / self.recording_s)
-        if self.device.models is not None:
-            squares, means = self._expected(truth, windows, self.size)
-            if squares <= 0 or means <= 0:  # the truth's own noise was taken off
-                return {}
-            limit = limit * np.sqrt(squares) / limit[0]
-            ratio = ratio * np.sqrt(squares / means) / ratio[0]
-            if saving is not None:
-                saving = saving + self._expected_saving(windows, squares) - saving[0]
-        ceilings = {
+        if (truth, windows) not in self._ceilings:
+            self._ceilings[truth, windows] = self._limits(truth, windows)
+        return self._ceilings[truth, windows]
+
+    @cached_property
+    def _ceilings(self) -> dict[tuple[str, str], dict[str, Estimate]]:
+        return {}
+
+    def _limits(self, truth: str, windows: str) -> dict[str, Estimate]:
+        best, mean = self._expected(truth, windows, self.size)
+        lowest = with_interval(best)
+        if (lowest.value if lowest.lo is None else lowest.lo) < 0 or mean.min() <= 0:
+            return {}
+        limit = np.sqrt(np.maximum(best, 0.0))
+        ratio = limit / np.sqrt(mean)
+        limits = {
             "ceiling_rmse_dps": with_interval(limit),
             "ceiling_accuracy_gain_pct": with_interval(100 * best_gain(ratio)),
         }
-        if saving is not None:
-            ceilings["ceiling_time_saving_pct"] = with_interval(100 * saving)
-        return ceilings
+        if truth == PAPER:
+            saving = self._expected_saving(windows, ratio, limit)
+            limits["ceiling_time_saving_pct"] = with_interval(100 * saving)
+        return limits
 
-    def _expected(self, truth: str, windows: str, size: int) -> tuple[float, float]:
-        """Mean squares of the best linear estimate and the running mean, over axes and windows."""
-        assert self.device.models is not None
+    def _expected(self, truth: str, windows: str, size: int) -> tuple[np.ndarray, np.ndarray]:
+        """Mean squares of the best estimate and the running mean over axes and windows.
+
+        For each of the device's resamples, (deg/s)^2.
+        """
+        device, attrs = self.device, self.recordings.attrs
+        if device.models is None:
+            times = size / attrs["rate_hz"], self.recording_s
+            best = pooled(ceiling_rmse(device.noise, device.spread, *times, truth))
+            return best**2, pooled(running_mean_rmse(device.noise, *times, truth)) ** 2
         starts = range(0, self.recordings.sizes["sample"] - size + 1, size)
         squares = [
-            mean_squares(model, start, size, truth)
-            for model in self.device.models
+            mean_squares(model, start, size, truth, covariances=device.priors(axis))
+            for (axis, _), model in self._distinct.items()
             for start in (starts[:1] if windows == FIRST else starts)
         ]
         best, mean = np.mean(squares, axis=0)
-        return float(best), float(mean)
+        return best, mean
 
-    def _expected_saving(self, windows: str, squares: float) -> float:
-        """1 - T0 / t*, where the running mean of t* is expected to have these squares."""
+    def _expected_saving(self, windows: str, ratio: np.ndarray, limit: np.ndarray) -> np.ndarray:
+        """1 - T0 / t*, where the running mean of t* is expected to be as good as the limit."""
+        if self.device.models is None:
+            return best_saving(ratio, self.window_s / self.recording_s)
         samples = self.recordings.sizes["sample"]
         sizes = np.unique(np.geomspace(self.size, samples, _CURVE_POINTS).astype(int))
         # of the whole recording it is 0, but for rounding
-        curve = [max(self._expected(PAPER, windows, int(size))[1], 0.0) for size in sizes]
-        reached = equivalent_time(sizes, np.sqrt([curve]), np.sqrt([squares]))[0]
-        return float(1 - self.size / reached) if np.isfinite(reached) else 0.0
+        curve = [np.maximum(self._expected(PAPER, windows, int(n))[1], 0.0) for n in sizes]
+        reached = equivalent_time(sizes, np.sqrt(curve).T, limit)
+        return np.where(np.isfinite(reached), 1 - self.size / reached, 0.0)
 
     def metrics(self, errors: pd.DataFrame, weights: str) -> dict[str, float]:
         """All figures of merit of one set of errors, by metric name; only finite ones.
