@@ -8,10 +8,11 @@ import pytest
 import xarray as xr
 from kedro.io import DatasetError
 
-from gyro_pipeline.conventions import InputError
+from gyro_pipeline.conventions import DIMENSIONS, InputError
 from gyro_pipeline.datasets import simulated_logs
 from gyro_pipeline.datasets.recordings import Recordings
 from gyro_pipeline.datasets.simulated_logs import SimulatedLogs
+from gyro_pipeline.pipelines.raw_logs.nodes import label_recordings
 
 SENSORS = {
     "dot": {
@@ -128,7 +129,9 @@ def test_random_walk_and_warm_up_are_added_and_what_was_drawn_is_kept(tmp_path):
     added = {"random_walk_mdps_per_rts": 10, "warm_up": WARM_UP}
     logs = simulated(tmp_path, simulated=model | added).load()
     assert float(logs.true_random_walk) == pytest.approx(10e-3)
-    np.testing.assert_allclose(logs.true_warm_up, [2, 0.5])
+    assert float(logs.true_amplitude_mean) == pytest.approx(2)
+    assert float(logs.true_amplitude_spread) == pytest.approx(0.5)
+    assert set(label_recordings(logs).dims) == set(DIMENSIONS)
     assert logs.true_amplitude.dims == logs.true_time_constant.dims == logs.true_bias.dims
     # 240 draws: a mean is known to 3 %, a standard deviation to 5 %
     assert float(logs.true_amplitude.mean()) == pytest.approx(2, rel=0.06)

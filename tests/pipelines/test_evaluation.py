@@ -283,7 +283,9 @@ def coloured(simulated, constants_s, count=200):
         "true_noise": ("axis", noise),
         "true_turn_on_spread": ("axis", spread),
         "true_time_constant": (("imu", "recording", "axis"), constants_s),
-        "true_warm_up": ("figure", np.array(WARM_UP)),
+        "true_amplitude": (("imu", "recording", "axis"), amplitude),
+        "true_amplitude_mean": WARM_UP[0],
+        "true_amplitude_spread": WARM_UP[1],
         **{f"true_{name}": value for name, value in COLOUR.items()},
     }
     labels = {"imu": [1], "recording": np.arange(1, 1 + count), "axis": list("xyz")}

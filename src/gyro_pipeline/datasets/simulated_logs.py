@@ -67,7 +67,7 @@ class SimulatedLogs(AbstractDataset[xr.Dataset, xr.Dataset]):
             ``true_turn_on_spread`` (axis), and ``true_noise`` (axis), N in deg/s * sqrt(s). Also
             ``true_flicker``, B, and ``true_random_walk``, K in deg/s / sqrt(s). With a warm-up its
             ``true_amplitude`` and ``true_time_constant``, in seconds, (imu, recording, axis), and
-            ``true_warm_up`` (figure): the mean and the spread that amplitudes were drawn with.
+            what amplitudes were drawn with: ``true_amplitude_mean``, ``true_amplitude_spread``.
 
         Raises:
             InputError: As the cause of Kedro's ``DatasetError``, files that cannot be written, or
@@ -160,7 +160,7 @@ def draw_biases(generator: np.random.Generator, entry: Sensor) -> xr.Dataset:
         constants_s = generator.uniform(*model.warm_up.time_constant_s, turn_on.shape)
         drawn["true_amplitude"] = (("imu", "recording", "axis"), amplitude)
         drawn["true_time_constant"] = (("imu", "recording", "axis"), constants_s)
-        drawn["true_warm_up"] = ("figure", np.array(figures))
+        drawn["true_amplitude_mean"], drawn["true_amplitude_spread"] = figures
     return xr.Dataset(
         {
             "true_bias": (("imu", "recording", "axis"), unit_bias[:, None] + turn_on),

@@ -150,17 +150,17 @@ def _drawn_models(recordings: xr.Dataset) -> tuple[RecordingModel, ...] | None:
     drawn = {
         name: float(recordings.get(f"true_{name}", 0.0)) for name in ("flicker", "random_walk")
     }
-    warm_up = recordings.get("true_warm_up")
-    if not any(drawn.values()) and warm_up is None:
+    warms_up = "true_amplitude" in recordings
+    if not any(drawn.values()) and not warms_up:
         return None
     models = []
     for axis in recordings.axis.to_numpy():
         one = recordings.sel(imu=TEST_IMU, axis=axis)
         noise = NoiseFigures(float(one.true_noise), drawn["flicker"], drawn["random_walk"])
         mean, spread = [float(one.true_unit_bias)], [float(one.true_turn_on_spread)]
-        if warm_up is not None:
-            amplitude, scatter = warm_up.to_numpy().tolist()
-            mean, spread = [*mean, amplitude], [*spread, scatter]
+        if warms_up:
+            mean.append(float(one.true_amplitude_mean))
+            spread.append(float(one.true_amplitude_spread))
         covariance = np.diag(np.square(spread))
         place = recordings.sizes["sample"], float(recordings.attrs["rate_hz"])
         models.append(RecordingModel(*place, noise, np.array(mean), covariance))
