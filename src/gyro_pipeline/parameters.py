@@ -7,11 +7,12 @@ refused before any node runs (see :class:`gyro_pipeline.hooks.Preflight`).
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from gyro_pipeline.conventions import AXES, LEAVE_ONE_DEVICE_OUT
 
 PerAxis = tuple[float, float, float]
+Seconds = Annotated[float, Field(gt=0)]
 Precision = Literal["float32", "bfloat16"]
 Gyroscopes = Annotated[int, Field(ge=0, multiple_of=len(AXES), description="a count of axes")]
 
@@ -30,7 +31,21 @@ class WarmUp(Parameter):
 
     amplitude_mdps: float = Field(description="its mean over power-ons, at power-on")
     spread_mdps: float = Field(ge=0, description="its standard deviation over power-ons")
-    time_constant_s: float = Field(gt=0, description="the same at all power-ons")
+    time_constant_s: tuple[Seconds, Seconds] = Field(
+        description="shortest and longest, uniform between them; one number: of all power-ons"
+    )
+
+    @field_validator("time_constant_s", mode="before")
+    @classmethod
+    def _one_number_is_both(cls, value: Any) -> Any:
+        return (value, value) if isinstance(value, int | float) else value
+
+    @field_validator("time_constant_s")
+    @classmethod
+    def _the_shortest_is_first(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if value[0] > value[1]:
+            raise ValueError(f"time_constant_s: expected shortest, longest; got {value}")
+        return value
 
 
 class SimulatedNoise(Parameter):

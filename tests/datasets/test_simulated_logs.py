@@ -1,4 +1,5 @@
 import copy
+import hashlib
 import logging
 import os
 
@@ -7,10 +8,13 @@ import pytest
 import xarray as xr
 from kedro.io import DatasetError
 
+from gyro_pipeline.conventions import DIMENSIONS, InputError
 from gyro_pipeline.datasets import simulated_logs
 from gyro_pipeline.datasets.recordings import Recordings
 from gyro_pipeline.datasets.simulated_logs import SimulatedLogs
 from gyro_pipeline.logs import Logs
+from gyro_pipeline.parameters import Execution
+from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs
 
 SENSORS = {
     "dot": {
@@ -102,6 +106,78 @@ def test_colour_reaches_the_noise(tmp_path):
     flicker = recordings(simulated(tmp_path / "b", simulated=model | {"flicker_mdps": 100}))
     means = (flicker.angular_rate - flicker.true_bias).mean("sample")
     assert float(means.std()) > 0.02  # white noise alone gives 0.004
+
+
+WARM_UP = {"amplitude_mdps": 2000, "spread_mdps": 500, "time_constant_s": [0.5, 2]}
+
+
+def digest(content):
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+@pytest.mark.parametrize(
+    ("colour", "settings", "first", "test"),
+    [
+        ({}, "d6df2e3fc124fe77", "eec5e2778ced583b", "56e521b8166a3850"),
+        (
+            {"flicker_mdps": 3, "lag1_correlation": -0.15},
+            "6361370f883c592a",
+            "3eead9cee4acff9f",
+            "49168560a86be389",
+        ),
+    ],
+)
+def test_files_are_those_of_the_time_before_random_walk_and_warm_up(
+    tmp_path, colour, settings, first, test
+):
+    sizes = {"recordings": 3, "train_recordings": 2, "samples": 50}
+    logs = simulated(tmp_path, simulated=SENSORS["dot"]["simulated"] | colour, **sizes)
+    logs.load()
+    assert digest(np.load(tmp_path / "dot_train.npy")[0].tobytes()) == first
+    assert digest(np.load(tmp_path / "dot_test.npy").tobytes()) == test
+    # so that they are not written anew
+    assert digest(logs._settings_on_disk().encode()) == settings
+
+
+def test_random_walk_and_warm_up_are_added_and_what_was_drawn_is_kept(tmp_path, parameters):
+    model = SENSORS["dot"]["simulated"] | {"noise_mdps_rts": [0.1] * 3}
+    added = {"random_walk_mdps_per_rts": 10, "warm_up": WARM_UP}
+    source = simulated(tmp_path, simulated=model | added)
+    logs = recordings(source)
+    assert float(logs.true_random_walk) == pytest.approx(10e-3)
+    assert float(logs.true_amplitude_mean) == pytest.approx(2)
+    assert float(logs.true_amplitude_spread) == pytest.approx(0.5)
+    serial = Execution(executor="serial", workers=None)
+    labelled, _ = inspect_logs(source.load(), parameters("base").quality, serial)
+    assert set(labelled.dims) == set(DIMENSIONS)
+    xr.testing.assert_equal(labelled.true_time_constant, logs.true_time_constant.drop_vars("split"))
+    assert logs.true_amplitude.dims == logs.true_time_constant.dims == logs.true_bias.dims
+    # 240 draws: a mean is known to 3 %, a standard deviation to 5 %
+    assert float(logs.true_amplitude.mean()) == pytest.approx(2, rel=0.06)
+    assert float(logs.true_amplitude.std()) == pytest.approx(0.5, rel=0.15)
+    assert 0.5 <= float(logs.true_time_constant.min()) < 0.52
+    assert 1.98 < float(logs.true_time_constant.max()) <= 2
+    time_s = (np.arange(400) + 0.5) / 100
+    settling = logs.true_amplitude * np.exp(
+        -xr.DataArray(time_s, dims="sample") / logs.true_time_constant
+    )
+    walk = logs.angular_rate - logs.true_bias - settling
+    # K sqrt(t) at the end and a quarter of the way
+    ends = walk.isel(sample=[99, 399]).std(("imu", "recording", "axis"))
+    np.testing.assert_allclose(ends, [10e-3, 20e-3], rtol=0.15)
+
+
+def test_one_time_constant_is_that_of_all_power_ons(tmp_path):
+    model = SENSORS["dot"]["simulated"] | {"warm_up": WARM_UP | {"time_constant_s": 1.5}}
+    drawn = simulated(tmp_path, simulated=model).load().drawn
+    assert set(np.ravel(drawn.true_time_constant)) == {1.5}
+
+
+@pytest.mark.parametrize("constants", [0, [2, 1], [0, 1], [1, 2, 3]])
+def test_time_constants_that_are_none_are_refused(tmp_path, constants):
+    model = SENSORS["dot"]["simulated"] | {"warm_up": WARM_UP | {"time_constant_s": constants}}
+    with pytest.raises(InputError, match="time_constant_s"):
+        simulated(tmp_path, simulated=model)
 
 
 def test_a_second_load_only_reads(tmp_path):

@@ -136,18 +136,18 @@ def test_turn_on_spread_takes_the_averaging_noise_off():
     generator = np.random.default_rng(1)
     scatter = np.sqrt(tau**2 + noise**2 / 52)
     means = np.array([1.0, -2.0, 0.1]) + generator.normal(0, scatter, (20_000, 3))
-    np.testing.assert_allclose(turn_on_spread(means, noise, 52), tau, rtol=0.03)
+    np.testing.assert_allclose(turn_on_spread(means, noise**2 / 52), tau, rtol=0.03)
 
 
 def test_turn_on_spread_by_hand_counts_present_recordings_only():
     means = np.array([[1.0, 0.0], [3.0, 0.0], [np.nan, 1.0], [5.0, 1.0]])
     # sample variances 4 and 1/3, averaging noise 2^2 / 4
-    np.testing.assert_allclose(turn_on_spread(means, 2.0, 4.0), [np.sqrt(3.0), 0.0])
+    np.testing.assert_allclose(turn_on_spread(means, 2.0**2 / 4), [np.sqrt(3.0), 0.0])
 
 
 def test_turn_on_spread_of_one_recording_is_refused():
     with pytest.raises(InputError, match="at least 2 recordings"):
-        turn_on_spread(np.array([[1.0, 1.0], [2.0, np.nan]]), N, T)
+        turn_on_spread(np.array([[1.0, 1.0], [2.0, np.nan]]), N**2 / T)
 
 
 def test_pooling_is_over_squares_of_axes():

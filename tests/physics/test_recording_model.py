@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -136,6 +138,49 @@ def test_monte_carlo_has_the_expected_errors(name, start, truth):
     assert (noise > 0) == (truth == DISJOINT)
     assert own == pytest.approx(mean + noise, rel=0.06)
     assert best < mean
+
+
+@pytest.fixture(scope="module")
+def many():
+    """20,000 recordings of flicker, random walk and warm-up, at two samples a second."""
+    model = replace(WARMING, samples=120, rate_hz=2.0)
+    return model, *simulated(model, 20_000, seed=4)
+
+
+@pytest.mark.parametrize("truth", TRUTHS)
+def test_the_ceiling_over_all_windows_is_what_simulated_recordings_show(many, truth):
+    """Mean squares over windows, as they are reported: less a truth's own noise."""
+    model, rates, bias = many
+    size = 20
+    found, expected, averaging = [], [], []
+    for start in range(0, model.samples, size):
+        windows = rates[:, start : start + size]
+        aim = truth_of(rates, bias, start, size, truth)
+        line = best_linear(model, start, size, truth)
+        found.append([np.mean((e - aim) ** 2) for e in (line(windows), windows.mean(axis=1))])
+        expected.append(mean_squares(model, start, size, truth))
+        averaging.append(line.variance - expected[-1][0])
+    own = np.mean(averaging)
+    # one standard error is 1 % of a mean square of 20,000, less of that over six windows
+    assert np.mean(found, axis=0) == pytest.approx(np.mean(expected, axis=0) + own, rel=0.02)
+    assert expected[0][1] > 2 * expected[-1][1]  # so first windows have another ceiling
+
+
+@pytest.mark.parametrize("name", ["white", "coloured", "warming"])
+@pytest.mark.parametrize("truth", TRUTHS)
+def test_squares_of_many_priors_are_those_of_each(name, truth):
+    model = MODELS[name]
+    priors = model.covariance * np.array([0.0, 0.3, 1.0, 7.0])[:, None, None]
+    together = mean_squares(model, 100, 200, truth, covariances=priors)
+    for i, prior in enumerate(priors):
+        alone = mean_squares(replace(model, covariance=prior), 100, 200, truth)
+        np.testing.assert_allclose([squares[i] for squares in together], alone)
+
+
+def test_the_mean_of_a_recording_scatters_about_the_bias_as_simulated(many):
+    model, rates, bias = many
+    assert (rates.mean(axis=1) - bias).var() == pytest.approx(model.averaging_variance(), rel=0.03)
+    assert WHITE.averaging_variance() == pytest.approx(N**2 / (SAMPLES / RATE))
 
 
 def test_the_averaging_noise_of_the_disjoint_truth_is_that_of_the_model():

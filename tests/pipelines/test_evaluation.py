@@ -21,8 +21,14 @@ from gyro_pipeline.conventions import (
 )
 from gyro_pipeline.estimators import ESTIMATORS, ORIENTATION_NOTE, RunningMean
 from gyro_pipeline.parameters import Grid, Study
+from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.noise import simulate_noise, warm_up
-from gyro_pipeline.physics.recording_model import outside_noise
+from gyro_pipeline.physics.recording_model import (
+    best_linear,
+    constant_bias,
+    mean_squares,
+    outside_noise,
+)
 from gyro_pipeline.pipelines.evaluation import bench as bench_module
 from gyro_pipeline.pipelines.evaluation.bench import (
     Bench,
@@ -195,9 +201,8 @@ def test_noise_and_turn_on_spread_are_measured(make_recordings, parameters):
     assert device.spread[0, 0] < 1.5e-4  # a third of N / sqrt(T), which is all there is
     assert device.unit_bias is None
     assert [model.noise.white for model in device.models] == pytest.approx(3 * [noise], rel=0.04)
-    assert [model.covariance[0, 0] for model in device.models] == pytest.approx(
-        device.spread[0] ** 2
-    )
+    priors = [device.priors(axis) for axis in range(3)]
+    np.testing.assert_allclose(np.stack(priors, axis=1)[..., 0, 0], device.spread**2)
     lo, hi = np.quantile(device.spread[1:, 2], [0.001, 0.999])
     assert lo < spread[2] < hi
 
@@ -251,19 +256,18 @@ def test_ceilings_of_simulated_data_are_the_closed_form(world, simulated):
 
 
 COLOUR = {"flicker": 3e-3, "random_walk": 1e-3}
-WARM_UP = (20e-3, 5e-3, 15.0)  # mean and spread of the amplitude, deg/s; time constant, s
+WARM_UP, CONSTANT_S = (20e-3, 5e-3), 15.0  # mean and spread of the amplitude, deg/s
 
 
-@pytest.fixture(scope="module")
-def coloured(simulated):
-    """200 recordings of flicker, random walk and warm-up, with what was drawn."""
-    generator, count = np.random.default_rng(4), 200
+def coloured(simulated, constants_s, count=200):
+    """Recordings of flicker, random walk and warm-up, with what was drawn."""
+    generator = np.random.default_rng(4)
     noise, spread = simulated.true_noise.to_numpy(), simulated.true_turn_on_spread.to_numpy()
     unit = simulated.true_unit_bias.sel(imu=[1]).to_numpy()
     bias = unit[:, None] + generator.normal(0, spread, (1, count, 3))
-    amplitude = generator.normal(*WARM_UP[:2], bias.shape)
-    samples = int(RECORDING_S * 20)
-    rates = bias[..., None] + warm_up(amplitude, np.full(bias.shape, WARM_UP[2]), samples, 20.0)
+    amplitude = generator.normal(*WARM_UP, bias.shape)
+    constants_s = generator.uniform(*constants_s, bias.shape)
+    rates = bias[..., None] + warm_up(amplitude, constants_s, int(RECORDING_S * 20), 20.0)
     rates += simulate_noise(
         generator,
         rates.shape,
@@ -278,18 +282,24 @@ def coloured(simulated):
         "true_unit_bias": (("imu", "axis"), unit),
         "true_noise": ("axis", noise),
         "true_turn_on_spread": ("axis", spread),
-        "true_warm_up": ("figure", np.array(WARM_UP)),
+        "true_time_constant": (("imu", "recording", "axis"), constants_s),
+        "true_amplitude": (("imu", "recording", "axis"), amplitude),
+        "true_amplitude_mean": WARM_UP[0],
+        "true_amplitude_spread": WARM_UP[1],
         **{f"true_{name}": value for name, value in COLOUR.items()},
     }
     labels = {"imu": [1], "recording": np.arange(1, 1 + count), "axis": list("xyz")}
     return xr.Dataset(drawn, labels, simulated.attrs)
 
 
+def bench_of_all(world, recordings):
+    numbers = tuple(recordings.recording.to_numpy().tolist())
+    return Bench(recordings, device_of(world, recordings), numbers, WINDOW_S, world.evaluation)
+
+
 @pytest.fixture(scope="module")
-def coloured_bench(world, coloured):
-    device = device_of(world, coloured)
-    numbers = tuple(coloured.recording.to_numpy().tolist())
-    return Bench(coloured, device, numbers, WINDOW_S, world.evaluation)
+def coloured_bench(world, simulated):
+    return bench_of_all(world, coloured(simulated, 2 * [CONSTANT_S]))
 
 
 @pytest.mark.parametrize("windows", [FIRST, ALL])
@@ -305,7 +315,7 @@ def test_the_ceiling_of_coloured_noise_and_warm_up_is_what_the_oracle_reaches(
     # 600 gyroscope recordings: 6 % of a mean square
     expected = coloured_bench._expected(truth, windows, coloured_bench.size)
     of_noise = coloured_bench.oracle_errors.query("truth == @truth").truth_variance.mean()
-    assert expected == pytest.approx((reached, of_mean), rel=0.12, abs=0.12 * of_noise)
+    assert np.ravel(expected) == pytest.approx((reached, of_mean), rel=0.12, abs=0.12 * of_noise)
     ceilings = coloured_bench.ceilings(truth, windows)
     if reached < 0:  # truth (b), less its own noise but not less what it shares with the window
         assert truth == DISJOINT
@@ -324,6 +334,68 @@ def test_on_coloured_noise_one_who_looks_outside_the_window_is_found_out(coloure
     assert 0 < metrics["ceiling_time_saving_pct_all"] < 100
     cheat = coloured_bench.metrics(coloured_bench.errors(Off(coloured_bench, 1e-3)), LAST)
     assert cheat["beats_oracle_p_all"] < 1e-6
+
+
+@pytest.fixture(scope="module")
+def ranging_bench(world, simulated):
+    return bench_of_all(world, coloured(simulated, (8.0, 30.0), count=40))
+
+
+def test_with_time_constants_of_their_own_the_limit_is_that_of_one_who_is_told_them(ranging_bench):
+    assert "nobody who must learn" in ranging_bench.ceiling_basis
+    oracle = squared_errors(ranging_bench.oracle_errors, PAPER, ALL).mean(np.ones((1, 40)))
+    # 120 gyroscope recordings: 13 % of a mean square
+    best, _ = ranging_bench._expected(PAPER, ALL, SIZE)
+    assert best == pytest.approx(oracle, rel=0.2)
+    ceiling = ranging_bench.ceilings(PAPER, ALL)["ceiling_rmse_dps"]
+    assert ceiling.value == pytest.approx(np.sqrt(best[0]))
+
+
+class OneConstant:
+    """Best of all who take one time constant for all power-ons, on windows from power-on."""
+
+    def __init__(self, bench, constant_s):
+        models = [replace(one, time_constant_s=constant_s) for one in bench.device.models]
+        self._lines = [best_linear(one, 0, SIZE, PAPER) for one in models]
+
+    def estimate(self, windows, target, start_s, recording):
+        axes = zip(self._lines, windows.swapaxes(0, 1), strict=True)
+        biases = np.stack([line(one) for line, one in axes], axis=-1)
+        return biases, np.full(biases.shape, np.nan)
+
+
+def test_nobody_honest_beats_one_who_is_told_the_time_constants(ranging_bench):
+    honest = ranging_bench.metrics(ranging_bench.errors(OneConstant(ranging_bench, 16.0)), LAST)
+    assert honest["beats_oracle_p"] > 0.5
+    cheat = ranging_bench.metrics(ranging_bench.errors(Off(ranging_bench, 1e-3)), LAST)
+    assert cheat["beats_oracle_p"] < 1e-3
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_ceiling_of_measured_flicker_is_that_of_its_model(make_recordings, parameters, seed):
+    """Flicker must not count as turn-on spread as well, or the ceiling is far too low."""
+    count, samples, rate_hz = 60, 1200, 20.0
+    noise = NoiseFigures(5e-3, 4e-3, 0.0)
+    drawn = simulate_noise(
+        np.random.default_rng(seed),
+        (1, count, 3, samples),
+        rate_hz,
+        np.full(3, noise.white),
+        flicker_dps=noise.instability,
+    )
+    recordings = make_recordings(np.zeros((1, count, 3)), samples, rate_hz, noise.white)
+    recordings = recordings.assign(angular_rate=recordings.angular_rate.copy(data=drawn))
+    allan = measure_allan_variance(recordings)
+    table = measure_bias(recordings, allan, parameters().ground_truth)
+    device = describe_device(recordings, table, allan, tuple(range(1, count + 1)), seed=1)
+    model = constant_bias(samples, rate_hz, noise, 0.0, 0.0)
+    bench = Bench(recordings, device, (1, 2), WINDOW_S, parameters().evaluation)
+    best, mean = (np.sqrt(square) for square in mean_squares(model, 0, SIZE, PAPER))
+    ceilings = bench.ceilings(PAPER, FIRST)
+    gain = ceilings["ceiling_accuracy_gain_pct"]
+    assert gain.value == pytest.approx(100 * (1 - best / mean), abs=4)
+    assert gain.lo < gain.value <= gain.hi
+    assert ceilings["ceiling_rmse_dps"].value == pytest.approx(best, rel=0.1)
 
 
 def test_simulated_data_are_judged_against_the_drawn_bias_as_well(world, simulated):

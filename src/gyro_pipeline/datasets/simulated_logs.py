@@ -68,9 +68,9 @@ class SimulatedLogs(AbstractDataset[Logs, Logs]):
             The recordings, and what was drawn, in deg/s: ``true_bias`` (imu, recording, axis),
             ``true_unit_bias`` (imu, axis), ``true_turn_on_spread`` (axis), and ``true_noise``
             (axis), N in deg/s * sqrt(s). Also ``true_flicker``, B, and ``true_random_walk``, K in
-            deg/s / sqrt(s). With a warm-up its ``true_amplitude`` (imu, recording, axis), and
-            ``true_warm_up`` (figure): the mean and the spread of the amplitude, and the time
-            constant in seconds.
+            deg/s / sqrt(s). With a warm-up its ``true_amplitude`` and ``true_time_constant``, in
+            seconds, (imu, recording, axis), and what amplitudes were drawn with:
+            ``true_amplitude_mean``, ``true_amplitude_spread``.
 
         Raises:
             InputError: As the cause of Kedro's ``DatasetError``, files that cannot be written, or
@@ -168,8 +168,10 @@ def draw_biases(generator: np.random.Generator, entry: Sensor) -> xr.Dataset:
     if model.warm_up is not None:
         figures = model.warm_up.amplitude_mdps * MDPS, model.warm_up.spread_mdps * MDPS
         amplitude = generator.normal(*figures, turn_on.shape)
+        constants_s = generator.uniform(*model.warm_up.time_constant_s, turn_on.shape)
         drawn["true_amplitude"] = (("imu", "recording", "axis"), amplitude)
-        drawn["true_warm_up"] = ("figure", np.array([*figures, model.warm_up.time_constant_s]))
+        drawn["true_time_constant"] = (("imu", "recording", "axis"), constants_s)
+        drawn["true_amplitude_mean"], drawn["true_amplitude_spread"] = figures
     return xr.Dataset(
         {
             "true_bias": (("imu", "recording", "axis"), unit_bias[:, None] + turn_on),
@@ -221,9 +223,9 @@ def write_logs(
         )
         rates = truth.true_bias.to_numpy()[imu, :, axis, None] + noise
         if model.warm_up is not None:
-            amplitude = truth.true_amplitude.to_numpy()[imu, :, axis]
-            constant_s = np.full(amplitude.shape, model.warm_up.time_constant_s)
-            rates += warm_up(amplitude, constant_s, entry.samples, entry.rate_hz)
+            one = truth.isel(imu=imu, axis=axis)
+            drawn = one.true_amplitude.to_numpy(), one.true_time_constant.to_numpy()
+            rates += warm_up(*drawn, entry.samples, entry.rate_hz)
         train_array[:, gyroscope], test_array[:, gyroscope] = rates[:cut], rates[cut:]
     train_array.flush()
     test_array.flush()

@@ -146,14 +146,14 @@ def oracle(
 
 
 def turn_on_spread(
-    recording_means: NDArray[np.floating], noise: ArrayLike, recording_s: float
+    recording_means: NDArray[np.floating], averaging: ArrayLike
 ) -> NDArray[np.float64]:
     """Turn-on spread tau: what the recordings' means scatter beyond their averaging noise.
 
     Args:
         recording_means: (n, ...), deg/s; NaN where a recording is lacking.
-        noise: N, deg/s * sqrt(s), broadcast against the trailing shape.
-        recording_s: T.
+        averaging: Variance of that noise, (deg/s)^2, broadcast against the trailing shape: N^2 / T
+            if it is white.
 
     Returns:
         (...), deg/s; 0 where the means scatter less than their averaging noise.
@@ -168,8 +168,7 @@ def turn_on_spread(
             f"gyroscope, got {present}"
         )
     scatter = np.nanvar(recording_means, axis=0, ddof=1, dtype=np.float64)
-    excess = scatter - np.asarray(noise, np.float64) ** 2 / recording_s
-    return np.asarray(np.sqrt(np.maximum(0.0, excess)))
+    return np.asarray(np.sqrt(np.maximum(0.0, scatter - np.asarray(averaging, np.float64))))
 
 
 def pooled(rmse_per_axis: ArrayLike) -> NDArray[np.float64]:

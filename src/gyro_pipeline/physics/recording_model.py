@@ -66,6 +66,13 @@ class RecordingModel:
         unit = noise_covariances(edges, self.samples, self.rate_hz)
         return np.tensordot(np.square(figures), unit, axes=1)
 
+    def averaging_variance(self) -> float:
+        """By how much the mean of a whole recording scatters about the bias, (deg/s)^2."""
+        edges = np.array([0, self.samples])
+        of_noise = self.noise_covariance(edges)[0, 0]
+        decay = self.profiles(edges)[0, 1:]
+        return float(of_noise + decay @ self.covariance[1:, 1:] @ decay)
+
     def profiles(self, edges: NDArray[np.integer]) -> NDArray[np.float64]:
         """Block means of what the bias and the amplitude are multiplied with, (m, 1) or (m, 2)."""
         return profiles(edges, self.rate_hz, self.time_constant_s)[:, : self.mean.size]
@@ -142,9 +149,14 @@ def best_linear(
     return WindowModel.of(model, start, size, truth, block_s).best(model.mean, model.covariance)
 
 
-def mean_squares(
-    model: RecordingModel, start: int, size: int, truth: str, block_s: float = BLOCK_S
-) -> tuple[float, float]:
+def mean_squares(  # noqa: PLR0917 - those of best_linear, and other priors
+    model: RecordingModel,
+    start: int,
+    size: int,
+    truth: str,
+    block_s: float = BLOCK_S,
+    covariances: NDArray[np.float64] | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Expected squared errors of the best linear estimate and of the running mean.
 
     The first is the ceiling for this noise: its root is the least RMSE that any function of the
@@ -157,21 +169,22 @@ def mean_squares(
         truth: PAPER, DISJOINT (the averaging noise of that truth is taken off, which may leave a
             negative square where noise is correlated) or TRUE.
         block_s: See :func:`best_linear`.
+        covariances: Of several priors instead of the model's, (n, 1, 1) or (n, 2, 2), (deg/s)^2.
 
     Returns:
-        Two squares, (deg/s)^2.
+        Two squares, (deg/s)^2; two of (n,) if ``covariances`` are given.
 
     Raises:
         InputError: A window that is not inside the recording, or an unknown truth.
     """
     window = WindowModel.of(model, start, size, truth, block_s)
+    priors = model.covariance if covariances is None else covariances
     weights = np.diff(window.edges) / size
     off = weights @ window.design - window.coefficients
-    variance = off @ model.covariance @ off + window.own
-    variance += weights @ (window.covariance @ weights - 2 * window.shared)
-    best = window.best(model.mean, model.covariance).variance
+    of_noise = window.own + weights @ (window.covariance @ weights - 2 * window.shared)
+    mean = priors @ off @ off + (off @ model.mean) ** 2 + of_noise
     averaging = window.own if truth == DISJOINT else 0.0
-    return best - averaging, float(variance + (off @ model.mean) ** 2 - averaging)
+    return window.variance(priors) - averaging, np.asarray(mean - averaging)
 
 
 @lru_cache(maxsize=1 << 16)  # a curve asks for the same in every recording
@@ -255,6 +268,29 @@ class WindowModel:
         solved = linalg.solve(self.covariance, both, assume_a="pos")
         return solved[:, 0], solved[:, 1:]
 
+    @cached_property
+    def _information(self) -> NDArray[np.float64]:
+        """What y tells of c."""
+        return np.asarray(self.design.T @ self._solved[1])
+
+    @cached_property
+    def _rest(self) -> NDArray[np.float64]:
+        """How the truth depends on c, given y."""
+        return np.asarray(self.coefficients - self.design.T @ self._solved[0])
+
+    def _posterior(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Covariance of c, given y; of (..., k, k) as well."""
+        shrinking = np.eye(self._rest.size) + covariance @ self._information
+        return np.asarray(np.linalg.solve(shrinking, covariance))
+
+    def variance(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Of the error of :meth:`best`, (...), under each of the priors (..., k, k)."""
+        return self._variance(self._posterior(covariance))
+
+    def _variance(self, posterior: NDArray[np.float64]) -> NDArray[np.float64]:
+        foretold = self._solved[0] @ self.shared
+        return np.asarray(self.own - foretold + posterior @ self._rest @ self._rest)
+
     def best(self, mean: NDArray[np.float64], covariance: NDArray[np.float64]) -> LinearEstimate:
         """The conditional mean of the truth given y, under a normal prior of c.
 
@@ -263,12 +299,10 @@ class WindowModel:
             covariance: Of the prior, (deg/s)^2; may be singular.
         """
         of_noise, of_design = self._solved
-        information = self.design.T @ of_design
-        posterior = np.linalg.solve(np.eye(mean.size) + covariance @ information, covariance)
-        rest = self.coefficients - self.design.T @ of_noise  # how the truth depends on c, given y
+        posterior, rest = self._posterior(covariance), self._rest
         weights = of_noise + of_design @ (posterior @ rest)
-        constant = rest @ (mean - posterior @ information @ mean)
-        variance = self.own - of_noise @ self.shared + rest @ posterior @ rest
+        constant = rest @ (mean - posterior @ self._information @ mean)
+        variance = self._variance(posterior)
         return LinearEstimate(self.edges, weights, float(constant), float(variance))
 
 

@@ -1,7 +1,7 @@
 """The test bench: one sensor, window and fold, on which every estimator is judged alike."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 
@@ -39,6 +39,7 @@ from gyro_pipeline.physics.ceiling import (
 )
 from gyro_pipeline.physics.recording_model import (
     LinearEstimate,
+    RecordingModel,
     best_linear,
     mean_squares,
 )
@@ -231,89 +232,120 @@ class Bench:
             known = (device.unit_bias[axes], device.spread[0, axes], device.noise[0, axes])
             return oracle(means, *known, self.window_s, self.recording_s, truth)
         windows = cut_windows(recording.samples, size)
-        return np.stack(
-            [
-                [
-                    float(self._line(axis, i * size, truth)(one[None])[0])
-                    for i, one in enumerate(rows)
-                ]
-                for axis, rows in enumerate(windows, self._axes(recording.imu).start)
-            ],
-            axis=-1,
-        )
+        estimates = [
+            [self._line(model, axis, i * size, truth)(one[None])[0] for i, one in enumerate(rows)]
+            for rows, (axis, model) in zip(windows, self._models(recording), strict=True)
+        ]
+        return np.stack(estimates, axis=-1)
+
+    def _models(self, recording: TestRecording) -> list[tuple[int, RecordingModel]]:
+        """The device's models for one recording: with the time constants of its power-on.
+
+        Each with the number of its axis among those of ``device``.
+        """
+        assert self.device.models is not None
+        axes = self._axes(recording.imu)
+        models = self.device.models[axes]
+        drawn = self.recordings.get("true_time_constant")
+        if drawn is not None:
+            constants_s = drawn.sel(imu=recording.imu, recording=recording.number)
+            both = zip(models, constants_s.to_numpy().tolist(), strict=True)
+            models = tuple(replace(model, time_constant_s=constant) for model, constant in both)
+        return list(enumerate(models, axes.start))
 
     @cached_property
-    def _lines(self) -> dict[tuple[int, int, str], LinearEstimate]:
+    def _distinct(self) -> dict[tuple[int, float], RecordingModel]:
+        """All models that differ, by axis and time constant."""
+        return {
+            (axis, model.time_constant_s): model
+            for recording in self.tested
+            for axis, model in self._models(recording)
+        }
+
+    @cached_property
+    def _lines(self) -> dict[tuple[int, float, int, str], LinearEstimate]:
         return {}
 
-    def _line(self, axis: int, start: int, truth: str) -> LinearEstimate:
-        """The best linear estimate of a window under the device's model, worked out once."""
-        assert self.device.models is not None
-        key = axis, start, truth
+    def _line(self, model: RecordingModel, axis: int, start: int, truth: str) -> LinearEstimate:
+        """The best linear estimate of a window under the model of its axis, worked out once."""
+        key = axis, model.time_constant_s, start, truth
         if key not in self._lines:
-            self._lines[key] = best_linear(self.device.models[axis], start, self.size, truth)
+            self._lines[key] = best_linear(model, start, self.size, truth)
         return self._lines[key]
 
     @property
     def ceiling_basis(self) -> str:
         """In words, what the ceilings are computed from."""
-        if self.device.unit_bias is not None:
-            return "drawn values"
-        noise = "white noise" if self.device.models is None else "fitted N, B and K"
-        return f"estimated from recordings, {noise}"
+        if self.device.unit_bias is None:
+            noise = "white noise" if self.device.models is None else "fitted N, B and K"
+            return f"estimated from recordings, {noise}"
+        if self.device.models is not None and len(self._distinct) > len(self.device.models):
+            return (
+                "drawn values, the time constant of each warm-up among them: nobody who must learn "
+                "it from the window can come this far"
+            )
+        return "drawn values"
 
     def ceilings(self, truth: str, windows: str) -> dict[str, Estimate]:
         """What no estimator can be better than; exact, without an interval, on simulated data.
 
-        On measured data the interval is that of N and the turn-on spread.
+        On measured data the interval is that of the turn-on spread (if noise is white that of N,
+        too). Nothing is returned for a truth whose own noise, taken off, leaves no square to take
+        the root of.
         """
-        times = (self.window_s, self.recording_s)
-        limit = pooled(ceiling_rmse(self.device.noise, self.device.spread, *times, truth))
-        mean = pooled(running_mean_rmse(self.device.noise, *times, truth))
-        ratio, saving = limit / mean, None
-        if truth == PAPER:
-            saving = best_saving(ratio, self.window_s / self.recording_s)
-        if self.device.models is not None:
-            squares, means = self._expected(truth, windows, self.size)
-            if squares <= 0 or means <= 0:  # the truth's own noise was taken off
-                return {}
-            limit = limit * np.sqrt(squares) / limit[0]
-            ratio = ratio * np.sqrt(squares / means) / ratio[0]
-            if saving is not None:
-                saving = saving + self._expected_saving(windows, squares) - saving[0]
-        ceilings = {
-            "ceiling_rmse_dps": with_interval(limit),
-            "ceiling_accuracy_gain_pct": with_interval(100 * best_gain(ratio)),
-        }
-        if saving is not None:
-            ceilings["ceiling_time_saving_pct"] = with_interval(100 * saving)
-        return ceilings
+        if (truth, windows) not in self._ceilings:
+            self._ceilings[truth, windows] = self._limits(truth, windows)
+        return self._ceilings[truth, windows]
 
     @cached_property
     def _ceilings(self) -> dict[tuple[str, str], dict[str, Estimate]]:
-        """By truth and windows; the same for every estimator."""
-        return {view: self.ceilings(*view) for view in self.curves}
+        return {}
 
-    def _expected(self, truth: str, windows: str, size: int) -> tuple[float, float]:
-        """Mean squares of the best linear estimate and the running mean, over axes and windows."""
-        assert self.device.models is not None
+    def _limits(self, truth: str, windows: str) -> dict[str, Estimate]:
+        best, mean = self._expected(truth, windows, self.size)
+        lowest = with_interval(best)
+        if (lowest.value if lowest.lo is None else lowest.lo) < 0 or mean.min() <= 0:
+            return {}
+        limit = np.sqrt(np.maximum(best, 0.0))
+        ratio = limit / np.sqrt(mean)
+        limits = {
+            "ceiling_rmse_dps": with_interval(limit),
+            "ceiling_accuracy_gain_pct": with_interval(100 * best_gain(ratio)),
+        }
+        if truth == PAPER:
+            saving = self._expected_saving(windows, ratio, limit)
+            limits["ceiling_time_saving_pct"] = with_interval(100 * saving)
+        return limits
+
+    def _expected(self, truth: str, windows: str, size: int) -> tuple[np.ndarray, np.ndarray]:
+        """Mean squares of the best estimate and the running mean over axes and windows.
+
+        For each of the device's resamples, (deg/s)^2.
+        """
+        device, attrs = self.device, self.recordings.attrs
+        if device.models is None:
+            times = size / attrs["rate_hz"], self.recording_s
+            best = pooled(ceiling_rmse(device.noise, device.spread, *times, truth))
+            return best**2, pooled(running_mean_rmse(device.noise, *times, truth)) ** 2
         starts = range(0, self.recordings.sizes["sample"] - size + 1, size)
         squares = [
-            mean_squares(model, start, size, truth)
-            for model in self.device.models
+            mean_squares(model, start, size, truth, covariances=device.priors(axis))
+            for (axis, _), model in self._distinct.items()
             for start in (starts[:1] if windows == FIRST else starts)
         ]
         best, mean = np.mean(squares, axis=0)
-        return float(best), float(mean)
+        return best, mean
 
-    def _expected_saving(self, windows: str, squares: float) -> float:
-        """1 - T0 / t*, where the running mean of t* is expected to have these squares."""
+    def _expected_saving(self, windows: str, ratio: np.ndarray, limit: np.ndarray) -> np.ndarray:
+        """1 - T0 / t*, where the running mean of t* is expected to be as good as the limit."""
+        if self.device.models is None:
+            return best_saving(ratio, self.window_s / self.recording_s)
         samples = self.recordings.sizes["sample"]
         sizes = np.unique(np.geomspace(self.size, samples, _CURVE_POINTS).astype(int))
         # of the whole recording it is 0, but for rounding
-        curve = [max(self._expected(PAPER, windows, int(size))[1], 0.0) for size in sizes]
-        reached = equivalent_time(sizes, np.sqrt([curve]), np.sqrt([squares]))[0]
-        return float(1 - self.size / reached) if np.isfinite(reached) else 0.0
+        curve = [np.maximum(self._expected(PAPER, windows, int(n))[1], 0.0) for n in sizes]
+        reached = equivalent_time(sizes, np.sqrt(curve).T, limit)
+        return np.where(np.isfinite(reached), 1 - self.size / reached, 0.0)
 
     def metrics(self, errors: pd.DataFrame, weights: str) -> dict[str, float]:
         """All figures of merit of one set of errors, by metric name; only finite ones.
@@ -333,7 +365,7 @@ class Bench:
                 curve = self.curves[truth, windows]
                 scores = score(own, mean, curve, self.window_s, self._resampled)
                 if weights == LAST:
-                    scores |= self._ceilings[truth, windows]
+                    scores |= self.ceilings(truth, windows)
                 for base, estimate in scores.items():
                     named = {"": estimate.value, "lo": estimate.lo, "hi": estimate.hi}
                     metrics |= {

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from gyro_pipeline.conventions import TEST_IMU
+from gyro_pipeline.conventions import AXES, TEST_IMU
 from gyro_pipeline.physics.allan import SHORTEST_FIT_SAMPLES, NoiseFigures, fit_noise
 from gyro_pipeline.physics.ceiling import turn_on_spread
 from gyro_pipeline.physics.recording_model import RecordingModel
@@ -29,8 +29,8 @@ class TestDevice:
         noise: N, shape (resamples, axes), deg/s sqrt(s); the first row is the estimate itself.
         spread: Turn-on spread tau, same shape, deg/s; of an unseen device, that of units.
         unit_bias: Drawn prior mean, shape (axes,), deg/s; None on measured data.
-        models: Of each axis, where its noise is not white or its bias warms up; drawn if simulated,
-            else fitted.
+        models: Of each axis, where its noise is not white or its bias warms up; drawn if simulated
+            (a time constant is then that of the recording at hand), else fitted.
     """
 
     noise: np.ndarray
@@ -44,6 +44,13 @@ class TestDevice:
         if self.models is not None:
             return tuple(model.noise for model in self.models)
         return tuple(NoiseFigures(float(white), 0.0, 0.0) for white in self.noise[0])
+
+    def priors(self, axis: int) -> np.ndarray:
+        """Covariances of the model's prior for each of ``spread``, (resamples, k, k)."""
+        assert self.models is not None
+        covariances = np.repeat(self.models[axis].covariance[None], len(self.spread), axis=0)
+        covariances[:, 0, 0] = self.spread[:, axis] ** 2
+        return covariances
 
 
 def describe_unseen(
@@ -72,8 +79,9 @@ def describe_unseen(
         variances = [allan.allan_variance.sel(imu=imu, recording=number) for imu, number in places]
         mean = np.mean([one.transpose("axis", "time_s").to_numpy() for one in variances], axis=0)
         noise = np.array([figures.white for figures in _allan_fits(recordings, allan, mean)])
-        spread = np.full(noise.shape, UNIT_SPREAD)
-        models = (_fitted_models(recordings, places, spread) or ()) * len(imus)
+        fitted = _fitted_models(recordings, places) or ()
+        own = tuple(_with_prior(model, float(model.mean[0]), UNIT_SPREAD) for model in fitted)
+        models = own * len(imus)
     axes = np.tile(noise, len(imus))[None]
     bias = np.zeros(axes.size) if recordings.attrs["simulated"] else None
     return TestDevice(axes, np.full(axes.shape, UNIT_SPREAD), bias, models or None)
@@ -115,6 +123,8 @@ def describe_device(  # noqa: PLR0913, PLR0917 - what a device is described by
     means = bias[bias.imu == imu].pivot(index="recording", columns="axis", values="bias_dps")
     variances = allan.allan_variance.sel(imu=imu, recording=list(numbers))
     variances = variances.transpose("recording", "axis", "time_s").to_numpy()
+    models = _fitted_models(recordings, [(imu, number) for number in numbers])
+    beyond_white = _beyond_white(models, duration_s)
     generator = np.random.default_rng(seed)
     draws = generator.integers(len(numbers), size=(_CEILING_RESAMPLES, len(numbers)))
     noise, spread = [], []
@@ -122,8 +132,8 @@ def describe_device(  # noqa: PLR0913, PLR0917 - what a device is described by
         fits = _allan_fits(recordings, allan, variances[chosen].mean(axis=0))
         noise.append([fit.white for fit in fits])
         values = means.loc[list(numbers)].to_numpy()[chosen]
-        spread.append(turn_on_spread(values, np.array(noise[-1]), duration_s))
-    models = _fitted_models(recordings, [(imu, number) for number in numbers], spread[0])
+        averaging = np.square(noise[-1]) / duration_s + beyond_white
+        spread.append(turn_on_spread(values, averaging))
     return TestDevice(np.array(noise), np.array(spread), None, models)
 
 
@@ -142,40 +152,45 @@ def _drawn_models(recordings: xr.Dataset) -> tuple[RecordingModel, ...] | None:
     drawn = {
         name: float(recordings.get(f"true_{name}", 0.0)) for name in ("flicker", "random_walk")
     }
-    warm_up = recordings.get("true_warm_up")
-    if not any(drawn.values()) and warm_up is None:
+    warms_up = "true_amplitude" in recordings
+    if not any(drawn.values()) and not warms_up:
         return None
     models = []
     for axis in recordings.axis.to_numpy():
         one = recordings.sel(axis=axis)
         noise = NoiseFigures(float(one.true_noise), drawn["flicker"], drawn["random_walk"])
         mean, spread = [float(one.true_unit_bias)], [float(one.true_turn_on_spread)]
-        constant_s = np.inf
-        if warm_up is not None:
-            amplitude, scatter, constant_s = warm_up.to_numpy().tolist()
-            mean, spread = [*mean, amplitude], [*spread, scatter]
+        if warms_up:
+            mean.append(float(one.true_amplitude_mean))
+            spread.append(float(one.true_amplitude_spread))
         covariance = np.diag(np.square(spread))
         place = recordings.sizes["sample"], float(recordings.attrs["rate_hz"])
-        models.append(RecordingModel(*place, noise, np.array(mean), covariance, constant_s))
+        models.append(RecordingModel(*place, noise, np.array(mean), covariance))
     return tuple(models)
 
 
 def _fitted_models(
-    recordings: xr.Dataset, places: Sequence[tuple[int, int]], spread: np.ndarray
+    recordings: xr.Dataset, places: Sequence[tuple[int, int]]
 ) -> tuple[RecordingModel, ...] | None:
-    """Models of the axes with a spread found otherwise; None of too few recordings.
+    """Models of the axes; None of too few recordings.
 
     Args:
         recordings: All.
         places: IMU and number of those to fit to.
-        spread: (axes,), deg/s.
     """
     if len(places) < FEWEST_RECORDINGS:
         return None
     rates = [recordings.angular_rate.sel(imu=imu, recording=number) for imu, number in places]
     samples = np.stack([one.transpose("axis", "sample").to_numpy() for one in rates], axis=1)
     models = []
-    for axis, tau in zip(samples, spread, strict=True):
+    for axis in samples:
         model = fit_recording_model(axis, float(recordings.attrs["rate_hz"]), warm_up=None)
-        models.append(_with_prior(model, float(model.mean[0]), tau))
+        models.append(replace(model, covariance=np.diag(np.diag(model.covariance))))
     return tuple(models)
+
+
+def _beyond_white(models: tuple[RecordingModel, ...] | None, duration_s: float) -> np.ndarray:
+    """Variance by which recordings' means scatter beyond tau and N^2 / T, by axis."""
+    if models is None:
+        return np.zeros(len(AXES))
+    return np.array([one.averaging_variance() - one.noise.white**2 / duration_s for one in models])
