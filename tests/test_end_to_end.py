@@ -59,6 +59,9 @@ FIGURES = {
 }  # fmt: skip
 
 
+NO_SIGMA = {"median", "trimmed_mean", "ridge", "ridge_same_time", "window_mean_network"}
+
+
 def files_of(**names):
     return {f"{kind}/{name}.{ending}" for kind in names for name in names[kind]
             for ending in FORMATS[kind]}  # fmt: skip
@@ -113,7 +116,7 @@ def shared(smoke, repeated):
 def incomplete(smoke, shared):
     project = smoke.project
     wanted = ("dot", "12", "24", "10.0")
-    (run,) = [one for one in shared.augmentation if cell(one) == wanted]
+    (run,) = [one for one in by_estimator(shared.augmentation, "cnn") if cell(one) == wanted]
     MlflowClient(f"sqlite:///{project.store}").delete_run(run.info.run_id)
     for name in ("augmentation_three_gyroscopes.md", "augmentation_results.csv"):
         (project.folder / REPORT / "tables" / name).unlink()
@@ -150,7 +153,7 @@ def without_a_run(smoke, whole):
     """Nine gyroscopes of DOT at 10 s: in one table and one figure."""
     project = smoke.project
     wanted = ("dot", "9", "0", "10.0")
-    (run,) = [one for one in whole.real2real if cell(one) == wanted]
+    (run,) = [one for one in by_estimator(whole.real2real, "cnn") if cell(one) == wanted]
     MlflowClient(f"sqlite:///{project.store}").delete_run(run.info.run_id)
     return step(project, project.run_here("reporting", "smoke"))
 
@@ -243,7 +246,11 @@ def test_metrics_are_those_of_the_errors_kept_with_the_run(smoke):
         assert folder.is_relative_to(smoke.project.folder)
         kept = {path.name for path in folder.iterdir()}
         network = run.data.params["estimator"] == "cnn"
-        own = {"weights.pt", "history.csv"} if network else {"running_mean_curve.parquet"}
+        own = {
+            "cnn": {"weights.pt", "history.csv"},
+            "mean": {"running_mean_curve.parquet"},
+            "residual_network": set(),
+        }[run.data.params["estimator"]]
         assert kept == {"errors.parquet"} | own
         errors = pd.read_parquet(folder / "errors.parquet")
         for suffix in SUFFIXES if network else [""]:
@@ -291,12 +298,19 @@ def test_tables_show_published_ours_and_the_ceiling_with_their_runs(smoke):
         assert table["A %"].str.fullmatch(r"-?\d+ \[-?\d+, -?\d+\]").all()
         assert table["Source"].eq("simulated_smoke").all()
         assert table["Recordings"].eq(4).all()
-        assert set(table["Runs"]) <= ids
+        assert {run for runs in table["Runs"] for run in runs.split()} <= ids
     by_id = {run.info.run_id[:8]: run for run in smoke.runs}
-    first = by_id[three["Runs"][0]]
-    assert cell(first) == ("sparkfun", "3", "0", "10.0")
-    gain = first.data.metrics["accuracy_gain_pct_all"]
-    assert three["A %"][0].split()[0] == f"{gain:.0f}"
+    for run_id, estimator, column in zip(
+        three["Runs"][0].split(),
+        ("cnn", "residual_network"),
+        ("A %", "Residual network A %"),
+        strict=True,
+    ):
+        run = by_id[run_id]
+        assert cell(run) == ("sparkfun", "3", "0", "10.0")
+        assert run.data.params["estimator"] == estimator
+        gain = run.data.metrics["accuracy_gain_pct_all"]
+        assert three[column][0].split()[0] == f"{gain:.0f}"
 
 
 def test_runs_say_what_made_them(smoke):
@@ -314,10 +328,10 @@ def test_runs_say_what_made_them(smoke):
 
 def test_a_second_run_trains_nothing_and_says_so(smoke, repeated):
     assert repeated.code == 0, repeated.output
-    skipped = "14 runs planned, 14 skipped (trained before), 0 shared with another study, 0 to"
+    skipped = "26 runs planned, 26 skipped (trained before), 0 shared with another study, 0 to"
     for sensor in ("sparkfun", "dot"):
         assert f"augmentation {sensor}: {skipped} train" in repeated.output
-        assert f"{sensor}: 0 runs evaluated, 14 skipped" in repeated.output
+        assert f"{sensor}: 0 runs evaluated, 26 skipped" in repeated.output
     assert identities(repeated.augmentation) == identities(smoke.runs)
     before = {path.removeprefix(f"{REPORT}/"): b for path, b in smoke.files.items()}
     assert all(before[name] == content for name, content in repeated.report.items())
@@ -326,10 +340,11 @@ def test_a_second_run_trains_nothing_and_says_so(smoke, repeated):
 
 def test_another_study_takes_the_cells_it_shares(smoke, shared):
     assert shared.code == 0, shared.output
-    assert "10 runs planned, 0 skipped (trained before), 6 shared" in shared.output
+    assert "18 runs planned, 0 skipped (trained before), 10 shared" in shared.output
     assert identities(shared.augmentation) == identities(smoke.runs)
     runs = shared.real2real
     assert len(by_estimator(runs, "cnn")) == 8
+    assert len(by_estimator(runs, "residual_network")) == 8
     assert len(by_estimator(runs, "mean")) == 2
     assert {run.info.status for run in runs} == {"FINISHED"}
     twins = {run.data.tags["fingerprint"]: run for run in smoke.runs}
@@ -355,7 +370,7 @@ def test_reporting_makes_what_it_can_and_names_what_is_missing(repeated, incompl
     three = "tables/augmentation_three_gyroscopes.md"
     assert incomplete.report[three] == repeated.report[three]
     results = incomplete.report["tables/augmentation_results.csv"].splitlines()
-    assert len(results) == 1 + 27
+    assert len(results) == 1 + 51
     (command,) = set(re.findall(r"kedro run --pipeline=augmentation \S+", incomplete.output))
     for part in ("sensor=dot", "real_gyros=12", "virtual_gyros=24", "window_s=10", "seed=0"):
         assert f"only.{part}" in command
@@ -364,7 +379,7 @@ def test_reporting_makes_what_it_can_and_names_what_is_missing(repeated, incompl
     assert "tables/sensor_specifications.csv" not in incomplete.report
     assert "figures/running_average.png" in incomplete.report
     assert "tables/input_channels_results.csv" not in incomplete.report
-    assert len(incomplete.augmentation) == 27  # nothing was trained
+    assert len(incomplete.augmentation) == 51  # nothing was trained
     assert f"<code>{command} --env=smoke</code>" in incomplete.page
 
 
@@ -372,7 +387,7 @@ def test_the_command_it_names_repairs_it(incomplete, repaired):
     assert repaired.code == 0, repaired.output
     new = identities(repaired.augmentation).keys() - identities(incomplete.augmentation).keys()
     assert len(new) == 1
-    assert len(repaired.augmentation) == 28
+    assert len(repaired.augmentation) == 52
     assert set(repaired.report) >= REPORTED
 
 
@@ -383,7 +398,7 @@ def test_another_hyper_parameter_trains_anew_and_keeps_what_was(repaired, change
     (new,) = [run for run in changed.augmentation if run.info.run_id not in before]
     assert new.data.params["hidden"] == "33"
     assert cell(new) == ("dot", "3", "0", "10.0")
-    assert "2 runs planned, 1 skipped" in changed.output
+    assert "3 runs planned, 2 skipped" in changed.output
 
 
 def test_its_report_uses_the_new_run_and_says_what_it_does_not_use(smoke, repaired, changed):
@@ -409,7 +424,9 @@ def test_method_1_shares_its_cell_of_one_imu(smoke, channels):
     assert {run.data.params["method"] for run in networks.values()} == {"1"}
     shared = {gyros for gyros, run in networks.items() if "trained_in" in run.data.tags}
     assert shared == {"3"}
-    twin = next(r for r in smoke.runs if cell(r) == ("sparkfun", "3", "0", "10.0"))
+    twin = next(
+        r for r in by_estimator(smoke.runs, "cnn") if cell(r) == ("sparkfun", "3", "0", "10.0")
+    )
     assert smoke.project.weights(networks["3"]) == smoke.project.weights(twin)
     for run in networks.values():
         errors = pd.read_parquet(smoke.project.artifacts(run) / "errors.parquet")
@@ -459,8 +476,10 @@ def estimators(new_project):
 def test_every_estimator_without_a_network_is_a_finished_run(estimators):
     _, done, runs, _ = estimators
     assert done.code == 0, done.output
-    assert sorted(run.data.params["estimator"] for run in runs) == sorted(ESTIMATORS)
+    assert sorted(run.data.params["estimator"] for run in runs) == sorted([*ESTIMATORS, "cnn"])
     for run in runs:
+        if run.data.params["estimator"] == "cnn":
+            continue
         assert run.info.status == "FINISHED"
         assert set(run.data.params) == PARAMS | {"folds"}
         name, metrics = run.data.params["estimator"], run.data.metrics
@@ -470,7 +489,7 @@ def test_every_estimator_without_a_network_is_a_finished_run(estimators):
             )
         assert {"test_mse_dps2_all_disjoint", "ceiling_rmse_dps_all"} <= set(metrics)
         covered = {f"coverage_{n}sigma_all{truth}" for n in (1, 2) for truth in ("", "_true")}
-        stated = name not in ("median", "trimmed_mean", "ridge", "ridge_same_time")
+        stated = name not in NO_SIGMA
         assert covered & set(metrics) == (covered if stated else set())
         assert ("uses_prior" in run.data.tags) == ESTIMATORS[name]().uses_prior
 
@@ -478,17 +497,17 @@ def test_every_estimator_without_a_network_is_a_finished_run(estimators):
 def test_they_are_compared_in_the_report_and_judged_once(estimators):
     project, _, runs, again = estimators
     assert again.code == 0, again.output
-    assert f"sparkfun: 0 runs evaluated, {len(ESTIMATORS)} skipped" in again.output
+    assert f"sparkfun: 0 runs evaluated, {len(ESTIMATORS) + 1} skipped" in again.output
     assert identities(project.runs("estimators")) == identities(runs)
     table = pd.read_csv(project.folder / REPORT / "tables/estimators_comparison.csv")
-    assert table["Estimator"].tolist() == list(ESTIMATORS)
+    assert table["Estimator"].tolist() == [*ESTIMATORS, "cnn", "cnn_best"]
     by_name = {run.data.params["estimator"]: run for run in runs}
     rmse = 1e3 * by_name["ridge"].data.metrics["test_rmse_dps_all"]
     assert table.set_index("Estimator")["RMSE mdps"]["ridge"] == pytest.approx(rmse, abs=1e-3)
     page = (project.folder / f"{PAGE}.html").read_text()
-    assert "Estimators without a network" in page
+    assert "error relative to the running mean" in page
     assert "best_linear_history" in page
-    assert ORIENTATION_NOTE in page
+    assert ORIENTATION_NOTE in " ".join(page.split())
 
 
 def test_ground_truth_alone(new_project):
@@ -568,9 +587,9 @@ def test_the_real_file_stands_beside_the_simulated_one_in_the_report(memsense):
     assert row["Published S/A %"] == "75/75 (6 real)"
     ids = {run.info.run_id[:8] for run in runs if run.data.params["window_s"] == "10.0"}
     assert set(row["Runs"].split()) <= ids
-    assert len(row["Runs"].split()) == 11
+    assert len(row["Runs"].split()) == 11 + 1  # and the residual network
     results = pd.read_csv(folder / "real2real_results.csv")
-    assert (results.source == "published (measured)").sum() == 4
+    assert (results.source == "published (measured)").sum() == 6
 
 
 def test_estimators_without_a_network_reach_on_the_real_file_what_is_known(memsense):
@@ -580,7 +599,7 @@ def test_estimators_without_a_network_reach_on_the_real_file_what_is_known(memse
     )
     assert done.code == 0, done.output
     runs = {run.data.params["estimator"]: run for run in project.runs("estimators")}
-    assert set(runs) == set(ESTIMATORS)
+    assert set(runs) == {*ESTIMATORS, "cnn"}
     assert all(run.data.params["folds"] == "11" for run in runs.values())
     rmse = {name: run.data.metrics["test_rmse_dps_all"] for name, run in runs.items()}
     assert f"{rmse['training_mean']:.7f}" == "0.0014536"

@@ -41,7 +41,8 @@ _ESTIMATORS = (
 _RATIOS = (
     "RMSE over all windows against the mean of the recording, relative to that of the running mean "
     "over the same window, with 95 % intervals. A gain is one whose interval lies below 1. "
-    "Differences, coverage and the other truths are in `tables/{study}_comparison.csv`."
+    "Differences, coverage and the other truths are in `tables/{study}_comparison.csv`. All but "
+    "the mean, the median and the trimmed mean are of the kind that " + ORIENTATION_NOTE + "."
 )
 _UNSEEN = (
     "Every device in turn is one that the estimators have never seen: they learn from the others, "

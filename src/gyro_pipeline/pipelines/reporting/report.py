@@ -146,7 +146,8 @@ def _facts(
         "Networks": f"{len(networks)} trained, of {of('epochs', trained)} epochs (the paper: 1200)",
         "Seeds": of("seed", trained),
         "Windows": f"{of('window_s', trained)} s",
-        "Estimators": f"{len(fitted)} besides the mean and the network, windows of {of('window_s', others)} s",
+        "Estimators": f"{len(fitted)} besides the mean and the network, "
+        f"windows of {of('window_s', others)} s",
         "Trained": f"{min(started):%Y-%m-%d %H:%M} to {max(started):%Y-%m-%d %H:%M} UTC",
         "Code": _code(runs),
         "Environment": ", ".join(f"`{e}`" for e in sorted({r.tags["kedro_env"] for r in runs})),
