@@ -790,8 +790,11 @@ def test_their_errors_relative_to_the_mean_are_a_compact_table(estimators, nothi
     elsewhere = results.assign(source="published", simulated=False)
     both = ratios(results, elsewhere, "sparkfun")
     assert both.Source.unique().tolist() == ["simulated", "published (measured)"]
-    lacking = pooled(runs[:2])
-    assert ratios(lacking, nothing, "sparkfun") == Missing(tuple(lacking.missing.dropna()))
+    assert ratios(pooled(runs[:2]), nothing, "sparkfun").Estimator.tolist() == [
+        *("running mean, RMSE in mdps", "empirical bayes (recommended)", "ceiling")
+    ]
+    lacking = pooled([])
+    assert ratios(lacking, nothing, "sparkfun") == Missing(tuple(lacking.missing))
 
 
 def test_unseen_devices_are_called_so_and_are_what_is_resampled(estimators, nothing):

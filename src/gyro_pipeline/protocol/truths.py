@@ -71,11 +71,12 @@ class TestRecording:
         exact = np.zeros(sums.shape)
         truths = {PAPER: (np.broadcast_to(total / n, sums.shape), exact)}
         if size < n:
+            white = not any(axis.instability or axis.random_walk for axis in self.noise)
             variance = [
                 [outside_noise(axis, n, self.rate_hz, window * size, size) for axis in self.noise]
-                for window in range(len(sums))
+                for window in range(1 if white else len(sums))  # of white noise all are alike
             ]
-            truths[DISJOINT] = ((total - sums) / (n - size), np.array(variance))
+            truths[DISJOINT] = ((total - sums) / (n - size), np.broadcast_to(variance, sums.shape))
         if self.true_bias is not None:
             truths[TRUE] = (np.broadcast_to(self.true_bias, sums.shape), exact)
         return truths
@@ -86,14 +87,18 @@ Columns = Mapping[str, NDArray[Any]]
 
 
 def error_columns(
-    recording: TestRecording, size: int, truth: str, estimates: np.ndarray, sigma: np.ndarray
+    recording: TestRecording,
+    truth: str,
+    known: tuple[np.ndarray, np.ndarray],
+    estimates: np.ndarray,
+    sigma: np.ndarray,
 ) -> Columns:
     """Errors of the estimates on one recording against one truth, a row per window and axis.
 
     Args:
         recording: What was estimated.
-        size: Samples per window.
-        truth: One that the recording has.
+        truth: Its name.
+        known: Its values and variances, from :meth:`TestRecording.truths`.
         estimates: Shape (windows, 3), deg/s.
         sigma: The standard deviations that the estimator states, same shape; NaN for none.
 
@@ -101,7 +106,7 @@ def error_columns(
         Columns of an error table, see :func:`error_table`; several are put below one another by
         :func:`stacked`.
     """
-    value, variance = recording.truths(size)[truth]
+    value, variance = known
     n = len(estimates)
     return {
         "imu": np.full(n * len(AXES), recording.imu),
@@ -132,8 +137,8 @@ def error_table(recording: TestRecording, size: int, estimates: np.ndarray) -> p
         Columns ``imu, recording, window, axis, truth, error_dps, truth_variance, sigma_dps``.
     """
     sigma = np.full(estimates.shape, np.nan)
-    truths = recording.truths(size)
-    return stacked([error_columns(recording, size, truth, estimates, sigma) for truth in truths])
+    truths = recording.truths(size).items()
+    return stacked([error_columns(recording, *truth, estimates, sigma) for truth in truths])
 
 
 def running_mean_curve(recording: TestRecording, size: int) -> pd.DataFrame:

@@ -122,6 +122,11 @@ class Bench:
         lacking = len(self.imus) > 1  # the plan has refused recordings that the test IMU lacks
         return [one for one in tested if not (lacking and np.isnan(one.samples[0, 0]))]
 
+    @cached_property
+    def _truths(self) -> list[dict[str, tuple[np.ndarray, np.ndarray]]]:
+        """Of each test recording."""
+        return [recording.truths(self.size) for recording in self.tested]
+
     def _axes(self, imu: int) -> slice:
         """Where the axes of an IMU are among those of ``device``."""
         first = len(AXES) * self.imus.index(imu)
@@ -142,7 +147,7 @@ class Bench:
         """
         seen = self.recordings.angular_rate.sel(imu=slice(TEST_IMU, TEST_IMU + imus - 1))
         parts = []
-        for recording in self.tested:
+        for recording, truths in zip(self.tested, self._truths, strict=True):
             own = estimator[recording.imu] if isinstance(estimator, Mapping) else estimator
             samples = (
                 recording.samples
@@ -160,8 +165,8 @@ class Bench:
                 for target in (RECORDING_MEAN, BIAS)
             }
             parts += [
-                error_columns(recording, self.size, truth, *judged[TARGET_OF[truth]])
-                for truth in recording.truths(self.size)
+                error_columns(recording, truth, known, *judged[TARGET_OF[truth]])
+                for truth, known in truths.items()
             ]
         errors = stacked(parts)
         for number in errors.recording[errors.error_dps.isna()].unique():
@@ -215,11 +220,11 @@ class Bench:
         if self.device.unit_bias is None:
             return None
         parts = []
-        for recording in self.tested:
-            for truth in recording.truths(self.size):
+        for recording, truths in zip(self.tested, self._truths, strict=True):
+            for truth, known in truths.items():
                 best = self._best(recording, truth)
                 sigma = np.full(best.shape, np.nan)
-                parts.append(error_columns(recording, self.size, truth, best, sigma))
+                parts.append(error_columns(recording, truth, known, best, sigma))
         return stacked(parts)
 
     def _best(self, recording: TestRecording, truth: str) -> np.ndarray:

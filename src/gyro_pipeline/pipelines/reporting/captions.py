@@ -41,8 +41,8 @@ _ESTIMATORS = (
 _RATIOS = (
     "RMSE over all windows against the mean of the recording, relative to that of the running mean "
     "over the same window, with 95 % intervals. A gain is one whose interval lies below 1. "
-    "Differences, coverage and the other truths are in `tables/{study}_comparison.csv`. All but "
-    "the mean, the median and the trimmed mean are of the kind that " + ORIENTATION_NOTE + "."
+    "Differences, coverage and the other truths are in `tables/{study}_comparison.csv`. Each but "
+    f"mean, median and trimmed mean {ORIENTATION_NOTE}."
 )
 _UNSEEN = (
     "Every device in turn is one that the estimators have never seen: they learn from the others, "
@@ -51,6 +51,7 @@ _UNSEEN = (
 )
 _TOLERANCE = "The band is the tolerance around the mean of the recording, which counts as truth."
 
+_FIRST = "To be read like that of SparkFun."
 _NAMES = {"sparkfun": "SparkFun", "dot": "DOT", "ng": "NG", "memsense": "Memsense"}
 
 
@@ -62,12 +63,10 @@ def _compared(kind: str) -> dict[str, Caption]:
         ("estimators", "estimators", ""),
         ("unseen_devices", "estimators on unseen devices", f" {_UNSEEN}"),
     ):
-        text = _ESTIMATORS
-        if kind == "tables":
-            text = _RATIOS.format(study=study)
-        for sensor, name in _NAMES.items():
-            title = f"{name}: {whose}, {what[kind]}"
-            captions[f"{kind}/{study}_{sensor}"] = Caption(title, text + more, study)
+        text = _RATIOS.format(study=study) if kind == "tables" else _ESTIMATORS
+        for i, (sensor, name) in enumerate(_NAMES.items()):
+            title, read = f"{name}: {whose}, {what[kind]}", text + more if i == 0 else _FIRST
+            captions[f"{kind}/{study}_{sensor}"] = Caption(title, read, study)
     return captions
 
 

@@ -134,11 +134,11 @@ def ratios(results: pd.DataFrame, elsewhere: pd.DataFrame, sensor: str) -> pd.Da
     Returns:
         A row per source and estimator, and one for its ceiling; a column per window.
     """
-    own = results[results.sensor == sensor]
-    if lacking := tuple(own.missing.dropna()):
-        return Missing(lacking)
-    others = elsewhere[elsewhere.sensor == sensor]
-    sources = [own, *(rows for _, rows in others.groupby("source"))]
+    own, others = (table[table.sensor == sensor] for table in (results, elsewhere))
+    made = own[own.missing.isna()]
+    if made.empty:
+        return Missing(tuple(own.missing))
+    sources = [made, *(rows for _, rows in others.groupby("source"))]
     return pd.concat([_ratios(rows) for rows in sources], ignore_index=True)
 
 
@@ -154,7 +154,7 @@ def _ratios(rows: pd.DataFrame) -> pd.DataFrame:
             cells[_marked(name)] = _ratio(named[name], "accuracy_gain_pct_all")
         cells["ceiling"] = _ratio(mean, "ceiling_accuracy_gain_pct_all")
         table[f"{window_s:g} s"] = cells
-    made = pd.DataFrame(table).rename_axis("Estimator").reset_index()
+    made = pd.DataFrame(table).fillna("–").rename_axis("Estimator").reset_index()
     made.insert(1, "Source", source_of(rows.iloc[0]))
     return made.assign(Split=_split(rows.iloc[0]))
 
