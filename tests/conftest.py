@@ -4,13 +4,14 @@ import contextlib
 import io
 import logging
 import os
+import pickle
 import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ import pytest
 import torch
 import xarray as xr
 import yaml
+from filelock import FileLock
 from kedro.config import OmegaConfigLoader
 from kedro.framework.session import KedroSession
 from kedro.framework.startup import bootstrap_project
@@ -212,11 +214,23 @@ class Ran:
 
 
 @pytest.fixture(scope="session")
-def smoke(new_project: Callable[..., Project]) -> Ran:
-    """``kedro run --pipeline=augmentation --env=smoke`` in a project without anything."""
+def smoke(new_project: Callable[..., Project], tmp_path_factory: pytest.TempPathFactory) -> Ran:
+    """``kedro run --pipeline=augmentation --env=smoke`` in a project without anything.
+
+    Each process of the tests gets a copy of one such run.
+    """
+    common = tmp_path_factory.getbasetemp()
+    made = (common.parent if "PYTEST_XDIST_WORKER" in os.environ else common) / "smoke"
     project = new_project(with_store=False)
-    done = project.kedro_run("--pipeline=augmentation", "--env=smoke")
-    return Ran(project, done, project.runs("augmentation"), project.files())
+    with FileLock(f"{made}.lock"):
+        if not made.exists():
+            done = project.kedro_run("--pipeline=augmentation", "--env=smoke")
+            ran = Ran(project, done, project.runs("augmentation"), project.files())
+            shutil.copytree(project.folder, made)
+            Path(f"{made}.pickle").write_bytes(pickle.dumps(ran))
+            return ran
+    shutil.copytree(made, project.folder, dirs_exist_ok=True)
+    return replace(pickle.loads(Path(f"{made}.pickle").read_bytes()), project=project)
 
 
 @pytest.fixture(scope="session")

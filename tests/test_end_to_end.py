@@ -120,7 +120,7 @@ def incomplete(smoke, shared):
     MlflowClient(f"sqlite:///{project.store}").delete_run(run.info.run_id)
     for name in ("augmentation_three_gyroscopes.md", "augmentation_results.csv"):
         (project.folder / REPORT / "tables" / name).unlink()
-    return step(project, project.kedro_run("--pipeline=reporting", "--env=smoke"))
+    return step(project, project.run_here("reporting", "smoke"))
 
 
 @pytest.fixture(scope="module")
@@ -535,11 +535,7 @@ def memsense(new_project):
     raw = project.folder / "data/01_raw/published"
     raw.mkdir(parents=True)
     shutil.copy(file, raw)
-    done = project.kedro_run(
-        "--pipeline=real2real",
-        "--env=memsense_real",
-        "--params=training.epochs=2,execution.executor=serial",
-    )
+    done = project.run_here("real2real", "memsense_real", training={"epochs": 2}, execution=SERIAL)
     return project, done, project.runs("real2real")
 
 
@@ -593,12 +589,12 @@ def test_the_real_file_stands_beside_the_simulated_one_in_the_report(memsense):
 
 def test_estimators_without_a_network_reach_on_the_real_file_what_is_known(memsense):
     project, _, _ = memsense
-    done = project.kedro_run(
-        "--pipeline=estimators", "--env=memsense_real", "--params=only.window_s=10"
-    )
+    asked = ["mean", "training_mean", "empirical_bayes", "best_linear"]
+    studies = {"estimators": {"windows_s": [10], "estimators": asked}}
+    done = project.run_here("estimators", "memsense_real", studies=studies)
     assert done.code == 0, done.output
     runs = {run.data.params["estimator"]: run for run in project.runs("estimators")}
-    assert set(runs) == {*ESTIMATORS, "cnn"}
+    assert set(runs) == set(asked)
     assert all(run.data.params["folds"] == "11" for run in runs.values())
     rmse = {name: run.data.metrics["test_rmse_dps_all"] for name, run in runs.items()}
     assert f"{rmse['training_mean']:.7f}" == "0.0014536"
