@@ -23,6 +23,9 @@ logger = logging.getLogger(__name__)
 Report = Callable[[float], None]
 _POLL_S = 0.2
 _LOG_EVERY_S = 30
+_START = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+_IMPORTED = "gyro_pipeline.learning.jobs"
+"""By the server of processes, which forks them with it: they take milliseconds, not seconds."""
 _AHEAD = 4
 """So many jobs per worker are handed out before results are taken, which bounds both."""
 
@@ -58,8 +61,9 @@ def run_jobs(
 ) -> Iterator[tuple[J, R]]:
     """Run ``function(job, report)`` for every job and yield results as they finish.
 
-    The longest jobs start first, so that the last ones do not wait. Processes are spawned (a fork
-    after torch used threads can deadlock) and end with this one, however it ends.
+    The longest jobs start first, so that the last ones do not wait. Processes are forked by one
+    that only imports (a fork after torch used threads can deadlock), or spawned where there is no
+    such server, and end with this one, however it ends.
 
     Args:
         jobs: Picklable, independent of each other.
@@ -235,10 +239,11 @@ def _run_serially(
 def _run_in_processes(
     jobs: Sequence[J], function: Callable[[J, Report], R], workers: int, progress: _Progress
 ) -> Generator[tuple[J, R], None, None]:
-    spawn = multiprocessing.get_context("spawn")
-    done, at_work = spawn.Value("d", 0.0), spawn.Value("i", 0)
+    context = multiprocessing.get_context(_START)
+    context.set_forkserver_preload([_IMPORTED])
+    done, at_work = context.Value("d", 0.0), context.Value("i", 0)
     shared = (done, at_work)
-    pool = ProcessPoolExecutor(workers, spawn, initializer=_start_worker, initargs=shared)
+    pool = ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=shared)
     try:
         waiting, pending = iter(jobs), dict[Future[R], J]()
         while True:
