@@ -6,10 +6,13 @@ process that is, so that a few recordings are in memory at a time.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 KEPT, REPAIRED, REJECTED = "kept", "repaired", "rejected"
 """How a finding, and a recording, can end."""
@@ -36,7 +39,8 @@ class Log:
     """One recording of one IMU, as its file has it.
 
     Attributes:
-        samples: (n, 3), float64, deg/s; may hold NaN and infinity.
+        samples: (n, 3), float64, or float32 where they were stored so; deg/s; may hold NaN and
+            infinity.
         rate_hz: Measured from timestamps; None where there are none.
         gap_rows: Rows before which samples are missing or out of order, increasing; a stretch
             between two of them is gap-free.
@@ -44,7 +48,7 @@ class Log:
         findings: Of the reading.
     """
 
-    samples: NDArray[np.float64]
+    samples: NDArray[np.floating]
     rate_hz: float | None = None
     gap_rows: NDArray[np.integer] = field(default_factory=lambda: np.empty(0, np.intp))
     temperature_c: NDArray[np.float64] | None = None
@@ -59,7 +63,8 @@ class LogEntry:
         imu: From 1.
         recording: From 1.
         where: For messages: the file, and where in it.
-        read: Reads it; can be pickled. Raises InputError where the file cannot be used.
+        read: Reads it, the same each time; can be pickled. It is called to judge the recording,
+            and again if it is kept. Raises InputError where the file cannot be used.
         size: Bytes to read, about: what reading and inspecting it costs.
         split: ``train`` or ``test``, where the source came split.
     """
@@ -90,4 +95,4 @@ class Logs:
     simulated: bool
     rate_hz: float
     entries: Sequence[LogEntry]
-    drawn: xr.Dataset | None = None
+    drawn: "xr.Dataset | None" = None

@@ -100,12 +100,11 @@ def runs(process):
 
 
 @BOTH
-def test_every_job_is_run_once_and_comes_back_with_its_result(here, execution):
-    jobs = [here.Job(f"job {i}", float(i)) for i in range(1, 8)]
-    results = list(run_jobs(jobs, here.square, execution, "squares"))
-    assert sorted((job.name, result) for job, result in results) == [
-        (f"job {i}", float(i**2)) for i in range(1, 8)
-    ]
+@pytest.mark.parametrize("short", [False, True], ids=["", "short"])
+def test_every_job_is_run_once_and_comes_back_with_its_result(here, execution, short):
+    jobs = [here.Job(f"job {i}", float(i)) for i in range(1, 20)]
+    results = dict(run_jobs(jobs, here.square, execution, "squares", short=short))
+    assert results == {job: job.work**2 for job in jobs}
 
 
 @pytest.mark.parametrize("execution", [SERIAL, ALONE], ids=["serial", "processes"])

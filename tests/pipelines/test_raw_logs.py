@@ -12,7 +12,6 @@ from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding, Log, LogEntry,
 from gyro_pipeline.parameters import Execution
 from gyro_pipeline.pipelines.raw_logs import nodes
 from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs, require_enough
-from gyro_pipeline.pipelines.raw_logs.stack import Stack
 
 RATE_HZ, SAMPLES = 100.0, 2000
 PAIR = Execution(executor="processes", workers=2)
@@ -264,20 +263,3 @@ def test_none_that_can_be_used_is_too_few_at_any_setting(inspected, quality):
     with pytest.raises(InputError, match="dot: 0 of 1 recordings can be used"):
         asked = quality.model_copy(update={"needed_pct": 1.0})
         require_enough(recordings, table.reset_index(), asked)
-
-
-def test_a_stack_moves_what_stays_to_the_front_without_overwriting_any():
-    generator = np.random.default_rng(0)
-    stack, kept = Stack([3, 5, 9], [2, 4, 7], 3), np.ones((3, 3), dtype=bool)
-    given = generator.normal(size=(3, 3, 3, 11)).astype(np.float32)
-    for i, imu in enumerate([3, 5, 9]):
-        for r, recording in enumerate([2, 4, 7]):
-            # the second has more samples than are reserved, the last one fewer
-            stack.add(imu, recording, given[i, r, :, : (9, 11, 7)[(i + r) % 3]])
-    kept[:, 1] = False
-    kept[2, 0] = False
-    cut = stack.cut(kept, 7)
-    expected = given[:, [0, 2], :, :7].copy()
-    expected[2, 0] = np.nan
-    np.testing.assert_array_equal(cut, expected)
-    assert cut.flags.c_contiguous

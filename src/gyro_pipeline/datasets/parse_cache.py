@@ -48,9 +48,9 @@ class Reading:
 def _save(log: Log, path: Path) -> None:
     """Arrays one after the other, which takes half the time of an archive of them."""
     findings = [[finding.check, finding.outcome, finding.detail] for finding in log.findings]
+    known = json.dumps([log.rate_hz, log.gap_rows.tolist(), findings])
     with np.errstate(over="ignore"):
-        arrays = [log.samples.astype(np.float32), log.gap_rows]
-    arrays.append(np.array(json.dumps([log.rate_hz, findings])))
+        arrays = [np.array(known), log.samples.astype(np.float32)]
     if log.temperature_c is not None:
         arrays.append(log.temperature_c.astype(np.float32))
     with replacing(path) as temporary, temporary.open("wb") as file:
@@ -62,10 +62,10 @@ def _load(path: Path) -> Log | None:
     """None where there is none that can be read."""
     try:
         with path.open("rb") as file:
-            samples, gap_rows, known = (np.load(file) for _ in range(3))  # never unpickles
-            warmth = np.load(file).astype(np.float64) if file.peek(1) else None
-        rate_hz, findings = json.loads(str(known))
+            known, samples = np.load(file), np.load(file)  # never unpickles
+            warmth = np.load(file) if file.peek(1) else None
+        rate_hz, gap_rows, findings = json.loads(str(known))
         found = tuple(Finding(*finding) for finding in findings)
-        return Log(samples.astype(np.float64), rate_hz, gap_rows, warmth, found)
+        return Log(samples, rate_hz, np.array(gap_rows, np.intp), warmth, found)
     except Exception:  # a damaged file fails in many ways, and is read anew in all of them
         return None

@@ -26,6 +26,8 @@ _LOG_EVERY_S = 30
 _START = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
 _IMPORTED = "gyro_pipeline.learning.jobs"
 """By the server of processes, which forks them with it: they take milliseconds, not seconds."""
+_SHORT_AT_ONCE = 16
+"""Short jobs that are handed out together: what it costs to hand one out is as much as it takes."""
 _AHEAD = 4
 """So many jobs per worker are handed out before results are taken, which bounds both."""
 
@@ -57,7 +59,7 @@ def run_jobs(
     execution: Execution,
     label: str,
     what: str = "trainings",
-    as_given: bool = False,
+    short: bool = False,
 ) -> Iterator[tuple[J, R]]:
     """Run ``function(job, report)`` for every job and yield results as they finish.
 
@@ -71,12 +73,13 @@ def run_jobs(
         execution: ``serial``, or else processes; how many workers.
         label: Names the work in progress lines.
         what: What the jobs are, for the same lines.
-        as_given: Start them in the order given, whatever their work.
+        short: They take milliseconds and do without PyTorch: several at a time go to processes
+            that are spawned without it.
 
     Yields:
         A job and its result. However slowly they are asked for, no more than a few wait in memory.
     """
-    ordered = list(jobs) if as_given else sorted(jobs, key=lambda job: job.work, reverse=True)
+    ordered = sorted(jobs, key=lambda job: job.work, reverse=True)
     if not ordered:
         return
     serial = execution.executor == "serial"
@@ -86,7 +89,7 @@ def run_jobs(
     if serial:
         results = _run_serially(ordered, function, progress)
     else:
-        results = _run_in_processes(ordered, function, workers, progress)
+        results = _run_in_processes(ordered, function, workers, progress, short)
     yield from _watched(results, progress)
 
 
@@ -237,24 +240,30 @@ def _run_serially(
 
 
 def _run_in_processes(
-    jobs: Sequence[J], function: Callable[[J, Report], R], workers: int, progress: _Progress
+    jobs: Sequence[J],
+    function: Callable[[J, Report], R],
+    workers: int,
+    progress: _Progress,
+    short: bool,
 ) -> Generator[tuple[J, R], None, None]:
-    context = multiprocessing.get_context(_START)
+    context = multiprocessing.get_context("spawn" if short else _START)
     context.set_forkserver_preload([_IMPORTED])
     done, at_work = context.Value("d", 0.0), context.Value("i", 0)
     shared = (done, at_work)
     pool = ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=shared)
     try:
-        waiting, pending = iter(jobs), dict[Future[R], J]()
+        at_once = _SHORT_AT_ONCE if short else 1
+        parts = (jobs[first : first + at_once] for first in range(0, len(jobs), at_once))
+        pending = dict[Future[list[R]], Sequence[J]]()
         while True:
-            for job in islice(waiting, _AHEAD * workers - len(pending)):
-                pending[pool.submit(_call, function, job)] = job
+            for part in islice(parts, _AHEAD * workers - len(pending)):
+                pending[pool.submit(_call, function, part)] = part
             if not pending:
                 break
             finished, _ = wait(pending, timeout=_POLL_S, return_when=FIRST_COMPLETED)
             progress.advance_to(done.value, at_work.value >= workers)
             for future in finished:
-                yield pending.pop(future), future.result()
+                yield from zip(pending.pop(future), future.result(), strict=True)
     except BaseException:  # also an interrupt, or a consumer that stops asking
         for worker in multiprocessing.active_children():
             worker.terminate()
@@ -283,8 +292,8 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _call(function: Callable[[J, Report], R], job: J) -> R:
-    return function(job, _report)
+def _call(function: Callable[[J, Report], R], jobs: Sequence[J]) -> list[R]:
+    return [function(job, _report) for job in jobs]
 
 
 def _report(work: float) -> None:

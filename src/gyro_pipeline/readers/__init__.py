@@ -43,7 +43,7 @@ def read_log(path: Path, options: ReaderOptions, expected_rate_hz: float | None 
     if stamps.rate_hz is not None and expected_rate_hz is not None:
         rate = check_rate(stamps.rate_hz, expected_rate_hz, options.rate_tolerance_pct)
     return Log(
-        samples=np.column_stack([column[n] for n in layout.rates]) * layout.scale_dps,
+        samples=np.stack([column[n] for n in layout.rates]).T * layout.scale_dps,
         rate_hz=stamps.rate_hz,
         gap_rows=np.union1d(stamps.gap_rows, counts.gap_rows),
         temperature_c=None if layout.temperature is None else column[layout.temperature],

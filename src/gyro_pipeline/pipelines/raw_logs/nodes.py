@@ -3,7 +3,6 @@
 import logging
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,8 +15,7 @@ from gyro_pipeline.fingerprints import data_hash
 from gyro_pipeline.learning.executors import run_jobs
 from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding, LogEntry, Logs
 from gyro_pipeline.parameters import Execution, Quality
-from gyro_pipeline.pipelines.raw_logs.inspection import Inspection, Judged, judge
-from gyro_pipeline.pipelines.raw_logs.stack import Stack
+from gyro_pipeline.protocol.inspection import Inspection, Judged, judge
 
 logger = logging.getLogger(__name__)
 
@@ -51,21 +49,12 @@ def inspect_logs(
         file; the rows that are used, from ``start`` to before ``stop``; ``rate_hz``, measured;
         ``findings``.
     """
-    numbers = _numbers(files.entries)
-    rates, warmth = Stack(*numbers, len(AXES)), Stack(*numbers, 1)
-    rows = list[Row]()
-    for entry, judged in _judge(files, quality, execution):
-        for stack, samples in ((rates, judged.samples), (warmth, judged.temperature_c)):
-            if samples is not None:
-                stack.add(entry.imu, entry.recording, samples)
-        rows.append((entry, replace(judged, samples=None, temperature_c=None)))
-    rows = _without_copies(sorted(rows, key=lambda row: (row[0].imu, row[0].recording)))
+    rows = sorted(_judge(files, quality, execution), key=lambda row: _place(row[0]))
+    rows = _without_copies(rows)
     used = [row for row in rows if row[1].outcome != REJECTED]
     length = min((judged.stop - judged.start for _, judged in used), default=0)
-    there = _there(used, *numbers)
-    recordings = _labelled(files, used, rates.cut(there, length), warmth.cut(there, length))
     table = pd.DataFrame(_described(files.sensor, row, length) for row in rows)
-    return recordings, table.astype({"start": "Int64", "stop": "Int64"})
+    return _labelled(files, used, length), table.astype({"start": "Int64", "stop": "Int64"})
 
 
 def require_enough(recordings: xr.Dataset, table: pd.DataFrame, quality: Quality) -> xr.Dataset:
@@ -99,19 +88,16 @@ def require_enough(recordings: xr.Dataset, table: pd.DataFrame, quality: Quality
     )
 
 
-def _numbers(entries: Sequence[LogEntry]) -> tuple[list[int], list[int]]:
-    """Of all IMUs, and of all recordings."""
-    return sorted({one.imu for one in entries}), sorted({one.recording for one in entries})
+def _place(entry: LogEntry) -> tuple[int, int]:
+    return entry.imu, entry.recording
 
 
 def _judge(files: Logs, quality: Quality, execution: Execution) -> Iterator[Row]:
     """All recordings, in any order, here or in several processes."""
-    # shortest first: the length of the first one is reserved for all
-    entries = sorted(files.entries, key=lambda entry: entry.size)
-    jobs = [Inspection(entry, files.rate_hz, quality) for entry in entries]
-    if sum(entry.size for entry in entries) < _WORTH_PROCESSES:
+    jobs = [Inspection(entry, files.rate_hz, quality) for entry in files.entries]
+    if sum(entry.size for entry in files.entries) < _WORTH_PROCESSES:
         return ((job.entry, judge(job, lambda work: None)) for job in jobs)
-    judged = run_jobs(jobs, judge, execution, files.sensor, "recordings", as_given=True)
+    judged = run_jobs(jobs, judge, execution, files.sensor, "recordings", short=True)
     return ((job.entry, one) for job, one in judged)
 
 
@@ -129,24 +115,30 @@ def _without_copies(rows: Sequence[Row]) -> list[Row]:
     return found
 
 
-def _there(
-    used: Sequence[Row], imus: Sequence[int], recordings: Sequence[int]
-) -> NDArray[np.bool_]:
-    """(imu, recording), whether it is used."""
-    pairs = {(entry.imu, entry.recording) for entry, _ in used}
-    return np.array([[(imu, number) in pairs for number in recordings] for imu in imus], dtype=bool)
+def _read(
+    used: Sequence[Row], imus: Sequence[int], recordings: Sequence[int], length: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """Samples, (imu, recording, axis, sample), and temperatures, without axis, if there are any."""
+    there = np.zeros((len(imus), len(recordings)), bool)
+    rates = np.empty((*there.shape, len(AXES), length), np.float32)
+    warmth = None
+    for entry, judged in used:
+        log, rows = entry.read(), slice(judged.start, judged.start + length)
+        place = imus.index(entry.imu), recordings.index(entry.recording)
+        there[place], rates[place] = True, log.samples[rows].T
+        if log.temperature_c is not None:
+            if warmth is None:
+                warmth = np.full((*there.shape, length), np.nan, np.float32)
+            warmth[place] = log.temperature_c[rows]
+    rates[~there] = np.nan
+    return rates, warmth
 
 
-def _labelled(
-    files: Logs,
-    used: Sequence[Row],
-    rates: NDArray[np.float32] | None,
-    warmth: NDArray[np.float32] | None,
-) -> xr.Dataset:
-    """Name the dimensions and say where the recordings come from."""
-    imus, recordings = _numbers([entry for entry, _ in used])
-    if rates is None:
-        rates = np.empty((0, 0, len(AXES), 0), dtype=np.float32)
+def _labelled(files: Logs, used: Sequence[Row], length: int) -> xr.Dataset:
+    """The recordings, with names of their dimensions and where they come from."""
+    imus = sorted({entry.imu for entry, _ in used})
+    recordings = sorted({entry.recording for entry, _ in used})
+    rates, warmth = _read(used, imus, recordings, length)
     coordinates: dict[str, Any] = {"imu": imus, "recording": recordings, "axis": list(AXES)}
     splits = {entry.recording: entry.split for entry, _ in used}
     if any(splits.values()):
@@ -163,7 +155,7 @@ def _labelled(
     logs.attrs["data_hash"] = data_hash(rates, [labels, logs.attrs])
     if warmth is not None:
         units = {"units": "degrees Celsius"}
-        logs["temperature_c"] = (("imu", "recording", "sample"), warmth[:, :, 0], units)
+        logs["temperature_c"] = (("imu", "recording", "sample"), warmth, units)
     if files.drawn is not None:
         logs = logs.assign(files.drawn.sel(imu=imus, recording=recordings).data_vars)
     return logs.assign_attrs(simulated=int(files.simulated))

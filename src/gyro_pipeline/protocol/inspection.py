@@ -5,7 +5,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.logs import REJECTED, Finding, Log, LogEntry
@@ -41,18 +40,16 @@ class Inspection:
 
 @dataclass(frozen=True)
 class Judged:
-    """What is known of a recording after it was read, and what is kept of it.
+    """What is known of a recording after it was read; its samples are read again where needed.
 
     Attributes:
         outcome: KEPT, REPAIRED or REJECTED.
         findings: Why.
         rows: It has.
         start: First row that is used.
-        stop: The row after the last one that can be used.
+        stop: The row after the last one that can be used, or that ``quality.length_s`` asks for.
         rate_hz: Measured from timestamps; None where there are none, or it cannot be read.
         content: Hash of all its samples; two recordings of one hash are one.
-        samples: The rows that can be used, (3, n), float32, deg/s; None of a rejected recording.
-        temperature_c: Of the same rows, (1, n), float32; None where the file has none.
     """
 
     outcome: str
@@ -62,8 +59,6 @@ class Judged:
     stop: int = 0
     rate_hz: float | None = None
     content: str = ""
-    samples: NDArray[np.float32] | None = None
-    temperature_c: NDArray[np.float32] | None = None
 
     def rejected(self, finding: Finding) -> "Judged":
         """The same recording with one more finding, for which it cannot be used."""
@@ -78,7 +73,7 @@ def judge(job: Inspection, report: Callable[[float], None]) -> Judged:
         report: Called with the work done.
 
     Returns:
-        What is kept of it. A file that cannot be used is a rejected recording.
+        What was found. A file that cannot be used is a rejected recording.
     """
     try:
         log = job.entry.read()
@@ -96,21 +91,14 @@ def _judged(log: Log, job: Inspection) -> Judged:
     rounded = replace(log, samples=stored.T.astype(np.float64))
     found = inspect(rounded, log.rate_hz or job.rate_hz, job.quality)
     usable = found.stop - found.start
-    used = slice(found.start, found.start + min(usable, job.samples or usable))
+    stop = found.start + min(usable, job.samples or usable)
     judged = Judged(
         found.outcome,
         found.findings,
-        *(len(log.samples), used.start, used.stop, log.rate_hz),
+        *(len(log.samples), found.start, stop, log.rate_hz),
         content=hashlib.sha256(stored.data).hexdigest(),
     )
-    if found.outcome == REJECTED:
-        return judged
-    if job.samples is not None and usable < job.samples:
+    if found.outcome != REJECTED and job.samples is not None and usable < job.samples:
         problem = f"{usable} rows can be used, quality.length_s asks for {job.samples}"
         return judged.rejected(Finding("too short", REJECTED, problem))
-    warmth = log.temperature_c
-    return replace(
-        judged,
-        samples=np.ascontiguousarray(stored[:, used]),
-        temperature_c=None if warmth is None else warmth[None, used].astype(np.float32),
-    )
+    return judged
