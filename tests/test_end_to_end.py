@@ -569,8 +569,8 @@ def test_the_running_means_error_on_the_real_file_is_the_known_one(memsense):
 
 def test_the_real_file_stands_beside_the_simulated_one_in_the_report(memsense):
     project, _, runs = memsense
-    training = {"epochs": 2}
-    done = project.run_here("real2real", "smoke", training=training, execution=SERIAL)
+    changes = {"training": {"epochs": 2}, "only": {"window_s": 10}}
+    done = project.run_here("real2real", "smoke", **changes, execution=SERIAL)
     assert done.code == 0, done.output
     folder = project.folder / REPORT / "tables"
     table = pd.read_csv(folder / "real2real_generalization.csv")
