@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from kedro.io import AbstractDataset, DatasetError
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from gyro_pipeline.conventions import AXES, InputError
+from gyro_pipeline.datasets.log_source import LogSource
 from gyro_pipeline.logs import Log, LogEntry, Logs
-from gyro_pipeline.parameters import Sensor
 
 LAYOUT = ("recording", "gyroscope", "sample")
 """What the three axes of a file are, in the order in which the published files have them."""
@@ -27,7 +25,7 @@ _DOMINANCE = 4
 Order = tuple[str, ...]
 
 
-class ArrayLogs(AbstractDataset[Logs, Logs]):
+class ArrayLogs(LogSource):
     """Lists what 3-D ``.npy`` files hold: recordings, gyroscopes, samples, in any order, deg/s.
 
     Gyroscopes come three to an IMU, IMU by IMU, in the order x, y, z. Counts are read from the
@@ -57,14 +55,10 @@ class ArrayLogs(AbstractDataset[Logs, Logs]):
         axes_order: Sequence[str] | None = None,
         metadata: dict[str, Any] | None = None,
     ) -> None:
-        self.entry = sensor_entry(sensor, sensors)
+        super().__init__(sensor, sensors, source, path, metadata)
         _check_entry(sensor, files, axes_order)
-        self._sensor = sensor
-        self._source = source
-        self._path = Path(path)
         self._files = {split: files[split] for split in ("train", "test", WHOLE) if split in files}
         self._axes_order = None if axes_order is None else tuple(axes_order)
-        self.metadata = metadata
 
     def load(self) -> Logs:
         """List the recordings of all files; their samples are read later, one at a time.
@@ -90,21 +84,11 @@ class ArrayLogs(AbstractDataset[Logs, Logs]):
         entries.sort(key=lambda entry: (entry.imu, entry.recording))
         return Logs(self._sensor, self._source, False, self.entry.rate_hz, entries)
 
-    def save(self, data: Logs) -> None:
-        """Refuse: logs are read only."""
-        raise DatasetError(f"{self._sensor}: logs are read only, {self._path} is not written to")
-
     def _exists(self) -> bool:
         return all((self._path / name).is_file() for name in self._files.values())
 
     def _describe(self) -> dict[str, Any]:
-        return {
-            "sensor": self._sensor,
-            "source": self._source,
-            "path": str(self._path),
-            "files": self._files,
-            "axes_order": self._axes_order,
-        }
+        return super()._describe() | {"files": self._files, "axes_order": self._axes_order}
 
     def _open(self, name: str) -> NDArray[Any]:
         """Map one file, refusing what is not three axes of real numbers."""
@@ -176,29 +160,6 @@ class ArrayLogs(AbstractDataset[Logs, Logs]):
             for imu in range(imus)
             for recording in range(count["recording"])
         ]
-
-
-def sensor_entry(sensor: str, sensors: Mapping[str, Mapping[str, Any]]) -> Sensor:
-    """Look up a sensor and check its entry.
-
-    Args:
-        sensor: Its name.
-        sensors: All sensors, as in ``conf/base/globals.yml``.
-
-    Returns:
-        The typed entry.
-
-    Raises:
-        InputError: No such sensor, or its entry is not usable.
-    """
-    if sensor not in sensors:
-        raise InputError(
-            f"unknown sensor {sensor!r}; conf/base/globals.yml knows {', '.join(sensors)}"
-        )
-    try:
-        return Sensor.model_validate(sensors[sensor])
-    except ValidationError as error:
-        raise InputError(f"sensor {sensor} in conf/base/globals.yml: {error}") from error
 
 
 def _check_entry(sensor: str, files: Mapping[str, str], axes_order: Sequence[str] | None) -> None:

@@ -9,12 +9,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from kedro.io import AbstractDataset, DatasetError
 from pydantic import ValidationError
 
 from gyro_pipeline import readers
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.datasets.array_logs import sensor_entry
+from gyro_pipeline.datasets.log_source import LogSource
 from gyro_pipeline.datasets.parse_cache import Reading
 from gyro_pipeline.fingerprints import code_hash, fingerprint
 from gyro_pipeline.logs import LogEntry, Logs
@@ -34,7 +33,7 @@ _PART = re.compile(r"\{(imu|recording)(:name)?\}|(\*)")
 Numbers = dict[str, tuple[int, int]]
 
 
-class FileLogs(AbstractDataset[Logs, Logs]):
+class FileLogs(LogSource):
     """Lists the files of a folder that match a pattern, each one recording of one IMU.
 
     Args:
@@ -66,10 +65,7 @@ class FileLogs(AbstractDataset[Logs, Logs]):
         cache: Mapping[str, str] | None = None,
         metadata: dict[str, Any] | None = None,
     ) -> None:
-        self._rate_hz = sensor_entry(sensor, sensors).rate_hz
-        self._sensor = sensor
-        self._source = source
-        self._path = Path(path)
+        super().__init__(sensor, sensors, source, path, metadata)
         self._pattern = pattern
         self._regex = _compiled(sensor, pattern)
         try:
@@ -77,7 +73,6 @@ class FileLogs(AbstractDataset[Logs, Logs]):
         except ValidationError as error:
             raise InputError(f"{sensor}: reader in the catalog entry: {error}") from error
         self._cache = None if cache is None else Path(cache["path"])
-        self.metadata = metadata
 
     def load(self) -> Logs:
         """List the recordings; their files are read later, one at a time.
@@ -95,23 +90,14 @@ class FileLogs(AbstractDataset[Logs, Logs]):
             for name, reading in readings.items()
         ]
         entries.sort(key=lambda entry: (entry.imu, entry.recording))
-        return Logs(self._sensor, self._source, False, self._rate_hz, entries)
-
-    def save(self, data: Logs) -> None:
-        """Refuse: logs are read only."""
-        raise DatasetError(f"{self._sensor}: logs are read only, {self._path} is not written to")
+        return Logs(self._sensor, self._source, False, self.entry.rate_hz, entries)
 
     def _exists(self) -> bool:
         return self._path.is_dir()
 
     def _describe(self) -> dict[str, Any]:
-        return {
-            "sensor": self._sensor,
-            "source": self._source,
-            "path": str(self._path),
-            "pattern": self._pattern,
-            "reader": self._options.model_dump(exclude_defaults=True),
-        }
+        reader = self._options.model_dump(exclude_defaults=True)
+        return super()._describe() | {"pattern": self._pattern, "reader": reader}
 
     def _matching(self) -> dict[str, re.Match[str]]:
         """Paths in the folder that the pattern describes, in their order."""
@@ -143,7 +129,7 @@ class FileLogs(AbstractDataset[Logs, Logs]):
 
     def _readings(self, names: Iterable[str]) -> dict[str, Reading]:
         """How each file is read, and where its reading is kept."""
-        settings = [self._options.model_dump(mode="json"), self._rate_hz, _readers_hash()]
+        settings = [self._options.model_dump(mode="json"), self.entry.rate_hz, _readers_hash()]
         found = {}
         for name in names:
             path, kept_as = self._path / name, None
@@ -151,7 +137,7 @@ class FileLogs(AbstractDataset[Logs, Logs]):
                 state = path.stat()
                 key = fingerprint([str(path), state.st_size, state.st_mtime_ns, settings])
                 kept_as = self._cache / f"{key}.npy"
-            found[name] = Reading(path, self._options, self._rate_hz, kept_as)
+            found[name] = Reading(path, self._options, self.entry.rate_hz, kept_as)
         return found
 
     def _tidy(self, wanted: Sequence[Path]) -> None:

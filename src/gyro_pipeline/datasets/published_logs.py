@@ -2,15 +2,15 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 from typing import Any
 
-from kedro.io import AbstractDataset, DatasetError
 from pydantic import Field, ValidationError
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.array_logs import ArrayLogs
 from gyro_pipeline.datasets.download import ensure
+from gyro_pipeline.datasets.log_source import LogSource
 from gyro_pipeline.logs import Logs
 from gyro_pipeline.parameters import Parameter
 
@@ -30,7 +30,7 @@ class PublishedFile(Parameter):
         return PurePosixPath(self.remote).name
 
 
-class PublishedLogs(AbstractDataset[Logs, Logs]):
+class PublishedLogs(LogSource):
     """Array files that are fetched once, verified at every load, and read as any such files.
 
     Args:
@@ -59,13 +59,11 @@ class PublishedLogs(AbstractDataset[Logs, Logs]):
         axes_order: Sequence[str] | None = None,
         metadata: dict[str, Any] | None = None,
     ) -> None:
+        super().__init__(sensor, sensors, source, path, metadata)
         self._files = {split: _published(sensor, split, files[split]) for split in files}
         names = {split: file.name for split, file in self._files.items()}
         self._arrays = ArrayLogs(sensor, sensors, source, path, names, axes_order)
-        self._sensor = sensor
         self._address = address.rstrip("/")
-        self._path = Path(path)
-        self.metadata = metadata
 
     def load(self) -> Logs:
         """Fetch what is not there, verify all of it, and read it.
@@ -82,10 +80,6 @@ class PublishedLogs(AbstractDataset[Logs, Logs]):
             ensure(url, self._path / file.name, file.blob)
         _LOG.info("published %s files verified: %s", self._sensor, self._path)
         return self._arrays.load()
-
-    def save(self, data: Logs) -> None:
-        """Refuse: logs are read only."""
-        raise DatasetError(f"{self._sensor}: logs are read only, {self._path} is not written to")
 
     def _exists(self) -> bool:
         return self._arrays.exists()

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from kedro.io import AbstractDataset, DatasetError
 
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 from gyro_pipeline.datasets.array_logs import LAYOUT, ArrayLogs
 from gyro_pipeline.datasets.atomic import replacing
+from gyro_pipeline.datasets.log_source import LogSource
 from gyro_pipeline.datasets.recordings import Recordings, open_recordings
 from gyro_pipeline.logs import Logs
 from gyro_pipeline.parameters import Sensor
@@ -24,7 +24,7 @@ from gyro_pipeline.physics.noise import simulate_noise, warm_up
 _LOG = logging.getLogger(__name__)
 
 
-class SimulatedLogs(AbstractDataset[Logs, Logs]):
+class SimulatedLogs(LogSource):
     """Writes simulated logs once, in the published layout, and reads them as any such files.
 
     Each gyroscope has a unit bias, uniform in plus or minus ``unit_bias_dps``; each power-on adds
@@ -52,14 +52,12 @@ class SimulatedLogs(AbstractDataset[Logs, Logs]):
         seed: int,
         metadata: dict[str, Any] | None = None,
     ) -> None:
+        super().__init__(sensor, sensors, source, path, metadata)
         files = {split: f"{sensor}_{split}.npy" for split in ("train", "test")}
         self._arrays = ArrayLogs(sensor, sensors, source, path, files, axes_order=LAYOUT)
-        self._sensor = sensor
-        self._source = source
         self._seed = seed
-        self._train, self._test = (Path(path) / name for name in files.values())
-        self._truth = Path(path) / f"{sensor}_truth.nc"
-        self.metadata = metadata
+        self._train, self._test = (self._path / name for name in files.values())
+        self._truth = self._path / f"{sensor}_truth.nc"
 
     def load(self) -> Logs:
         """List the recordings, writing them first where they are missing or of other settings.
@@ -79,7 +77,7 @@ class SimulatedLogs(AbstractDataset[Logs, Logs]):
         found = self._settings_on_disk()
         if found != self._settings():
             why = "" if found is None else " anew, since their settings have changed"
-            _LOG.info("writing simulated %s logs%s: %s", self._sensor, why, self._train.parent)
+            _LOG.info("writing simulated %s logs%s: %s", self._sensor, why, self._path)
             self._write()
         truth = open_recordings(self._truth).load()
         if truth.attrs["files_hash"] != self._files_hash():
@@ -90,26 +88,17 @@ class SimulatedLogs(AbstractDataset[Logs, Logs]):
             )
         return replace(self._arrays.load(), simulated=True, drawn=truth.drop_attrs())
 
-    def save(self, data: Logs) -> None:
-        """Refuse: logs are read only."""
-        raise DatasetError(f"{self._sensor}: logs are read only, nothing is written to them")
-
     def _exists(self) -> bool:
         return self._truth.is_file() and self._arrays.exists()
 
     def _describe(self) -> dict[str, Any]:
-        return {
-            "sensor": self._sensor,
-            "source": self._source,
-            "path": str(self._train.parent),
-            "seed": self._seed,
-        }
+        return super()._describe() | {"seed": self._seed}
 
     def _settings(self) -> str:
         """All that the files depend on."""
         # without what was left at its default: files of versions that did not know it stay valid
-        entry = self._arrays.entry.model_dump(mode="json")
-        known = self._arrays.entry.simulated.model_dump(mode="json")
+        entry = self.entry.model_dump(mode="json")
+        known = self.entry.simulated.model_dump(mode="json")
         for added, default in (("random_walk_mdps_per_rts", 0.0), ("warm_up", None)):
             if known[added] == default:
                 del entry["simulated"][added]
@@ -131,9 +120,9 @@ class SimulatedLogs(AbstractDataset[Logs, Logs]):
         """Write the logs, then what was drawn, which marks them as complete."""
         name = zlib.crc32(self._sensor.encode())  # sensors with one seed get different draws
         generator = np.random.default_rng(np.random.SeedSequence([self._seed, name]))
-        truth = draw_biases(generator, self._arrays.entry)
+        truth = draw_biases(generator, self.entry)
         with replacing(self._train) as train, replacing(self._test) as test:
-            write_logs(generator, self._arrays.entry, truth, train, test)
+            write_logs(generator, self.entry, truth, train, test)
             # from here on the old mark would vouch for the new arrays
             self._truth.unlink(missing_ok=True)
         truth.attrs = {"settings": self._settings(), "files_hash": self._files_hash()}

@@ -1,0 +1,59 @@
+"""What all sources of raw logs have in common."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from kedro.io import AbstractDataset, DatasetError
+from pydantic import ValidationError
+
+from gyro_pipeline.conventions import InputError
+from gyro_pipeline.logs import Logs
+from gyro_pipeline.parameters import Sensor
+
+
+class LogSource(AbstractDataset[Logs, Logs]):
+    """Logs of one sensor in a folder, read only.
+
+    Args:
+        sensor: Name of the sensor the files are of.
+        sensors: All sensors, as in ``conf/base/globals.yml``.
+        source: Where the logs come from, as stored paths name it.
+        path: Folder of the files.
+        metadata: For other tools, such as Kedro-Viz.
+
+    Raises:
+        InputError: No such sensor, or its entry is not usable.
+    """
+
+    def __init__(
+        self,
+        sensor: str,
+        sensors: Mapping[str, Mapping[str, Any]],
+        source: str,
+        path: str,
+        metadata: dict[str, Any] | None,
+    ) -> None:
+        self.entry = _entry(sensor, sensors)
+        self._sensor = sensor
+        self._source = source
+        self._path = Path(path)
+        self.metadata = metadata
+
+    def save(self, data: Logs) -> None:
+        """Refuse: logs are read only."""
+        raise DatasetError(f"{self._sensor}: logs are read only, {self._path} is not written to")
+
+    def _describe(self) -> dict[str, Any]:
+        return {"sensor": self._sensor, "source": self._source, "path": str(self._path)}
+
+
+def _entry(sensor: str, sensors: Mapping[str, Mapping[str, Any]]) -> Sensor:
+    if sensor not in sensors:
+        raise InputError(
+            f"unknown sensor {sensor!r}; conf/base/globals.yml knows {', '.join(sensors)}"
+        )
+    try:
+        return Sensor.model_validate(sensors[sensor])
+    except ValidationError as error:
+        raise InputError(f"sensor {sensor} in conf/base/globals.yml: {error}") from error
