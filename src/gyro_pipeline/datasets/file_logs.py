@@ -47,7 +47,8 @@ class FileLogs(LogSource):
             without a recording the files of an IMU are numbered in their order.
         reader: How the files are read (:class:`gyro_pipeline.parameters.ReaderOptions`).
         cache: ``{"path": folder}`` for what was read of text files, so that an interrupted run
-            goes on where it was; None: nothing is kept. (Kedro makes a ``path`` absolute.)
+            goes on where it was; None: nothing is kept, and each file is read twice. (Kedro makes
+            a ``path`` absolute.)
         metadata: For other tools, such as Kedro-Viz.
 
     Raises:
