@@ -29,6 +29,9 @@ _TICKS_S = (1, 2, 5, 10, 20, 30, 60, 100)
 _SHIFT = 0.11
 """Points of one window stand side by side: so much apart, relative to the time."""
 
+_LEAST_SPAN = 2.5
+"""Of an axis of errors, largest over smallest."""
+
 _COMMON_SPREAD_MDPS = 10
 """Turn-on spread that is common for consumer parts."""
 
@@ -203,7 +206,10 @@ def _draw_estimators(left: Axes, right: Axes, rows: pd.DataFrame) -> None:
         ax.plot(values.index, values, color=CEILING, lw=2, ls="--", label="ceiling")
         ax.set(xscale="log", yscale="log", xlabel="window length [s], points side by side")
         ax.set_xticks(means.index.tolist(), minor=False)
-        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        low, high = ax.get_ylim()
+        widen = max(np.sqrt(_LEAST_SPAN * low / high), 1)  # what differs by little must look so
+        ax.set_ylim(low / widen, high * widen)
+        ax.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
         for axis in (ax.xaxis, ax.yaxis):
             axis.set_major_formatter("{x:g}")
         ax.minorticks_off()
