@@ -45,6 +45,16 @@ def test_a_warm_up_is_found():
     assert model.time_constant_s == pytest.approx(15, rel=0.15)
 
 
+@pytest.mark.parametrize(("time_constant_s", "kept"), [(30.0, True), (300.0, False)])
+def test_a_warm_up_is_found_unless_its_end_is_not_seen(time_constant_s, kept):
+    decay = np.exp(-np.arange(SAMPLES) / RATE / time_constant_s)
+    recordings = recorded(20) + np.linspace(0.02, 0.04, 20)[:, None] * decay
+    model = fit_recording_model(recordings, RATE, None)
+    assert (model.mean.size == 2) is kept
+    if kept:
+        assert model.time_constant_s == pytest.approx(time_constant_s, rel=0.2)
+
+
 def test_known_noise_is_kept():
     noise = NoiseFigures(6 * MDPS, 1 * MDPS, 0.0)
     assert fit_recording_model(recorded(10), RATE, noise=noise).noise == noise

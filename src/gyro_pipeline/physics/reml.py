@@ -59,7 +59,8 @@ def fit_recording_model(
         rate_hz: Samples per second.
         warm_up: Whether there is one; its time constant is the same in all recordings. None: if
             the recordings say so, by the Bayesian information criterion (Schwarz 1978, Annals of
-            Statistics 6).
+            Statistics 6), and are longer than its time constant: what the bias settles to after
+            they end, they do not say.
         noise: Known N, B and K; fitted together with the rest if None.
 
     Returns:
@@ -80,7 +81,9 @@ def fit_recording_model(
     stationary = _fitted(*given, bool(warm_up), noise)
     if warm_up is not None or not stationary.warms_up:
         return stationary.model
-    return min(stationary, _fitted(*given, True, noise), key=lambda fit: fit.criterion).model
+    warming = _fitted(*given, True, noise)
+    settles = warming.model.time_constant_s <= samples / rate_hz
+    return (warming if settles and warming.criterion < stationary.criterion else stationary).model
 
 
 @dataclass(frozen=True)
