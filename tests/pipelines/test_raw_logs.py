@@ -241,6 +241,18 @@ def test_counts_are_said_and_enough_recordings_go_on(inspected, quality, caplog)
     assert caplog.messages == ["dot: 4 recordings, 2 kept, 1 repaired, 1 rejected"]
 
 
+def test_a_much_shorter_recording_that_shortens_all_is_named(inspected, caplog):
+    recordings, _ = inspected(listed(four(log_12=Log(noise(7, 1100)))))
+    assert recordings.sizes["sample"] == 1100
+    assert caplog.messages == [
+        "dot: all recordings are cut to 11 s, as long as IMU 1 recording 2, 1_2.csv; half of them "
+        "have 20 s or more. Remove or repair it, or raise quality.least_s"
+    ]
+    caplog.clear()
+    inspected(listed(four(log_12=Log(noise(7, 1700)))))
+    assert caplog.messages == []
+
+
 def test_too_few_recordings_stop_and_the_rejected_ones_are_named(inspected, quality):
     logs = {(1, number): Log(np.zeros((9, 3))) for number in range(1, 13)} | {(2, 1): Log(noise(1))}
     logs[1, 3] = InputError("1_3.csv: is a zip")

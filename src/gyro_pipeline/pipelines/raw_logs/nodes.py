@@ -52,7 +52,7 @@ def inspect_logs(
     rows = sorted(_judge(files, quality, execution), key=lambda row: _place(row[0]))
     rows = _without_copies(rows)
     used = [row for row in rows if row[1].outcome != REJECTED]
-    length = min((judged.stop - judged.start for _, judged in used), default=0)
+    length = _common_length(files, used, quality)
     table = pd.DataFrame(_described(files.sensor, row, length) for row in rows)
     return _labelled(files, used, length), table.astype({"start": "Int64", "stop": "Int64"})
 
@@ -113,6 +113,23 @@ def _without_copies(rows: Sequence[Row]) -> list[Row]:
         copy = Finding("duplicate", REJECTED, problem)
         found.append((entry, judged if same is entry else judged.rejected(copy)))
     return found
+
+
+def _common_length(files: Logs, used: Sequence[Row], quality: Quality) -> int:
+    """Rows of the shortest recording; a warning where it costs the others much."""
+    if not used:
+        return 0
+    lengths = [judged.stop - judged.start for _, judged in used]
+    shortest = int(np.argmin(lengths))
+    length, usual = lengths[shortest], float(np.median(lengths))
+    if length < quality.least_share * usual:
+        logger.warning(
+            "%s: all recordings are cut to %.4g s, as long as IMU %d recording %d, %s; half of "
+            "them have %.4g s or more. Remove or repair it, or raise quality.least_s",
+            *(files.sensor, length / files.rate_hz, used[shortest][0].imu),
+            *(used[shortest][0].recording, used[shortest][0].where, usual / files.rate_hz),
+        )
+    return length
 
 
 def _read(
