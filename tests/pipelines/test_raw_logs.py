@@ -88,7 +88,7 @@ def test_recordings_are_labelled_as_the_conventions_say(inspected):
 def test_all_are_cut_to_the_shortest_that_is_kept_from_the_first_usable_row_on(inspected):
     started = noise(7)
     started[:3] = 0
-    logs = four(log_12=Log(started), log_21=Log(noise(8, 2500)), log_22=Log(noise(9, 1700)))
+    logs = four(log_12=Log(started), log_21=Log(noise(8, 2500)), log_22=Log(noise(9, 1200)))
     recordings, table = inspected(listed(logs))
     assert recordings.sizes["sample"] == 1200
     for (imu, recording), first in {(1, 1): 0, (1, 2): 3, (2, 1): 0, (2, 2): 0}.items():
@@ -108,7 +108,7 @@ def test_a_rejected_recording_does_not_decide_the_length(inspected):
 
 
 def test_all_are_cut_to_a_stated_length_and_shorter_ones_rejected(inspected):
-    logs = four(log_22=Log(noise(9, 1700)))
+    logs = four(log_22=Log(noise(9, 1200)))
     recordings, table = inspected(listed(logs), length_s=15.0)
     assert recordings.sizes["sample"] == 1500
     assert table.outcome.tolist() == [KEPT, KEPT, KEPT, REJECTED]
