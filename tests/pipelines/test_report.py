@@ -55,7 +55,7 @@ def result(number, gain, **changes):
         "test_rmse_dps_all": rmse, "mean_rmse_dps_all": 1e-3, "ceiling_rmse_dps_all": 0.43e-3,
         "accuracy_gain_pct_all": gain, "accuracy_gain_pct_all_lo": gain - 10,
         "accuracy_gain_pct_all_hi": gain + 10, "ceiling_accuracy_gain_pct_all": 57.0,
-        "ceiling_accuracy_gain_pct_all_hi": None,
+        "ceiling_accuracy_gain_pct_all_hi": None, "recording_s": 86.5,
     }  # fmt: skip
     return row | changes
 
@@ -156,8 +156,20 @@ def test_it_says_what_was_run(write):
 def test_measured_recordings_are_called_so(write):
     runs = [stored(number, simulated="0") for number in range(3)]
     content, _ = write("published", runs=runs)
-    assert dict(content["facts"])["Data"].startswith("Recordings measured on real sensors")
+    facts = dict(content["facts"])
+    assert facts["Data"].startswith("Recordings measured on real sensors")
+    assert facts["Recordings"] == "sparkfun: 86.5 s each"
     assert not content["simulated"]
+
+
+def test_what_a_page_has_said_it_does_not_say_again(write):
+    name = "augmentation.reporting.tables.multiple_gyroscopes"
+    content, _ = write(**{name: TABLE})
+    first, second = (item(content, "tables", f"{n} real gyroscopes") for n in ("Three", "Twelve"))
+    assert first["caption"].startswith("Windows of 10 s; S and A in percent")
+    assert second["caption"] == "To be read like “Three real gyroscopes”."
+    alone, _ = write(**{name: TABLE, "augmentation.reporting.tables.three_gyroscopes": ()})
+    assert item(alone, "tables", "Twelve real gyroscopes")["caption"] == first["caption"]
 
 
 def test_findings_are_counted(write):

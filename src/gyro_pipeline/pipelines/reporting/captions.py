@@ -11,13 +11,16 @@ class Caption:
 
     Attributes:
         title: A few words.
-        text: What is to be seen, for a reader who has not read the paper.
+        text: What is to be seen, for a reader who has not read the paper. The page says the same
+            text once.
         pipeline: What ``kedro run --pipeline=`` makes it.
+        section: Of the paper, where it has one like it.
     """
 
     title: str
     text: str
     pipeline: str
+    section: str = ""
 
 
 _SUMMARY = (
@@ -31,7 +34,6 @@ _ON_CURVE = (
     "95 % intervals, hollow ones the error that a published gain would mean on these data, bars "
     "the ceiling. Lower is better."
 )
-_ALIKE = "To be read like the figure of SparkFun with 3 real gyroscopes."
 _ESTIMATORS = (
     "Left: error over all windows. Right: the same relative to the running mean. Relatives share a "
     "colour, filled markers are the recommended estimators. The dashed line is the ceiling, on "
@@ -51,7 +53,6 @@ _UNSEEN = (
 )
 _TOLERANCE = "The band is the tolerance around the mean of the recording, which counts as truth."
 
-_FIRST = "To be read like that of SparkFun."
 _NAMES = {"sparkfun": "SparkFun", "dot": "DOT", "ng": "NG", "memsense": "Memsense"}
 
 
@@ -64,9 +65,9 @@ def _compared(kind: str) -> dict[str, Caption]:
         ("unseen_devices", "estimators on unseen devices", f" {_UNSEEN}"),
     ):
         text = _RATIOS.format(study=study) if kind == "tables" else _ESTIMATORS
-        for i, (sensor, name) in enumerate(_NAMES.items()):
-            title, read = f"{name}: {whose}, {what[kind]}", text + more if i == 0 else _FIRST
-            captions[f"{kind}/{study}_{sensor}"] = Caption(title, read, study)
+        for sensor, name in _NAMES.items():
+            title = f"{name}: {whose}, {what[kind]}"
+            captions[f"{kind}/{study}_{sensor}"] = Caption(title, text + more, study)
     return captions
 
 
@@ -88,8 +89,9 @@ CAPTIONS = {
         "Sensors: datasheets and recordings",
         "Datasheet values beside those found in the recordings: the root mean square over "
         "gyroscopes, with the smallest and the largest. N is the white noise: the mean of t "
-        "seconds scatters by N/√t. B is the bias instability. Paper, section IV-A.",
+        "seconds scatters by N/√t. B is the bias instability.",
         "reporting",
+        "IV-A",
     ),
     "tables/recording_quality": Caption(
         "Recordings: kept, repaired, rejected",
@@ -100,9 +102,9 @@ CAPTIONS = {
     ),
     "tables/dataset_hours": Caption(
         "Hours of the datasets",
-        "Training recordings count for every gyroscope, test recordings for the three of IMU 1. "
-        "Paper, section IV-A.",
+        "Training recordings count for every gyroscope, test recordings for the three of IMU 1.",
         "reporting",
+        "IV-A",
     ),
     "figures/real2real_saving_against_turn_on_spread": Caption(
         "What can be saved, against the turn-on spread",
@@ -114,49 +116,54 @@ CAPTIONS = {
     **_compared("figures"),
     "figures/input_channels_input_channels": Caption(
         "Method 1: more gyroscopes as input channels",
-        f"{_ON_CURVE} Paper, section IV-C.",
+        _ON_CURVE,
         "input_channels",
+        "IV-C",
     ),
     "figures/real2real_training_data": Caption(
         "Method 2: more gyroscopes as training data",
-        f"{_ON_CURVE} Paper, section IV-D.",
+        _ON_CURVE,
         "real2real",
+        "IV-D",
     ),
     "figures/real2real_gyroscopes_10s": Caption(
         "Method 2: error at 10 s against the number of gyroscopes",
-        "Left: all windows, the main result. Right: the paper's way. Lower is better. Paper, "
-        "section IV-D.",
+        "Left: all windows, the main result. Right: the paper's way. Lower is better.",
         "real2real",
+        "IV-D",
     ),
     "figures/augmentation_sparkfun_3_real": Caption(
         "SparkFun: 3 real gyroscopes and virtual ones",
-        f"{_ON_CURVE} Paper, section IV-E.",
+        _ON_CURVE,
         "augmentation",
+        "IV-E",
     ),
     "figures/augmentation_sparkfun_12_real": Caption(
         "SparkFun: 12 real gyroscopes and virtual ones",
-        f"{_ALIKE} Paper, section IV-E.",
+        _ON_CURVE,
         "augmentation",
+        "IV-E",
     ),
     "figures/augmentation_dot_3_real": Caption(
-        "DOT: 3 real gyroscopes and virtual ones", f"{_ALIKE} Paper, section IV-F.", "augmentation"
+        "DOT: 3 real gyroscopes and virtual ones", _ON_CURVE, "augmentation", "IV-F"
     ),
     "figures/augmentation_dot_12_real": Caption(
-        "DOT: 12 real gyroscopes and virtual ones", f"{_ALIKE} Paper, section IV-F.", "augmentation"
+        "DOT: 12 real gyroscopes and virtual ones", _ON_CURVE, "augmentation", "IV-F"
     ),
     "figures/running_average": Caption(
-        "Running average of one gyroscope", f"{_TOLERANCE} Paper, section II.", "reporting"
+        "Running average of one gyroscope", _TOLERANCE, "reporting", "II"
     ),
     "figures/calibrated_signal": Caption(
         "Raw and calibrated signal of the same gyroscope",
-        "Calibrated is the raw signal less the bias. Paper, section II.",
+        "Calibrated is the raw signal less the bias.",
         "reporting",
+        "II",
     ),
     "figures/mg_convergence": Caption(
         "Running average of several gyroscopes",
-        f"Each gyroscope is centred by its own bias before they are averaged. {_TOLERANCE} Paper, "
-        "section III-A.",
+        f"Each gyroscope is centred by its own bias before they are averaged. {_TOLERANCE}",
         "reporting",
+        "III-A",
     ),
     "figures/allan_deviation": Caption(
         "Allan deviation of every gyroscope",

@@ -60,14 +60,20 @@ def write_report(
     further = [place for place in folder if place not in known and not place.endswith(_LONG)]
     narrowed = ", ".join(f"{k}={v}" for k, v in only.model_dump(exclude_none=True).items())
 
+    first = dict[str, str]()  # what said a text first
+
     def items(places: Iterable[str]) -> list[dict[str, Any]]:
-        return [_item(place, shown, env) | {"earlier": place not in fresh} for place in places]
+        return [
+            _item(place, shown, env, first) | {"earlier": place not in fresh} for place in places
+        ]
 
     content = {
         "source": source,
         "smoke": "smoke" in source,
         "simulated": bool(used) and all(run.tags["simulated"] == "1" for run in used),
-        "facts": _facts(source, narrowed, used, known_sensors, sorted(set(elsewhere.source))),
+        "facts": _facts(
+            source, narrowed, used, known_sensors, results, sorted(set(elsewhere.source))
+        ),
         "tables": items(p for p in CAPTIONS if p.startswith("tables/")),
         "figures": items(p for p in CAPTIONS if p.startswith("figures/")),
         "results": items(whole),
@@ -121,6 +127,7 @@ def _facts(
     narrowed: str,
     runs: Sequence[StoredRun],
     sensors: Mapping[str, Sensor],
+    results: pd.DataFrame,
     elsewhere: Sequence[str],
 ) -> list[tuple[str, str]]:
     """What was run, in plain words."""
@@ -140,9 +147,10 @@ def _facts(
 
     used = {name: sensors[name] for name in sensors if name in {r.params["sensor"] for r in runs}}
     started = [datetime.fromtimestamp(run.started_ms / 1000, UTC) for run in runs]
+    simulated = all(run.tags["simulated"] == "1" for run in runs)
     facts = {
         "Data": _data(source, runs),
-        "Recordings": _recordings(used, all(run.tags["simulated"] == "1" for run in runs)),
+        "Recordings": _recordings(used) if simulated else _lengths(results),
         "Networks": f"{len(networks)} trained, of {of('epochs', trained)} epochs (the paper: 1200)",
         "Seeds": of("seed", trained),
         "Windows": f"{of('window_s', trained)} s",
@@ -172,10 +180,14 @@ def _data(source: str, runs: Iterable[StoredRun]) -> str:
     return f"Recordings measured on real sensors (source `{source}`)."
 
 
-def _recordings(sensors: Mapping[str, Sensor], simulated: bool) -> str:
-    """How many hours; of measured ones, the configuration does not know the number."""
-    if not simulated:
-        return ", ".join(f"{name}: {one.recording_s:g} s each" for name, one in sensors.items())
+def _lengths(results: pd.DataFrame) -> str:
+    """Of measured recordings, whose number and length the configuration does not know."""
+    lengths = results[results.missing.isna()].groupby("sensor", sort=False).recording_s.first()
+    return ", ".join(f"{name}: {length:.4g} s each" for name, length in lengths.items())
+
+
+def _recordings(sensors: Mapping[str, Sensor]) -> str:
+    """How many hours."""
     seconds = [
         len(AXES)
         * (one.imus * one.train_recordings + one.recordings - one.train_recordings)
@@ -203,18 +215,22 @@ def _code(runs: Sequence[StoredRun]) -> str:
     return f"commit {', '.join(sorted(commits))}; {'; '.join(sorted(versions))}"
 
 
-def _item(place: str, shown: Mapping[str, Part], env: str) -> dict[str, Any]:
+def _item(place: str, shown: Mapping[str, Part], env: str, first: dict[str, str]) -> dict[str, Any]:
     """A table or figure with its title, caption and the commands that make it."""
     caption = CAPTIONS.get(place) or FURTHER.get(place) or _plain_caption(place)
     part, gap = shown.get(place), shown.get(_gap(place))
     command = f"kedro run --pipeline={caption.pipeline}" if caption.pipeline else ""
     missing = gap if isinstance(gap, tuple) and 0 < len(gap) <= _FEW else (command,)
+    made = isinstance(part, pd.DataFrame | Path)
+    same = first.setdefault(caption.text, caption.title) if made else caption.title
+    text = caption.text if same == caption.title else f"To be read like “{same}”."
+    section = f" Paper, section {caption.section}." if caption.section else ""
     return {
         "anchor": place.replace("/", "-"),
         "title": caption.title,
-        "caption": caption.text,
+        "caption": text + section,
         "command": command and command + env,
-        "made": isinstance(part, pd.DataFrame | Path),
+        "made": made,
         "missing": [one + env for one in missing],
         "table": _narrow(part) if isinstance(part, pd.DataFrame) else None,
         "figure": part if isinstance(part, Path) else None,
