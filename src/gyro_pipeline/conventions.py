@@ -24,7 +24,7 @@ MDPS = 1e-3
 HOLD_OUT = -1
 """The ``fold`` of a run on the fixed hold-out split."""
 
-BY_RECORDING, LEAVE_ONE_DEVICE_OUT = "by_recording", "leave_one_device_out"
+LEAVE_ONE_DEVICE_OUT = "leave_one_device_out"
 """Protocols: recordings of the test IMU are held out, or every IMU in turn is an unseen device."""
 
 TRAIN, VALIDATION, TEST = "train", "validation", "test"

@@ -21,6 +21,13 @@ def recording(n=47, seed=0, true_bias=BIAS, offset=0.0, number=7):
     return truths.TestRecording(number, samples, RATE_HZ, FIGURES, true_bias)
 
 
+def error_table(one, size, estimates):
+    """Errors against all truths."""
+    stated = np.full(estimates.shape, np.nan)
+    known = one.truths(size).items()
+    return truths.stacked([truths.error_columns(one, *each, estimates, stated) for each in known])
+
+
 def brute_force(one, size):
     """Window means and each truth, one window and axis at a time."""
     n = one.samples.shape[1]
@@ -105,7 +112,7 @@ def test_error_table_by_hand():
     samples = np.array([[1.0, 3, 5, 7, 100], [0, 0, 0, 0, 5], [2, 2, 2, 2, 2]])
     one = truths.TestRecording(4, samples, 2.0, FIGURES, np.array([1.0, 1, 1]))
     estimates = np.array([[2.0, 0, 2], [6, 1, 3]])
-    table = truths.error_table(one, 2, estimates)
+    table = error_table(one, 2, estimates)
     assert table.recording.unique().tolist() == [4]
     shown = table.set_index(["truth", "window", "axis"])
     whole = 116 / 5
@@ -149,7 +156,7 @@ def test_the_curve_is_that_of_brute_force():
 @pytest.mark.parametrize("size", [9, 16, 47])
 def test_a_point_of_the_curve_lies_exactly_at_the_window(size):
     one = recording()
-    table = truths.error_table(one, size, one.window_sums(size) / size)
+    table = error_table(one, size, one.window_sums(size) / size)
     squares = table.error_dps[table.truth == PAPER] ** 2
     at_window = view(truths.running_mean_curve(one, size), PAPER, ALL).loc[size / RATE_HZ]
     assert at_window.sum_sq == pytest.approx(squares.sum(), rel=1e-12)
@@ -173,7 +180,7 @@ def test_a_constant_on_samples_and_truth_changes_no_error(constant, n, size, see
     one = recording(n, seed)
     shifted = recording(n, seed, true_bias=BIAS + constant, offset=constant)
     for make in (
-        lambda r: truths.error_table(r, size, r.window_sums(size) / size).error_dps,
+        lambda r: error_table(r, size, r.window_sums(size) / size).error_dps,
         lambda r: truths.running_mean_curve(r, size).sum_sq,
     ):
         np.testing.assert_allclose(make(shifted), make(one), atol=1e-8)

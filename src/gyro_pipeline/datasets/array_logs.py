@@ -32,14 +32,10 @@ class ArrayLogs(LogSource):
     files, never required. Samples are judged by the quality control, where they are read.
 
     Args:
-        sensor: Name of the sensor the files are of.
-        sensors: All sensors, as in ``conf/base/globals.yml``.
-        source: Where the logs come from, as stored paths name it.
-        path: Folder of the files.
+        sensor, sensors, source, path, metadata: As :class:`~.log_source.LogSource` takes them.
         files: Names of the files: ``{"train": name, "test": name}``, or ``{"all": name}``.
         axes_order: ``recording``, ``gyroscope`` and ``sample`` in the order of the files'
             axes; needed only where their shapes leave it open.
-        metadata: For other tools, such as Kedro-Viz.
 
     Raises:
         InputError: An unknown sensor, or an entry that is not as described here.

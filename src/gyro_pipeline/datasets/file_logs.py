@@ -37,10 +37,7 @@ class FileLogs(LogSource):
     """Lists the files of a folder that match a pattern, each one recording of one IMU.
 
     Args:
-        sensor: Name of the sensor the files are of.
-        sensors: All sensors, as in ``conf/base/globals.yml``.
-        source: Where the logs come from, as stored paths name it.
-        path: The folder.
+        sensor, sensors, source, path, metadata: As :class:`~.log_source.LogSource` takes them.
         pattern: Of the files' paths in the folder. ``{imu}`` and ``{recording}`` stand for their
             numbers; ``{imu:name}`` and ``{recording:name}`` for names, which are numbered in
             their order; ``*`` for anything but a slash. Without an IMU all files are of IMU 1;
@@ -49,7 +46,6 @@ class FileLogs(LogSource):
         cache: ``{"path": folder}`` for what was read of text files, so that an interrupted run
             goes on where it was; None: nothing is kept, and each file is read twice. (Kedro makes
             a ``path`` absolute.)
-        metadata: For other tools, such as Kedro-Viz.
 
     Raises:
         InputError: An unknown sensor, a pattern or reader options that are not usable.

@@ -34,15 +34,12 @@ class PublishedLogs(LogSource):
     """Array files that are fetched once, verified at every load, and read as any such files.
 
     Args:
-        sensor: Name of the sensor the files are of.
-        sensors: All sensors, as in ``conf/base/globals.yml``.
-        source: Where the logs come from, as stored paths name it.
+        sensor, sensors, source, path, metadata: As :class:`~.log_source.LogSource` takes them.
         address: Base address, to which the files' paths are relative.
         path: Local folder of the files. Those already there are verified, not fetched.
         files: ``remote`` (path below the address) and ``blob`` (git blob id) of each:
             ``{"train": …, "test": …}``, or ``{"all": …}``.
         axes_order: As :class:`~.array_logs.ArrayLogs` takes it.
-        metadata: For other tools, such as Kedro-Viz.
 
     Raises:
         InputError: An unknown sensor, or an entry that is not as described here.

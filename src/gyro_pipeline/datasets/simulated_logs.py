@@ -32,12 +32,8 @@ class SimulatedLogs(LogSource):
     is kept beside the logs and read with them.
 
     Args:
-        sensor: Name of the sensor to stand in for.
-        sensors: All sensors, as in ``conf/base/globals.yml``.
-        source: Where the logs come from, as stored paths name it.
-        path: Folder of the files.
+        sensor, sensors, source, path, metadata: As :class:`~.log_source.LogSource` takes them.
         seed: Of all draws, together with the sensor's name; 0 or more.
-        metadata: For other tools, such as Kedro-Viz.
 
     Raises:
         InputError: An unknown sensor, or an entry that is not usable.

@@ -103,8 +103,8 @@ def error_columns(
         sigma: The standard deviations that the estimator states, same shape; NaN for none.
 
     Returns:
-        Columns of an error table, see :func:`error_table`; several are put below one another by
-        :func:`stacked`.
+        Columns ``imu, recording, window, axis, truth, error_dps, truth_variance, sigma_dps``;
+        several such tables are put below one another by :func:`stacked`.
     """
     value, variance = known
     n = len(estimates)
@@ -123,22 +123,6 @@ def error_columns(
 def stacked(parts: Sequence[Columns]) -> pd.DataFrame:
     """Put columns below one another; much faster than making a table of each first."""
     return pd.DataFrame({name: np.concatenate([one[name] for one in parts]) for name in parts[0]})
-
-
-def error_table(recording: TestRecording, size: int, estimates: np.ndarray) -> pd.DataFrame:
-    """Errors of the estimates on one recording, a row per window, axis and truth.
-
-    Args:
-        recording: What was estimated.
-        size: Samples per window.
-        estimates: Shape (windows, 3), deg/s.
-
-    Returns:
-        Columns ``imu, recording, window, axis, truth, error_dps, truth_variance, sigma_dps``.
-    """
-    sigma = np.full(estimates.shape, np.nan)
-    truths = recording.truths(size).items()
-    return stacked([error_columns(recording, *truth, estimates, sigma) for truth in truths])
 
 
 def running_mean_curve(recording: TestRecording, size: int) -> pd.DataFrame:
