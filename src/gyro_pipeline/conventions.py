@@ -25,7 +25,7 @@ HOLD_OUT = -1
 """The ``fold`` of a run on the fixed hold-out split."""
 
 LEAVE_ONE_DEVICE_OUT = "leave_one_device_out"
-"""Protocols: recordings of the test IMU are held out, or every IMU in turn is an unseen device."""
+"""The ``protocol`` by which every IMU in turn is an unseen device; else recordings are held out."""
 
 TRAIN, VALIDATION, TEST = "train", "validation", "test"
 """The roles a recording can have. It has exactly one of them in each fold."""

@@ -34,7 +34,7 @@ class PublishedLogs(LogSource):
     """Array files that are fetched once, verified at every load, and read as any such files.
 
     Args:
-        sensor, sensors, source, path, metadata: As :class:`~.log_source.LogSource` takes them.
+        sensor, sensors, source, metadata: As :class:`~.log_source.LogSource` takes them.
         address: Base address, to which the files' paths are relative.
         path: Local folder of the files. Those already there are verified, not fetched.
         files: ``remote`` (path below the address) and ``blob`` (git blob id) of each:
