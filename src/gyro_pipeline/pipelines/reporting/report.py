@@ -222,8 +222,9 @@ def _item(place: str, shown: Mapping[str, Part], env: str, first: dict[str, str]
     command = f"kedro run --pipeline={caption.pipeline}" if caption.pipeline else ""
     missing = gap if isinstance(gap, tuple) and 0 < len(gap) <= _FEW else (command,)
     made = isinstance(part, pd.DataFrame | Path)
-    same = first.setdefault(caption.text, caption.title) if made else caption.title
-    text = caption.text if same == caption.title else f"To be read like “{same}”."
+    text = caption.text
+    if made and place in CAPTIONS and first.setdefault(text, caption.title) != caption.title:
+        text = f"To be read like “{first[text]}”."
     section = f" Paper, section {caption.section}." if caption.section else ""
     return {
         "anchor": place.replace("/", "-"),
