@@ -243,3 +243,13 @@ def test_files_that_cannot_be_used_and_binary_ones_are_not_kept(tmp_path, counte
     logs = file_logs(tmp_path, "{imu}.*", cache={"path": str(tmp_path / ".read")})
     assert [log is None for log in read_all(logs)] == [True, False]
     assert not (tmp_path / ".read").exists()
+
+
+def test_only_readings_are_tidied_away(tmp_path):
+    put(tmp_path, "1.csv")
+    logs = file_logs(tmp_path, "{imu}.csv", cache={"path": str(tmp_path)})
+    for name in ("mine.npy", "notes.txt", ".0123456789abcdef.1.reading", "gone.reading"):
+        (tmp_path / name).touch()
+    logs.load()
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"1.csv", "mine.npy", "notes.txt", ".0123456789abcdef.1.reading"}

@@ -269,6 +269,16 @@ def test_too_few_recordings_stop_and_the_rejected_ones_are_named(inspected, qual
     assert lines[-1] == "  and 2 more, in the table of their quality"
 
 
+def test_the_tested_imu_must_be_among_them(inspected, quality):
+    logs = {(2, number): Log(noise(number)) for number in range(1, 12)} | {
+        (1, 1): Log(np.zeros((9, 3)))
+    }
+    recordings, table = inspected(listed(logs))
+    with pytest.raises(InputError, match="dot: no recording of IMU 1, which is tested") as caught:
+        require_enough(recordings, table.reset_index(), quality)
+    assert "IMU 1 recording 1, 1_1.csv" in str(caught.value)
+
+
 def test_none_that_can_be_used_is_too_few_at_any_setting(inspected, quality):
     recordings, table = inspected(listed({(1, 1): Log(np.zeros((9, 3)))}))
     assert recordings.sizes == {"imu": 0, "recording": 0, "axis": 3, "sample": 0}

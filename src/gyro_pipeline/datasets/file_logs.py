@@ -27,6 +27,9 @@ _NAMED = 5
 _BINARY = {".npy", ".npz", ".mat", ".parquet"}
 """What is read as fast as anything that could be kept of it."""
 
+_KEPT = ".reading"
+"""Suffix of what is kept of a file; no logger's."""
+
 _HIDDEN = re.compile(r"(^|/)\.")
 _PART = re.compile(r"\{(imu|recording)(:name)?\}|(\*)")
 
@@ -133,7 +136,7 @@ class FileLogs(LogSource):
             if self._cache is not None and path.suffix.lower() not in _BINARY:
                 state = path.stat()
                 key = fingerprint([str(path), state.st_size, state.st_mtime_ns, settings])
-                kept_as = self._cache / f"{key}.npy"
+                kept_as = self._cache / f"{key}{_KEPT}"
             found[name] = Reading(path, self._options, self.entry.rate_hz, kept_as)
         return found
 
@@ -141,9 +144,10 @@ class FileLogs(LogSource):
         """Say what is there of an earlier run, and remove what is of other files."""
         if self._cache is None:
             return
-        there = set(self._cache.glob("*.npy"))
+        # the folder may hold other files, and the hidden ones that another process is writing
+        there = {path for path in self._cache.glob(f"*{_KEPT}") if not path.name.startswith(".")}
         for path in there.difference(wanted):
-            path.unlink()
+            path.unlink(missing_ok=True)
         before = len(there.intersection(wanted))
         if before:
             _LOG.info("%s: %d of %d files were read before", self._sensor, before, len(wanted))

@@ -10,7 +10,7 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyro_pipeline.conventions import AXES, DIMENSIONS, InputError
+from gyro_pipeline.conventions import AXES, DIMENSIONS, TEST_IMU, InputError
 from gyro_pipeline.fingerprints import data_hash
 from gyro_pipeline.learning.executors import run_jobs
 from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding, LogEntry, Logs
@@ -69,7 +69,7 @@ def require_enough(recordings: xr.Dataset, table: pd.DataFrame, quality: Quality
         The recordings.
 
     Raises:
-        InputError: Fewer than ``quality.needed_pct`` percent remain.
+        InputError: Fewer than ``quality.needed_pct`` percent remain, or none of the tested IMU.
     """
     sensor, rejected = recordings.attrs["sensor"], table[table.outcome == REJECTED]
     counts = Counter(table.outcome)
@@ -80,6 +80,11 @@ def require_enough(recordings: xr.Dataset, table: pd.DataFrame, quality: Quality
     )
     remain = len(table) - len(rejected)
     if 100 * remain >= quality.needed_pct * len(table):
+        if TEST_IMU in set(table.imu) and TEST_IMU not in recordings.imu:
+            raise InputError(
+                f"{sensor}: no recording of IMU {TEST_IMU}, which is tested, can be used. Repair "
+                "or remove them:\n  " + "\n  ".join(_named(rejected[rejected.imu == TEST_IMU]))
+            )
         return recordings
     raise InputError(
         f"{sensor}: {remain} of {len(table)} recordings can be used, quality.needed_pct asks for "
