@@ -2,8 +2,11 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
-from gyro_pipeline.logs import KEPT, REJECTED
+from gyro_pipeline.logs import REJECTED
 from gyro_pipeline.readers.timing import check_rate, from_counter, from_stamps
 
 N = 1000
@@ -65,7 +68,7 @@ def test_lost_samples_are_gaps_and_do_not_change_the_rate():
     assert timing.gap_rows.tolist() == [100, 498]
     assert timing.rate_hz == pytest.approx(200, rel=1e-12)
     assert checks(timing) == ["gaps"]
-    assert timing.findings[0].detail == "samples are missing, 0.025 s: 2 times, at rows 100, 498"
+    assert timing.findings[0].detail == "samples are missing, about 3: 2 times, at rows 100, 498"
 
 
 def test_many_lost_samples_are_no_bursts():
@@ -115,11 +118,80 @@ def test_counters_of_time_and_midnight_are_unwrapped(period, step, unit_s):
     assert timing.findings[0].detail.endswith("once, at row 500")
 
 
-@pytest.mark.parametrize("stamps", [np.zeros(9), np.full(9, np.nan), np.arange(9.0)[::-1]])
+@pytest.mark.parametrize("stamps", [np.zeros(9), np.full(9, np.nan)])
 def test_stamps_that_do_not_advance_give_no_rate(stamps):
     timing = from_stamps(stamps, 1.0)
     assert timing.rate_hz is None
-    assert [f.outcome for f in timing.findings] == [KEPT]
+    assert checks(timing) == ["timestamps"]
+    assert not len(timing.gap_rows)
+
+
+def test_decreasing_stamps_are_a_gap_each_and_give_no_rate():
+    timing = from_stamps(np.arange(9.0)[::-1], 1.0)
+    assert timing.rate_hz is None
+    assert checks(timing) == ["time order", "timestamps"]
+    assert timing.gap_rows.tolist() == list(range(1, 9))
+
+
+def test_stamps_of_an_unknown_unit_give_gaps_and_order_but_no_rate():
+    timing = from_stamps(np.delete(np.r_[np.arange(600), np.arange(400)], 100) * 7.0, None)
+    assert timing.rate_hz is None
+    assert timing.gap_rows.tolist() == [100, 599]
+    even = from_stamps(np.arange(N) * 7.0, None)
+    assert (even.rate_hz, even.findings, len(even.gap_rows)) == (None, (), 0)
+
+
+@pytest.mark.parametrize(("rate", "digits"), [(100, 2), (1000, 3), (50, 2), (50, 3), (10, 1)])
+def test_samples_lost_at_random_are_seen_where_the_step_is_the_resolution(rate, digits):
+    rows = np.sort(rng().choice(np.arange(1, 12 * N - 1), 12, replace=False))
+    timing = from_stamps(np.round(np.delete(np.arange(12 * N), rows) / rate, digits), 1.0)
+    np.testing.assert_array_equal(timing.gap_rows, rows - np.arange(12))
+    assert timing.rate_hz == pytest.approx(rate, rel=1e-9)
+
+
+def test_a_long_step_that_rounding_explains_as_well_as_a_loss_is_said_and_no_gap():
+    lost = from_stamps(np.round(np.delete(np.arange(N), 500) / 100, 2), 1.0)
+    assert not len(lost.gap_rows)
+    assert checks(lost) == ["timestamps"]
+    assert lost.findings[0].detail.endswith("the rounding of timestamps: once, at row 500")
+    slow = from_stamps(np.floor((np.arange(N) + 0.005) / 99.9 * 100) / 100, 1.0)
+    assert checks(slow) == ["timestamps"]
+    assert not len(slow.gap_rows)
+
+
+@pytest.mark.parametrize(("rate", "tick"), [(100, 1 / 64), (50, 1 / 64), (98, 0.01), (48, 0.01)])
+def test_regularly_longer_steps_are_the_ticks_of_a_clock(rate, tick):
+    timing = from_stamps(np.floor(np.arange(12 * N) / rate / tick) * tick, 1.0)
+    assert not len(timing.gap_rows)
+    assert timing.rate_hz == pytest.approx(rate, rel=1e-3)
+
+
+@pytest.mark.parametrize(("rate", "unit"), [(100, 0.1), (97, 0.1), (100, 1.0), (250, 1.0)])
+def test_several_rows_a_stamp_in_floats_give_the_rate_and_no_gaps(rate, unit):
+    stamps = 1e4 + np.floor(np.arange(6000) / rate / unit + 1e-9) * unit
+    timing = from_stamps(stamps, 1.0)
+    assert timing.rate_hz == pytest.approx(rate, rel=1e-3)
+    assert not len(timing.gap_rows)
+    assert checks(timing) == ["timestamps"]
+
+
+@pytest.mark.parametrize("scatter", [0.1, 0.15])
+def test_late_stamps_are_no_gaps_and_lost_samples_among_them_are(scatter):
+    stamps = np.arange(12 * N) + np.clip(rng().normal(0, scatter, 12 * N), -0.45, 0.45)
+    timing = from_stamps(stamps / 100, 1.0)
+    assert not len(timing.gap_rows)
+    assert timing.rate_hz == pytest.approx(100, rel=1e-3)
+    cut = from_stamps(np.delete(stamps, [4000, 4001, 9000, 9001]) / 100, 1.0)
+    assert cut.gap_rows.tolist() == [4000, 8998]
+
+
+def test_a_writer_that_stalls_and_catches_up_loses_nothing():
+    stamps = np.arange(N) / 120.0
+    for at in (200, 600):
+        stamps[at : at + 40] = stamps[at + 40]
+    timing = from_stamps(stamps, 1.0)
+    assert not len(timing.gap_rows)
+    assert timing.rate_hz == pytest.approx(120, rel=1e-9)
 
 
 @pytest.mark.parametrize("bits", [8, 16])
@@ -159,3 +231,18 @@ def test_another_rate_is_rejected_with_advice(rate, advice):
     (finding,) = check_rate(rate, 120, 2.0)
     assert finding.outcome == REJECTED
     assert advice in finding.detail
+
+
+STAMPS = st.one_of(
+    arrays(float, st.integers(2, 40), elements=st.sampled_from([0.0, 0.01, 0.02, 0.1, 1.0, 500])),
+    arrays(float, st.integers(2, 40), elements=st.one_of(st.integers(0, 60), st.just(np.nan))),
+)
+
+
+@pytest.mark.filterwarnings("error")
+@given(steps=STAMPS, in_order=st.booleans())
+def test_any_stamps_give_gaps_among_the_rows_and_a_rate_or_none(steps, in_order):
+    timing = from_stamps(np.cumsum(np.nan_to_num(steps)) + 0 * steps if in_order else steps, 1.0)
+    assert (np.diff(timing.gap_rows) > 0).all()
+    assert set(timing.gap_rows.tolist()) <= set(range(1, len(steps)))
+    assert timing.rate_hz is None or 0 < timing.rate_hz < np.inf

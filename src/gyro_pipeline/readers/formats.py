@@ -34,17 +34,17 @@ class Layout:
         rates: Angular rates about x, y, z.
         scale_dps: deg/s in one unit of them.
         time: Timestamps.
-        time_s: Seconds in one unit of them.
+        time_s: Seconds in one unit of them; None: not known.
         temperature: Degrees Celsius.
         counter: Packets, one more each row.
         counter_bits: The counter starts anew after ``2**counter_bits``.
-        findings: What could not be used.
+        findings: What the header does not say.
     """
 
     rates: tuple[int, ...]
     scale_dps: float
     time: int | None
-    time_s: float
+    time_s: float | None
     temperature: int | None
     counter: int | None
     counter_bits: int
@@ -105,7 +105,7 @@ class Reader:
         return Layout(
             rates=rates,
             scale_dps=self._scale([names[n] for n in rates], options, where),
-            time=None if findings else time,
+            time=time,
             time_s=time_s,
             temperature=number(options.temperature_column, self.temperature_column(table)),
             counter=number(options.counter_column, self._if_there(table, self.counter)),
@@ -145,10 +145,10 @@ class Reader:
 
     def _time_unit(
         self, table: Table, time: int | None, options: ReaderOptions, where: str
-    ) -> tuple[float, tuple[Finding, ...]]:
-        """Seconds in one unit of the timestamps; a finding if there are none to use."""
+    ) -> tuple[float | None, tuple[Finding, ...]]:
+        """Seconds in one unit of the timestamps; a finding if that cannot be said."""
         if time is None:
-            return 1.0, (Finding("timestamps", KEPT, "no time column: the rate is not checked"),)
+            return None, (Finding("timestamps", KEPT, "no time column: the rate is not checked"),)
         if time in table.in_seconds:
             return 1.0, ()
         header = table.names[time]
@@ -170,8 +170,8 @@ class Reader:
             raise InputError(
                 f"{where}: {header!r} has no unit; give time_units: {', '.join(SECONDS)}"
             )
-        text = f"{header!r} has no unit and is not used; give time_units to have the rate checked"
-        return 1.0, (Finding("timestamps", KEPT, text),)
+        text = f"{header!r} has no unit; give time_units to have the rate checked"
+        return None, (Finding("timestamps", KEPT, text),)
 
 
 class MovellaDot(Reader):

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from gyro_pipeline.logs import KEPT, REJECTED, Finding
@@ -10,14 +11,27 @@ from gyro_pipeline.logs import KEPT, REJECTED, Finding
 _DAY_S = 86_400.0
 _PERIODS = (2.0**16, 2.0**24, 2.0**32)  # of counters of microseconds, milliseconds or ticks
 
-_SHORT = 0.05
-"""A larger share of steps far below the median: the stamps are a host's, and come in bursts."""
+_SHORT = 0.1
+"""A larger share of steps is far below the median: stamps come in bursts."""
 
 _LONG, _LONG_TIME = 0.005, 0.5
 """The same, if a larger share is far above it, and makes up more of the time than this."""
 
-_BURST = 3.0
-"""From burst to burst, a step longer than so many times the 95th percentile is a gap."""
+_HOLE = 3.0
+"""A step so many times longer than those from burst to burst is none of them."""
+
+_REGULAR, _MOST = 0.25, 0.75
+"""Rounding lengthens steps at intervals of which most differ by less than this; losses come at
+random ones."""
+
+_FEW, _MANY = 3, 10
+"""Long steps that it takes to tell: of stamps as coarse as the step, and of others."""
+
+_AHEAD = 1000
+"""Rows within which a stamp that was written late is followed by one in time."""
+
+_ROUNDS = 4
+"""How often gaps are found from the step between samples, and that without the gaps."""
 
 _JITTER = 0.1
 """Scatter of the steps, relative to their mean, that is worth a word."""
@@ -42,93 +56,161 @@ class _Steps:
 
     Attributes:
         rows: (k,), of the later stamp.
-        lost: (k,), rows without a stamp in between.
+        counts: (k,), rows from the earlier one to it: 1, or more where rows have no stamp.
         steps: (k,), wraps of a counter undone.
         wraps: (k,), where.
-        median: Of the steps; NaN if there are none.
-        resolution: Decimal unit that all stamps are multiples of; 0 if small beside the steps.
     """
 
     rows: Rows
-    lost: Rows
+    counts: Rows
     steps: Floats
     wraps: Mask
-    median: float
-    resolution: float
 
     @classmethod
-    def between(cls, stamps: Floats, unit_s: float) -> "_Steps":
+    def between(cls, stamps: Floats, unit_s: float | None) -> "_Steps":
         rows = np.flatnonzero(np.isfinite(stamps))
         steps, wraps = _unwrapped(np.diff(stamps[rows]), unit_s)
-        median = float(np.median(steps)) if len(steps) else np.nan
-        resolution = _resolution(stamps[rows], median) if len(steps) else 0.0
-        return cls(rows[1:], np.diff(rows) - 1, steps, wraps, median, resolution)
+        return cls(rows[1:], np.diff(rows), steps, wraps)
 
-    def near_median(self) -> Mask:
-        """Steps within half of the median step, and the resolution, of it."""
-        away = np.abs(self.steps - self.median * (1 + self.lost))
-        return away <= self.median / 2 + self.resolution
+    def per_row(self, where: Mask) -> float:
+        """Mean of those steps, for each row."""
+        return float(self.steps[where].sum() / self.counts[where].sum())
 
-    def are_bursts(self, far: Mask) -> bool:
-        """Whether many steps are far from the median: within bursts short, between them long."""
-        if not far.any():
-            return False
-        forward = np.maximum(self.steps, 0)
-        far = far & (self.steps >= 0)
-        long = far & (forward > self.median)
-        lasts = forward[long].sum() > _LONG_TIME * forward.sum()
-        return bool((far & ~long).mean() > _SHORT or (lasts and long.mean() > _LONG))
+    def delays(self, step: float) -> Floats:
+        """How much later than the stamp before one lets expect it and all that follow are.
 
-    def within_bursts(self) -> Mask:
-        """Steps within bursts, and between them unless they are too long."""
-        forward = self.steps[self.steps >= 0]
-        between = forward[forward > forward.mean()]
-        limit = _BURST * np.quantile(between, 0.95) if len(between) else forward.max()
-        return (self.steps >= 0) & (self.steps <= limit)
+        A missing sample makes all later stamps late. One that was written late is followed by
+        others in time, and a burst ends in time.
+        """
+        late = np.where(self.steps < 0, 0.0, self.steps - step * self.counts)
+        total = np.cumsum(late)
+        least = pd.Series(total[::-1]).rolling(_AHEAD, min_periods=1).min().to_numpy()[::-1]
+        return least - (total - late)
 
 
-def from_stamps(stamps: Floats, unit_s: float) -> Timing:
+def from_stamps(stamps: Floats, unit_s: float | None) -> Timing:
     """Sample rate and gaps from timestamps.
 
-    The rate is one over the mean of the ordinary steps. Even stamps: those within half of the
-    median step, so that gaps do not count. Stamps of a host come in bursts; ordinary are then all
-    steps that are not too long, which makes the rate the count over the duration.
+    Stamps may be rounded, and written late, one by one or in bursts. The rate is the count of
+    samples over the duration, without the gaps.
 
     Args:
         stamps: (n,), one a row; NaN where a row has none.
-        unit_s: Seconds in one unit of them.
+        unit_s: Seconds in one unit of them; None: not known, and no rate.
 
     Returns:
-        Rows behind a missing sample or a step back in time are gaps.
+        Rows behind missing samples, which make all later stamps late, and those at which time goes
+        back are gaps. What is missing within a burst, or the resolution of stamps, is not seen.
     """
     every = np.diff(stamps)
     if len(every) and every.min() > 0 and np.ptp(every) <= _JITTER * every.mean():
-        return Timing(float(1 / (every.mean() * unit_s)))  # as most are: there is nothing to find
+        return Timing(_rate(every.mean(), unit_s))  # as most are: there is nothing to find
     found = _Steps.between(stamps, unit_s)
-    steps = found.steps
+    steps, back = found.steps, found.steps < 0
+    findings = [
+        *_at("wrap-around", found.rows[found.wraps], "the counter of the timestamps starts anew"),
+        *_at("time order", found.rows[back], "time goes back"),
+    ]
     if not (steps > 0).any():
         text = "timestamps do not advance: the rate is not measured"
-        return Timing(findings=(Finding("timestamps", KEPT, text),))
-    ordinary = found.near_median()
-    if bursty := found.are_bursts(~ordinary):
-        ordinary = found.within_bursts()
-    step = steps[ordinary].sum() / (1 + found.lost[ordinary]).sum()
-    back, gaps = steps < 0, (steps > step) & ~ordinary
-    scatter = np.std(steps[ordinary & (found.lost == 0)])
-    findings = [
-        *_at("wrap-around", found, found.wraps, "the counter of the timestamps starts anew"),
-        *_at("time order", found, back, "time goes back"),
-        *_at("gaps", found, gaps, f"samples are missing, {steps[gaps].sum() * unit_s:.4g} s"),
-    ]
-    if bursty or found.resolution > 1.5 * step:
-        text = "timestamps are coarse or come in bursts: the rate is the count over the duration"
         findings.append(Finding("timestamps", KEPT, text))
-    elif found.resolution < step / 2:
-        findings += _at("duplicated timestamps", found, steps == 0, "a timestamp repeats")
-    if not bursty and scatter > max(_JITTER * step, found.resolution):
-        text = f"steps of {step * unit_s * 1e3:.4g} ms scatter by {scatter * unit_s * 1e3:.4g} ms"
+        return Timing(gap_rows=found.rows[back], findings=tuple(findings))
+    clock = _Clock.of(found, stamps[np.isfinite(stamps)])
+    step, gaps, missing = _gaps(found, clock)
+    findings += _at("gaps", found.rows[gaps], f"samples are missing, about {missing}")
+    findings += _irregular(found, step, clock, gaps | back)
+    return Timing(_rate(step, unit_s), found.rows[back | gaps], tuple(findings))
+
+
+@dataclass(frozen=True)
+class _Clock:
+    """How stamps are written.
+
+    Attributes:
+        step: From sample to sample, about.
+        coarseness: Delays up to this are rounding, or within a burst.
+        in_bursts: Whether stamps come in bursts, as those do that are rounded to several steps.
+        counted: (k,), steps whose mean is taken: between two ends of bursts, or those from row to
+            row and ordinary ones over a row without a stamp, which may be no sample.
+    """
+
+    step: float
+    coarseness: float
+    in_bursts: bool
+    counted: Mask
+
+    @classmethod
+    def of(cls, found: _Steps, stamps: Floats) -> "_Clock":
+        steps, forward = found.steps, found.steps >= 0
+        median = max(float(np.quantile(steps, 0.5, method="lower")), 0.0)
+        usual = median * found.counts
+        long = steps > 1.5 * usual
+
+        # steps that rounding makes one unit longer, or losses of single samples
+        resolution = _resolution(stamps, median)
+        coarse = resolution >= median / 2
+        double = long & (steps < 2.01 * usual)
+        rows = found.rows[double & (found.delays(median) > median / 2)]
+        regular = len(rows) >= (_FEW if coarse else _MANY) and _at_regular_intervals(rows)
+        if coarse and len(rows) >= _FEW and not regular:
+            resolution = 0.0  # of an exact clock, whose step it is
+
+        short = forward & (steps < usual / 2 - resolution)
+        many = median == 0 or long.mean() > _LONG
+        lasts = steps[long].sum() > _LONG_TIME * steps[forward].sum()
+        if regular or short.mean() > _SHORT or (many and lasts):
+            between = double if regular else steps >= steps[forward].mean()
+            burst = float(np.quantile(steps[between], 0.95))
+            ends = np.flatnonzero(between)
+            counted = np.ones(len(steps), bool)
+            counted[: ends[0] + 1] = counted[ends[-1] + 1 :] = len(ends) == 1
+            ordinary = forward & (steps <= _HOLE * burst)
+            return cls(found.per_row(ordinary & counted), burst, True, counted)
+
+        ordinary = forward & (np.abs(steps - usual) <= usual / 2 + resolution)
+        return cls(found.per_row(ordinary), resolution, False, ordinary | (found.counts == 1))
+
+
+def _gaps(found: _Steps, clock: _Clock) -> tuple[float, Mask, int]:
+    """The step from sample to sample, behind which steps samples are missing, and how many."""
+    steps, step = found.steps, clock.step
+    gaps, delays = steps < 0, steps
+    for _ in range(_ROUNDS):
+        delays = found.delays(step)
+        gaps = delays > max(step / 2, clock.coarseness * (1 + 1e-6))  # differences are rounded
+        stalls = (steps > 1.5 * step) & ~gaps
+        twice = (steps == 0) & (clock.coarseness < step / 2) & ~stalls.any()  # one row too many
+        step = found.per_row(clock.counted & (steps >= 0) & ~gaps & ~twice)
+    return step, gaps, max(round(delays[gaps].sum() / step), 1)
+
+
+def _at_regular_intervals(rows: Rows) -> bool:
+    intervals = np.diff(rows)
+    median = np.median(intervals)
+    return bool((np.abs(intervals - median) <= 1 + _REGULAR * median).mean() >= _MOST)
+
+
+def _irregular(found: _Steps, step: float, clock: _Clock, apart: Mask) -> list[Finding]:
+    """What is worth a word about steps other than those that are gaps or go back."""
+    if clock.in_bursts:
+        text = "timestamps are coarse or come in bursts: the rate is the count over the duration"
+        return [Finding("timestamps", KEPT, text)]
+    steps, rows = found.steps, found.rows
+    if clock.coarseness > step / 2:
+        longer = ~apart & (steps > (np.median(steps) + clock.coarseness / 2) * found.counts)
+        text = "a step is longer, for a lost sample or the rounding of timestamps"
+        return _at("timestamps", rows[longer], text)
+    findings = _at("duplicated timestamps", rows[steps == 0], "a timestamp repeats")
+    even = steps[(steps > 0) & ~apart & (found.counts == 1)]
+    scatter = np.std(even) / step if len(even) else 0.0
+    if scatter > max(_JITTER, clock.coarseness / step):
+        text = f"steps scatter by {scatter:.0%} of their mean"
         findings.append(Finding("jitter", KEPT, text))
-    return Timing(float(1 / (step * unit_s)), found.rows[back | gaps], tuple(findings))
+    return findings
+
+
+def _rate(step: float, unit_s: float | None) -> float | None:
+    return None if unit_s is None else float(1 / (step * unit_s))
 
 
 def from_counter(counts: Floats, bits: int) -> Timing:
@@ -143,15 +225,15 @@ def from_counter(counts: Floats, bits: int) -> Timing:
     """
     if (np.diff(counts) == 1).all():  # as most are
         return Timing()
-    found = _Steps.between(counts, 1.0)
-    raw = np.diff(counts[np.isfinite(counts)])
-    broken = np.mod(raw - 1 - found.lost, 2.0**bits) != 0
-    wraps = ~broken & (raw < 0)
+    there = np.flatnonzero(np.isfinite(counts))
+    rows, steps = there[1:], np.diff(counts[there])
+    broken = np.mod(steps - np.diff(there), 2.0**bits) != 0
+    wraps = ~broken & (steps < 0)
     return Timing(
-        gap_rows=found.rows[broken],
+        gap_rows=rows[broken],
         findings=(
-            *_at("wrap-around", found, wraps, f"the {bits}-bit packet counter starts anew"),
-            *_at("packet counter", found, broken, "the packet counter does not go on by one"),
+            *_at("wrap-around", rows[wraps], f"the {bits}-bit packet counter starts anew"),
+            *_at("packet counter", rows[broken], "the packet counter does not go on by one"),
         ),
     )
 
@@ -172,7 +254,7 @@ def check_rate(rate_hz: float, expected_hz: float, tolerance_pct: float) -> tupl
     return (Finding("sample rate", REJECTED, text),)
 
 
-def _unwrapped(steps: Floats, unit_s: float) -> tuple[Floats, Mask]:
+def _unwrapped(steps: Floats, unit_s: float | None) -> tuple[Floats, Mask]:
     """Steps without wraps, and where those are: a step back that a period makes an ordinary one.
 
     Periods are those of counters of 16, 24 and 32 bits, and a day.
@@ -181,7 +263,8 @@ def _unwrapped(steps: Floats, unit_s: float) -> tuple[Floats, Mask]:
     if not (steps < 0).any():
         return steps, wraps
     ordinary = np.median(steps)
-    for period in (*_PERIODS, _DAY_S / unit_s):
+    day = [] if unit_s is None else [_DAY_S / unit_s]
+    for period in [*_PERIODS, *day]:
         found = (steps < 0) & (np.abs(steps + period - ordinary) <= ordinary)
         steps = np.where(found, steps + period, steps)
         wraps |= found
@@ -199,9 +282,8 @@ def _resolution(stamps: Floats, step: float) -> float:
     return 0.0
 
 
-def _at(check: str, found: _Steps, where: Mask, what: str) -> list[Finding]:
+def _at(check: str, rows: Rows, what: str) -> list[Finding]:
     """A KEPT finding of how often something is so, and where first; none if it never is."""
-    rows = found.rows[where]
     if not len(rows):
         return []
     shown = ", ".join(map(str, rows[:3])) + (", …" if len(rows) > len(rows[:3]) else "")
