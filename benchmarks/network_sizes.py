@@ -19,7 +19,7 @@ from kedro.framework.session import KedroSession
 from kedro.framework.startup import bootstrap_project
 
 from gyro_pipeline.conventions import HOLD_OUT
-from gyro_pipeline.learning.executors import run_jobs
+from gyro_pipeline.executors import run_jobs
 from gyro_pipeline.learning.jobs import TrainingJob, run_training
 from gyro_pipeline.parameters import Parameters
 from gyro_pipeline.pipelines.training.nodes import Devices

@@ -43,9 +43,9 @@ from torch.utils.data import DataLoader, Sampler, TensorDataset
 
 from gyro_pipeline.conventions import AXES, DIMENSIONS, TEST, TRAIN
 from gyro_pipeline.datasets.recordings import Recordings
+from gyro_pipeline.executors import available_cores, run_jobs
 from gyro_pipeline.learning import fused
 from gyro_pipeline.learning.examples import Device, Examples
-from gyro_pipeline.learning.executors import available_cores, run_jobs
 from gyro_pipeline.learning.fused import FusedEngine
 from gyro_pipeline.learning.jobs import (
     TrainingJob,

@@ -17,6 +17,7 @@ ALLOWED = {
     "conventions": set(),
     "fingerprints": set(),
     "parameters": {"conventions"},
+    "executors": {"parameters"},
     "studies": {"conventions", "parameters"},
     "logs": {"conventions"},
     "readers": {"conventions", "logs", "parameters"},
@@ -24,7 +25,7 @@ ALLOWED = {
     "physics": {"conventions"},
     "estimators": {"conventions", "learning", "physics"},
     "protocol": {"conventions", "logs", "parameters", "physics"},
-    "learning": {"conventions", "parameters", "protocol"},
+    "learning": {"conventions", "executors", "parameters", "protocol"},
     "datasets": {
         "conventions",
         "parameters",
@@ -38,6 +39,7 @@ ALLOWED = {
         f"pipelines.{stage}": {
             "conventions",
             "estimators",
+            "executors",
             "fingerprints",
             "learning",
             "logs",

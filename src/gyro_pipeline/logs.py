@@ -43,7 +43,7 @@ class Log:
             infinity.
         rate_hz: Measured from timestamps; None where there are none.
         gap_rows: Rows before which samples are missing or out of order, increasing; a stretch
-            between two of them is gap-free.
+            between two of them is gap-free. Findings say why.
         temperature_c: (n,), degrees Celsius; None where the file has none.
         findings: Of the reading.
     """

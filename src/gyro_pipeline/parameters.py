@@ -130,8 +130,8 @@ class Quality(Parameter):
     least_share: float = Field(
         gt=0,
         le=1,
-        description="of a recording's rows, in the stretch that is kept of it: all of a sensor's "
-        "recordings are cut to the shortest one",
+        description="of a recording's rows, in the stretch that is kept of it, where all of a "
+        "sensor's recordings are cut to the shortest one (length_s: null)",
     )
     false_alarm: float = Field(
         gt=0, lt=0.5, description="probability of an alarm, for each check of a recording at rest"
@@ -153,7 +153,10 @@ class Quality(Parameter):
         "rejected, seconds; null: to the shortest one that is kept",
     )
     needed_pct: float = Field(
-        90.0, gt=0, le=100, description="of a sensor's recordings that must remain, percent"
+        90.0,
+        gt=0,
+        le=100,
+        description="of a sensor's recordings that must remain, and of the tested IMU's, percent",
     )
 
     @model_validator(mode="after")

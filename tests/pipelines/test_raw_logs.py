@@ -274,9 +274,18 @@ def test_the_tested_imu_must_be_among_them(inspected, quality):
         (1, 1): Log(np.zeros((9, 3)))
     }
     recordings, table = inspected(listed(logs))
-    with pytest.raises(InputError, match="dot: no recording of IMU 1, which is tested") as caught:
+    with pytest.raises(InputError, match="dot, the tested IMU 1: 0 of 1 recordings") as caught:
         require_enough(recordings, table.reset_index(), quality)
     assert "IMU 1 recording 1, 1_1.csv" in str(caught.value)
+
+
+def test_an_imu_of_which_nothing_is_left_is_named(inspected, quality, caplog):
+    logs = {(1, number): Log(noise(number)) for number in range(1, 12)} | {
+        (2, 1): Log(np.zeros((9, 3)))
+    }
+    recordings, table = inspected(listed(logs))
+    assert require_enough(recordings, table.reset_index(), quality) is recordings
+    assert caplog.messages[-1] == "dot: no recording is left of IMU 2"
 
 
 def test_none_that_can_be_used_is_too_few_at_any_setting(inspected, quality):

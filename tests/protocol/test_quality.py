@@ -76,6 +76,10 @@ def warming(rates):
     rates[:, 1] += warm_up(0.5, 20, ROWS, RATE_HZ)
 
 
+def interleaved(rates):
+    rates[1::2] += [0.0, 0.0, 0.8 * SIGMA]
+
+
 def rounded(step):
     def change(rates):
         rates[:] = step * np.round(rates / step)
@@ -100,6 +104,7 @@ def test_a_sound_recording_is_kept_whole_without_a_finding(samples, quality):
         (rotating, {"motion": REJECTED}, None),
         (shaken, {"motion": REJECTED}, None),
         (carried, {"motion": REJECTED}, None),
+        (interleaved, {"alternating rows": REJECTED}, None),
         (warming, {"warm-up drift": KEPT}, (0, ROWS)),
         (rounded(0.3 * SIGMA), {}, (0, ROWS)),
         (rounded(1.3 * SIGMA), {"coarse quantisation": KEPT}, (0, ROWS)),
@@ -157,11 +162,19 @@ def test_the_least_length_itself_is_kept(samples, quality):
 
 
 def test_the_longest_stretch_between_gaps_is_kept(samples, quality):
-    inspected = inspect(Log(samples, gap_rows=np.array([500, 5700])), RATE_HZ, quality)
+    said = Finding("gaps", REPAIRED, "samples are missing")
+    log = Log(samples, gap_rows=np.array([500, 5700]), findings=(said,))
+    inspected = inspect(log, RATE_HZ, quality)
     assert (inspected.outcome, inspected.start, inspected.stop) == (REPAIRED, 500, 5700)
-    assert detail(inspected, "gaps") == (
-        "samples are missing or out of order before 2 rows from 500 to 5700"
-    )
+    assert inspected.findings == (said,)
+
+
+def test_where_a_length_is_stated_no_share_of_the_recording_is_asked_for(samples, quality):
+    asked = quality.model_copy(update={"length_s": 12.0})
+    log = Log(samples, gap_rows=np.array([1500, 3000]))
+    assert inspect(log, RATE_HZ, quality).outcome == REJECTED
+    inspected = inspect(log, RATE_HZ, asked)
+    assert (inspected.outcome, inspected.start, inspected.stop) == (KEPT, 3000, ROWS)
 
 
 @pytest.mark.parametrize(("share", "outcome"), [(0.8, REJECTED), (0.5, REPAIRED)])

@@ -133,7 +133,7 @@ def npy(array):
 RAD = {"units": "rad/s"}
 UNREADABLE = ("unreadable rows", "repaired")
 CUT = ("end of file", "repaired")
-BACK = ("time order", "kept")
+BACK = ("time order", "repaired")
 BUT_LAST = slice(0, 59)
 
 CASES = {
@@ -235,7 +235,7 @@ CASES = {
     "a row is missing": (
         ANGLES,
         no_row(30),
-        Read([*range(30), *range(31, 60)], findings=(("gaps", "kept"),), gaps=(30,)),
+        Read([*range(30), *range(31, 60)], findings=(("gaps", "repaired"),), gaps=(30,)),
     ),
     "a packet is missing, time is smooth": (
         DOT,
@@ -245,7 +245,7 @@ CASES = {
                 + [f"{int(line.split(',')[0]) + 1},{line.split(',', 1)[1]}" for line in t[30:]]
             )
         ),
-        Read(findings=(("packet counter", "kept"),), gaps=(25,), rate_hz=120.0048),
+        Read(findings=(("packet counter", "repaired"),), gaps=(25,), rate_hz=120.0048),
     ),
     "a row is twice": (
         ANGLES,
@@ -262,7 +262,7 @@ CASES = {
         lines(lambda t: [*t[:30], t[31], t[30], *t[32:]]),
         Read(
             [*range(29), 30, 29, *range(31, 60)],
-            findings=(BACK, ("gaps", "kept")),
+            findings=(BACK, ("gaps", "repaired")),
             gaps=(29, 30, 31),
         ),
     ),

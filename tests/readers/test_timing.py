@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from gyro_pipeline.logs import REJECTED
+from gyro_pipeline.logs import REJECTED, REPAIRED
 from gyro_pipeline.readers.timing import check_rate, from_counter, from_stamps
 
 N = 1000
@@ -68,7 +68,10 @@ def test_lost_samples_are_gaps_and_do_not_change_the_rate():
     assert timing.gap_rows.tolist() == [100, 498]
     assert timing.rate_hz == pytest.approx(200, rel=1e-12)
     assert checks(timing) == ["gaps"]
-    assert timing.findings[0].detail == "samples are missing, about 3: 2 times, at rows 100, 498"
+    assert timing.findings[0].outcome == REPAIRED
+    assert timing.findings[0].detail == (
+        "samples are missing, about 3: 2 times, at rows 100, 498, cut there"
+    )
 
 
 def test_many_lost_samples_are_no_bursts():

@@ -9,10 +9,10 @@ from itertools import groupby
 import psutil
 import torch
 
+from gyro_pipeline.executors import run_batches, run_jobs
 from gyro_pipeline.learning import batched, fused
 from gyro_pipeline.learning.batched import Learner, train_together
 from gyro_pipeline.learning.examples import Examples, Scaling
-from gyro_pipeline.learning.executors import run_batches, run_jobs
 from gyro_pipeline.learning.jobs import (
     TrainedNetwork,
     TrainingJob,
@@ -49,12 +49,12 @@ def run_trainings(
     if execution.executor == "batched" or (execution.executor == "auto" and cuda):
         device = torch.device("cuda" if cuda else "cpu")
         batches = in_batches(jobs, device, free_memory(device))
-        yield from run_batches(batches, train_batch, label)
+        yield from run_batches(batches, train_batch, label, "trainings")
         return
     if jobs:
         # compiled, or said why not, before the workers need it
         fused.available(jobs[0].settings.precision)
-    yield from run_jobs(jobs, run_training, execution, label)
+    yield from run_jobs(jobs, run_training, execution, label, "trainings")
 
 
 @dataclass(frozen=True)

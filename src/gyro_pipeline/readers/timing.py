@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from gyro_pipeline.logs import KEPT, REJECTED, Finding
+from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding
 
 _DAY_S = 86_400.0
 _PERIODS = (2.0**16, 2.0**24, 2.0**32)  # of counters of microseconds, milliseconds or ticks
@@ -109,7 +109,7 @@ def from_stamps(stamps: Floats, unit_s: float | None) -> Timing:
     steps, back = found.steps, found.steps < 0
     findings = [
         *_at("wrap-around", found.rows[found.wraps], "the counter of the timestamps starts anew"),
-        *_at("time order", found.rows[back], "time goes back"),
+        *_at("time order", found.rows[back], "time goes back", REPAIRED),
     ]
     if not (steps > 0).any():
         text = "timestamps do not advance: the rate is not measured"
@@ -117,7 +117,8 @@ def from_stamps(stamps: Floats, unit_s: float | None) -> Timing:
         return Timing(gap_rows=found.rows[back], findings=tuple(findings))
     clock = _Clock.of(found, stamps[np.isfinite(stamps)])
     step, gaps, missing = _gaps(found, clock)
-    findings += _at("gaps", found.rows[gaps], f"samples are missing, about {missing}")
+    what = f"samples are missing, about {missing}"
+    findings += _at("gaps", found.rows[gaps], what, REPAIRED)
     findings += _irregular(found, step, clock, gaps | back)
     return Timing(_rate(step, unit_s), found.rows[back | gaps], tuple(findings))
 
@@ -229,11 +230,12 @@ def from_counter(counts: Floats, bits: int) -> Timing:
     rows, steps = there[1:], np.diff(counts[there])
     broken = np.mod(steps - np.diff(there), 2.0**bits) != 0
     wraps = ~broken & (steps < 0)
+    what = "the packet counter does not go on by one"
     return Timing(
         gap_rows=rows[broken],
         findings=(
             *_at("wrap-around", rows[wraps], f"the {bits}-bit packet counter starts anew"),
-            *_at("packet counter", rows[broken], "the packet counter does not go on by one"),
+            *_at("packet counter", rows[broken], what, REPAIRED),
         ),
     )
 
@@ -282,10 +284,11 @@ def _resolution(stamps: Floats, step: float) -> float:
     return 0.0
 
 
-def _at(check: str, rows: Rows, what: str) -> list[Finding]:
-    """A KEPT finding of how often something is so, and where first; none if it never is."""
+def _at(check: str, rows: Rows, what: str, outcome: str = KEPT) -> list[Finding]:
+    """How often something is so, and where first; no finding if it never is."""
     if not len(rows):
         return []
     shown = ", ".join(map(str, rows[:3])) + (", …" if len(rows) > len(rows[:3]) else "")
     times = "once, at row" if len(rows) == 1 else f"{len(rows)} times, at rows"
-    return [Finding(check, KEPT, f"{what}: {times} {shown}")]
+    cut = ", cut there" if outcome == REPAIRED else ""
+    return [Finding(check, outcome, f"{what}: {times} {shown}{cut}")]

@@ -11,8 +11,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import AXES, DIMENSIONS, TEST_IMU, InputError
+from gyro_pipeline.executors import run_jobs
 from gyro_pipeline.fingerprints import data_hash
-from gyro_pipeline.learning.executors import run_jobs
 from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding, LogEntry, Logs
 from gyro_pipeline.parameters import Execution, Quality
 from gyro_pipeline.protocol.inspection import Inspection, Judged, judge
@@ -23,7 +23,7 @@ _WORTH_PROCESSES = 10**8
 """Bytes to read; fewer are read by this process before others have started."""
 
 _NAMED = 10
-"""So many rejected recordings are named in a message; all are in the table."""
+"""So many are named in a message; all are in the table."""
 
 Row = tuple[LogEntry, Judged]
 
@@ -69,28 +69,30 @@ def require_enough(recordings: xr.Dataset, table: pd.DataFrame, quality: Quality
         The recordings.
 
     Raises:
-        InputError: Fewer than ``quality.needed_pct`` percent remain, or none of the tested IMU.
+        InputError: Fewer than ``quality.needed_pct`` percent remain, of all or of the tested IMU.
     """
-    sensor, rejected = recordings.attrs["sensor"], table[table.outcome == REJECTED]
+    sensor = recordings.attrs["sensor"]
     counts = Counter(table.outcome)
     logger.info(
         "%s: %d recordings, %s",
         *(sensor, len(table)),
         ", ".join(f"{counts[outcome]} {outcome}" for outcome in (KEPT, REPAIRED, REJECTED)),
     )
-    remain = len(table) - len(rejected)
-    if 100 * remain >= quality.needed_pct * len(table):
-        if TEST_IMU in set(table.imu) and TEST_IMU not in recordings.imu:
+    lost = sorted(set(table.imu) - set(recordings.imu.values.tolist()))
+    if lost:
+        shown = ", ".join(map(str, lost[:_NAMED])) + (", …" if len(lost) > _NAMED else "")
+        logger.warning("%s: no recording is left of IMU %s", sensor, shown)
+    tested = table.imu == TEST_IMU
+    for label, listed in ((sensor, table), (f"{sensor}, the tested IMU {TEST_IMU}", table[tested])):
+        bad = listed[listed.outcome == REJECTED]
+        remain = len(listed) - len(bad)
+        if 100 * remain < quality.needed_pct * len(listed):
             raise InputError(
-                f"{sensor}: no recording of IMU {TEST_IMU}, which is tested, can be used. Repair "
-                "or remove them:\n  " + "\n  ".join(_named(rejected[rejected.imu == TEST_IMU]))
+                f"{label}: {remain} of {len(listed)} recordings can be used, quality.needed_pct "
+                f"asks for {quality.needed_pct:g} %. Repair or remove the others, or lower it:\n  "
+                + "\n  ".join(_named(bad))
             )
-        return recordings
-    raise InputError(
-        f"{sensor}: {remain} of {len(table)} recordings can be used, quality.needed_pct asks for "
-        f"{quality.needed_pct:g} %. Repair or remove the others, or lower it:\n  "
-        + "\n  ".join(_named(rejected))
-    )
+    return recordings
 
 
 def _place(entry: LogEntry) -> tuple[int, int]:

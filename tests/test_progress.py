@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyro_pipeline.learning import executors
+from gyro_pipeline import executors
+from gyro_pipeline.executors import _Progress
 from gyro_pipeline.learning.examples import Device
-from gyro_pipeline.learning.executors import _Progress
 from gyro_pipeline.learning.jobs import RECORDING_WORK, TrainingJob
 
 
@@ -21,7 +21,7 @@ def clock(monkeypatch):
 
 
 def test_time_left_counts_from_the_first_report_and_on_workers_that_run_out_of_jobs(clock):
-    progress = _Progress("study", 3, [10.0, 10.0, 10.0], workers=2)
+    progress = _Progress("study", 3, [10.0, 10.0, 10.0], workers=2, what="jobs")
     clock.now += 50  # processes start
     progress.advance_to(0.5, all_at_work=False)
     clock.now += 5
@@ -78,7 +78,7 @@ def test_time_left_is_right_within_half_after_a_tenth(clock, parameters, epochs,
             reports += [(free[worker] + seconds * (n + 1), worker, work) for n in range(count)]
             free[worker] += seconds * count
     works = [job.work for job, *_ in profile]
-    progress = _Progress("study", len(works), works, workers)
+    progress = _Progress("study", len(works), works, workers, "jobs")
     reports.sort()
     at_work, done, factors = set(), 0.0, []
     for now in np.arange(start, max(free) - 2.0, executors._POLL_S):  # until two seconds are left

@@ -58,7 +58,7 @@ def run_jobs(
     function: Callable[[J, Report], R],
     execution: Execution,
     label: str,
-    what: str = "trainings",
+    what: str = "jobs",
     short: bool = False,
 ) -> Iterator[tuple[J, R]]:
     """Run ``function(job, report)`` for every job and yield results as they finish.
@@ -94,14 +94,18 @@ def run_jobs(
 
 
 def run_batches(
-    batches: Sequence[B], function: Callable[[B, Report], Iterator[R]], label: str
+    batches: Sequence[B],
+    function: Callable[[B, Report], Iterator[R]],
+    label: str,
+    what: str = "jobs",
 ) -> Iterator[R]:
     """Run ``function(batch, report)`` for one batch after the other, in this process.
 
     Args:
-        batches: Each of ``size`` trainings that are made at once.
+        batches: Each of ``size`` jobs that are done at once.
         function: Yields the batch's results as they finish; calls ``report`` like a job's.
         label: Names the work in progress lines.
+        what: What the jobs are, for the same lines.
 
     Yields:
         What the function yields.
@@ -109,8 +113,8 @@ def run_batches(
     if not batches:
         return
     size = sum(batch.size for batch in batches)
-    progress = _Progress(label, size, [batch.work for batch in batches], 1)
-    logger.info("%s: %d trainings, %d at once", label, size, max(b.size for b in batches))
+    progress = _Progress(label, size, [batch.work for batch in batches], 1, what)
+    logger.info("%s: %d %s, %d at once", label, size, what, max(b.size for b in batches))
     results = (result for batch in batches for result in function(batch, progress.advance))
     yield from _watched(results, progress)
 
@@ -154,7 +158,7 @@ class _Progress:
         jobs: int,
         works: Sequence[float],
         workers: int,
-        what: str = "trainings",
+        what: str,
     ) -> None:
         self._label, self._jobs, self._plan = label, jobs, _Plan(works, workers)
         self._what = what

@@ -19,8 +19,8 @@ from types import SimpleNamespace
 import psutil
 import pytest
 
-from gyro_pipeline.learning import executors
-from gyro_pipeline.learning.executors import available_cores, run_jobs
+from gyro_pipeline import executors
+from gyro_pipeline.executors import available_cores, run_jobs
 from gyro_pipeline.parameters import Execution
 
 SERIAL = Execution(executor="serial", workers=None)
@@ -288,13 +288,13 @@ def test_progress_lines_tell_what_is_done_and_what_is_left(monkeypatch, caplog):
         list(run_jobs([Job("a", 4e9), Job("b", 4e9)], train_one, SERIAL, "study dot"))
     assert caplog.messages[1:] == [
         # every 40 s, because 20 s are less than the half minute between lines
-        "study dot: 0 of 2 trainings done, 25 %, 2 min 00 s left",
-        "study dot: 0 of 2 trainings done, 50 %, 1 min 20 s left",
-        "study dot: 1 of 2 trainings done, 75 %, 0 min 40 s left",
-        "study dot: 1 of 2 trainings done, 100 %, 0 min 00 s left",
-        "study dot: 2 trainings in 2 min 40 s",
+        "study dot: 0 of 2 jobs done, 25 %, 2 min 00 s left",
+        "study dot: 0 of 2 jobs done, 50 %, 1 min 20 s left",
+        "study dot: 1 of 2 jobs done, 75 %, 0 min 40 s left",
+        "study dot: 1 of 2 jobs done, 100 %, 0 min 00 s left",
+        "study dot: 2 jobs in 2 min 40 s",
     ]
-    assert caplog.messages[0].startswith("study dot: 2 trainings on ")
+    assert caplog.messages[0].startswith("study dot: 2 jobs on ")
 
 
 def test_work_reported_by_workers_reaches_the_log(here, monkeypatch, caplog):
@@ -303,12 +303,12 @@ def test_work_reported_by_workers_reaches_the_log(here, monkeypatch, caplog):
     with caplog.at_level(logging.INFO, executors.__name__):
         list(run_jobs(jobs, here.square, PAIR, "study"))
     first, *between, last = caplog.messages
-    assert first == "study: 4 trainings on 2 processes"
-    pattern = r"study: \d of 4 trainings done, (\d+) %, .* left"
+    assert first == "study: 4 jobs on 2 processes"
+    pattern = r"study: \d of 4 jobs done, (\d+) %, .* left"
     shares = [int(re.fullmatch(pattern, line)[1]) for line in between]
     assert shares == sorted(shares)
     assert shares[-1] == 100
-    assert re.fullmatch(r"study: 4 trainings in 0 min \d\d s", last)
+    assert re.fullmatch(r"study: 4 jobs in 0 min \d\d s", last)
 
 
 def test_a_terminal_gets_a_bar_and_no_lines(monkeypatch, caplog):
