@@ -165,6 +165,35 @@ def test_units_of_the_options_win_over_the_format_but_not_over_the_header(good, 
         read(good["general"], time_units="s")
 
 
+def below_the_header(text, *lines):
+    """With lines between header and rows."""
+    header, rows = text.split("\n", 1)
+    return "\n".join([header, *lines, rows])
+
+
+@pytest.mark.parametrize("lines", [["# start"], ["", "started; at noon", "# 1"]])
+def test_lines_between_header_and_rows_hide_neither_names_nor_units(lines, good, rates, read):
+    text = below_the_header(good["general"], *lines)
+    log = read(text, 100)
+    np.testing.assert_allclose(log.samples, rates, rtol=0, atol=1e-7)
+    assert log.rate_hz == pytest.approx(100)
+    assert not log.findings
+    with pytest.raises(InputError, match="the header says rad/s.*and units of the options deg/s"):
+        read(text, columns=(2, 3, 4), units="deg/s")
+
+
+def test_a_row_of_units_is_not_overruled(good, rates, read):
+    rows = "\n".join(f"{k};{x};{y};{z}" for k, (x, y, z) in enumerate(rates.tolist()))
+    text = f"t;wx;wy;wz\nms;rad/s;rad/s;rad/s\n{rows}\n"
+    log = read(text, columns=(1, 2, 3), time_column=0)
+    np.testing.assert_allclose(log.samples, np.degrees(rates))
+    assert log.rate_hz == pytest.approx(1000)
+    with pytest.raises(InputError, match="the header says rad/s.*and units of the options deg/s"):
+        read(text, columns=(1, 2, 3), units="deg/s")
+    with pytest.raises(InputError, match="expected columns of angular rate about x, y, z"):
+        read(text)
+
+
 def test_the_header_wins_over_the_format(good, rates, read):
     text = good["movella_dot"]
     for axis in "XYZ":

@@ -44,7 +44,7 @@ def split_unit(header: str, spellings: tuple[str, ...]) -> tuple[str, str | None
 
     Returns:
         The name, and what is in brackets at the end, else a spelling behind a space, dot or
-        underscore at the end, in lower case without spaces; None if there is neither.
+        underscore at the end, or all of it, in lower case without spaces; None if there is none.
     """
     axis = match[0] if (match := _AXIS.search(header)) else ""
     text = header.removesuffix(axis)
@@ -52,7 +52,7 @@ def split_unit(header: str, spellings: tuple[str, ...]) -> tuple[str, str | None
         return text[: found.start()] + axis, re.sub(r"\s|\^", "", found[1].lower())
     for unit in sorted(spellings, key=len, reverse=True):
         name = text[: -len(unit)]
-        if text.lower().endswith(unit) and name.endswith((" ", "_", ".")):
+        if text.lower().endswith(unit) and (not name or name.endswith((" ", "_", "."))):
             return name.rstrip(" _.") + axis, unit
     return header, None
 

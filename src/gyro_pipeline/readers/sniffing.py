@@ -51,15 +51,15 @@ def open_text(path: Path) -> TextTable:
     lines = _first_lines(data)
     rows = _find_rows(path, lines)
     above = _above(lines, rows)
-    start = above.end if above else 0
+    start = above[-1].end if above else 0
     head = data[start : start + _HEAD].decode("latin-1")
     return TextTable(
         path=path,
-        names=_names(path, above, rows),
+        names=_names(path, _header(above, rows), rows),
         preamble="\n".join(line.text for line in lines[: rows.at]),
         data=data,
         start=start,
-        header_lines=above.number if above else 0,
+        header_lines=above[-1].number if above else 0,
         delimiter=rows.delimiter,
         quoted='"' in lines[rows.at].text,
         decimal_point=_decimal_point(path, head, rows.delimiter),
@@ -138,23 +138,32 @@ def _row(text: str, delimiter: str) -> tuple[str, ...]:
     return tuple(fields) if sum(map(is_number, fields)) >= len(AXES) else ()
 
 
-def _above(lines: list[_Line], rows: _Rows) -> _Line | None:
-    """The nearest line above that is not a row of numbers, be it a damaged one."""
+def _above(lines: list[_Line], rows: _Rows) -> list[_Line]:
+    """Lines above the first row of numbers, be it a damaged one."""
     above = lines[: rows.at]
     while above and _row(above[-1].text, rows.delimiter):
         above.pop()
-    return above[-1] if above else None
+    return above
 
 
-def _names(path: Path, above: _Line | None, rows: _Rows) -> tuple[str, ...]:
+def _header(above: list[_Line], rows: _Rows) -> _Line | None:
+    """The line next to the rows, or the nearest as wide as they are if that has too few fields."""
+    widths = [len(split(line.text, rows.delimiter)) for line in above]
+    if widths and widths[-1] >= len(AXES):
+        return above[-1]
+    wide = [n for n, width in enumerate(widths) if abs(width - len(rows.fields)) <= 1]
+    return above[wide[-1]] if wide else None
+
+
+def _names(path: Path, header: _Line | None, rows: _Rows) -> tuple[str, ...]:
     """The header, as long as the rows; a delimiter at the end of one alone does not count.
 
     A header with a delimiter too many or too few elsewhere would shift the names: it is refused.
     """
-    names = split(above.text, rows.delimiter) if above else []
     width = len(rows.fields)
-    if len(names) < len(AXES):
+    if header is None:
         return ("",) * width
+    names = split(header.text, rows.delimiter)
     ends = bool(names[-1]), bool(rows.fields[-1])
     if ends == (False, True) and len(names) == width + 1:
         return tuple(names[:-1])
@@ -162,7 +171,7 @@ def _names(path: Path, above: _Line | None, rows: _Rows) -> tuple[str, ...]:
         return (*names, "")
     if len(names) != width or (ends[0] != ends[1] and "" in names):
         raise InputError(
-            f"{path} line {above.number if above else 0}: expected a header of as many columns as "
+            f"{path} line {header.number}: expected a header of as many columns as "
             f"the rows, {width}, got {len(names)}, {listed(names)}; which is which cannot be told: "
             "correct it"
         )
