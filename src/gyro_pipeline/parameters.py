@@ -107,7 +107,7 @@ class ReaderOptions(Parameter):
     temperature_column: Column | None = Field(None, description="degrees Celsius")
     counter_column: Column | None = Field(None, description="counts packets, one a row")
     counter_bits: int | None = Field(
-        None, ge=2, le=32, description="after which the counter starts anew; null: 16"
+        None, ge=2, le=32, description="it starts anew after 2 to this; null: the format's, or 16"
     )
     rate_tolerance_pct: float = Field(
         2.0, gt=0, description="that a measured sample rate may differ from the expected one"

@@ -25,6 +25,9 @@ RATES_HZ = {
 }
 
 
+UNIT = ("unit", "kept")
+
+
 def checks(log):
     return [(finding.check, finding.outcome) for finding in log.findings]
 
@@ -37,7 +40,13 @@ def test_each_logger_is_told_by_its_header_and_read_in_deg_per_s(name, good, rat
     assert log.samples.dtype == np.float64
     assert log.rate_hz == pytest.approx(RATES_HZ[name], rel=1e-9)
     assert not len(log.gap_rows)
-    assert not log.findings
+    assert checks(log) == ([UNIT] if READERS[name].units else [])
+
+
+def test_the_unit_of_a_format_is_said_unless_file_or_options_say_it(good, read):
+    (finding,) = read(good["movella_dot"]).findings
+    assert finding.detail == "deg/s, which files of this format have; the file itself does not say"
+    assert not read(good["movella_dot"], units="deg/s").findings
 
 
 def test_a_temperature_column_is_kept(good, read):
@@ -114,7 +123,7 @@ def test_a_parquet_copy_is_read_as_the_text_is(frame, rates, read):
     log = read(frame.to_parquet, 120, name="log.parquet")
     np.testing.assert_array_equal(log.samples, rates)
     assert log.rate_hz == pytest.approx(120)
-    assert not log.findings
+    assert checks(log) == [UNIT]
 
 
 def test_parquet_timestamps_and_integers_with_missing_values(rates, read):

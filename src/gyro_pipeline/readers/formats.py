@@ -101,24 +101,27 @@ class Reader:
         if len(set(rates)) < len(AXES):
             raise InputError(f"{where}: expected three columns of rates, got {list(columns)}")
         time = number(options.time_column, self.time_column(table))
-        time_s, findings = self._time_unit(table, time, options, where)
+        scale_dps, by_format = self._scale([names[n] for n in rates], options, where)
+        time_s, without_unit = self._time_unit(table, time, options, where)
         return Layout(
             rates=rates,
-            scale_dps=self._scale([names[n] for n in rates], options, where),
+            scale_dps=scale_dps,
             time=time,
             time_s=time_s,
             temperature=number(options.temperature_column, self.temperature_column(table)),
             counter=number(options.counter_column, self._if_there(table, self.counter)),
             counter_bits=options.counter_bits or self.counter_bits,
-            findings=findings,
+            findings=(*by_format, *without_unit),
         )
 
     @staticmethod
     def _if_there(table: Table, name: str | None) -> str | None:
         return name if name and matching(table.names, name) else None
 
-    def _scale(self, headers: Sequence[str], options: ReaderOptions, where: str) -> float:
-        """deg/s in one unit of the rates."""
+    def _scale(
+        self, headers: Sequence[str], options: ReaderOptions, where: str
+    ) -> tuple[float, tuple[Finding, ...]]:
+        """deg/s in one unit of the rates; a finding if the format alone says which."""
         said = {split_unit(header, UNITS)[1] for header in headers}
         found = {rate_unit(header) for header in headers}
         if len(found) > 1:
@@ -133,7 +136,12 @@ class Reader:
                 f"{options.units}; correct the one that is wrong"
             )
         unknown = next(iter(said)) if unit is None else None
-        unit = unit or options.units or (None if unknown else self.units)
+        findings: tuple[Finding, ...] = ()
+        if unit is None and options.units is None and self.units and not unknown:
+            unit = self.units
+            text = f"{unit}, which files of this format have; the file itself does not say"
+            findings = (Finding("unit", KEPT, text),)
+        unit = unit or options.units
         if unit == "raw" and options.scale_dps is None:
             raise InputError(f"{where}: raw counts: give units: raw and scale_dps, deg/s a count")
         if unit is None:
@@ -141,7 +149,7 @@ class Reader:
                 f"{where}: expected a unit of the rates, got {listed(headers)}; give units: "
                 f"{', '.join(DEG_PER_S)} or raw (with scale_dps)"
             )
-        return options.scale_dps or DEG_PER_S[unit]
+        return options.scale_dps or DEG_PER_S[unit], findings
 
     def _time_unit(
         self, table: Table, time: int | None, options: ReaderOptions, where: str
