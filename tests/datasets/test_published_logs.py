@@ -14,6 +14,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 from kedro.io import DatasetError
@@ -544,6 +545,19 @@ def test_the_environment_reads_the_published_files_of_all_sensors(server, made_u
             assert recordings.attrs["simulated"] == 0
     raw = made_up.folder / "data/01_raw/published"
     assert len([one for one in raw.iterdir() if one.suffix == ".npy"]) == 8
+
+
+def test_of_devices_that_are_unseen_those_with_test_recordings_are_tested(server, made_up):
+    only = {"published_address": server.address, "only": {"sensor": "dot"}}
+    done = made_up.run_here("unseen_devices", "published", **only)
+    assert done.code == 0, done.output
+    assert "dot: IMUs 2, 3, 4 have no test recording and only train" in done.output
+    roles = pd.read_csv(made_up.folder / "data/05_model_input/published_all/dot/devices.csv")
+    assert roles.fold.unique().tolist() == [1]
+    assert set(zip(roles.imu, roles.role, strict=True)) == {
+        (1, "test"),
+        *((imu, "train") for imu in (2, 3, 4)),
+    }
 
 
 def test_a_run_without_a_file_of_its_own_ends_with_a_message(server, made_up):

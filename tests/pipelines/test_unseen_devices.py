@@ -69,9 +69,17 @@ def test_one_device_has_no_other_to_learn_from(splits):
         leave_one_device_out({1: [1, 2, 3]}, splits)
 
 
-def test_a_device_without_a_test_recording_is_refused(splits):
-    with pytest.raises(InputError, match="unseen device IMU 2: no recording has role 'test'"):
-        leave_one_device_out({1: [1, 2], 2: [1]}, splits, {1: TRAIN, 2: TEST})
+def test_a_device_without_a_test_recording_only_trains(splits):
+    roles = leave_one_device_out({1: [1, 2], 2: [1]}, splits, {1: TRAIN, 2: TEST})
+    assert roles.fold.unique().tolist() == [1]
+    assert used(roles, 1, TEST) == [(1, 2)]
+    assert used(roles, 1, TRAIN) == [(2, 1)]
+
+
+def test_no_device_with_a_test_recording_is_refused(splits):
+    given = {1: TRAIN, 2: TRAIN, 3: TEST}
+    with pytest.raises(InputError, match="expected an IMU with a recording to test, got none"):
+        leave_one_device_out({1: [1, 2], 2: [1, 2]}, splits, given)
 
 
 @pytest.mark.parametrize(
@@ -225,7 +233,7 @@ def test_of_simulated_devices_the_noise_is_known_and_the_bias_is_not(four):
         true_flicker=2e-3,
     )
     places = [(imu, number) for imu in (1, 2, 4) for number in (1, 2)]
-    device = describe_unseen(drawn.assign_attrs(simulated=1), None, places)
+    device = describe_unseen(drawn.assign_attrs(simulated=1), None, places, (1, 2, 4))
     np.testing.assert_array_equal(device.noise, np.tile([3e-3, 4e-3, 5e-3], 3)[None])
     assert (device.spread == UNIT_SPREAD).all()
     assert (device.unit_bias == 0).all()
@@ -243,7 +251,7 @@ def test_the_best_possible_estimate_of_an_unseen_device_knows_each_ones_noise(fo
     )
     drawn = drawn.assign_attrs(simulated=1)
     imus, numbers = (1, 2, 3, 4), (1, 2, 3, 4)
-    device = describe_unseen(drawn, None, [(imu, number) for imu in imus for number in numbers])
+    device = describe_unseen(drawn, None, [(imu, n) for imu in imus for n in numbers], imus)
     bench = Bench(drawn, device, numbers, 10.0, world.evaluation, imus)
     oracle, mean = bench.oracle_errors, bench.mean_errors
     assert len(oracle) == len(mean) == 4 * 4 * 5 * 3 * 3

@@ -42,6 +42,8 @@ def leave_one_device_out(
 ) -> pd.DataFrame:
     """Let every IMU in turn be the unseen device: it tests, and all others train.
 
+    One that has no recording to test, as all but IMU 1 of the published files, only trains.
+
     Where :func:`assign_roles` holds recordings out, only those of the unseen device test, and only
     the rest of the others' train: recordings made together with a test recording never train. Where
     it makes a k-fold, or there is one recording, all of the device's test and all of the others'
@@ -56,7 +58,8 @@ def leave_one_device_out(
         Columns ``fold`` (the unseen IMU), ``imu``, ``recording``, ``role``.
 
     Raises:
-        InputError: Fewer than two IMUs, or an IMU without a recording to test or to learn from.
+        InputError: Fewer than two IMUs, none with a recording to test, or one with none to learn
+            from.
     """
     if len(recordings) <= 1:
         raise InputError(
@@ -65,9 +68,17 @@ def leave_one_device_out(
         )
     numbers = sorted({number for own in recordings.values() for number in own})
     held_out = _held_out(numbers, splits, given)
+    tested = [
+        imu for imu, own in recordings.items() if held_out is None or set(held_out) & set(own)
+    ]
+    if not tested:
+        raise InputError(
+            "unseen devices: expected an IMU with a recording to test, got none; bring test "
+            "recordings, or leave the sensor out of the study"
+        )
     rows = [
         (unseen, imu, number, TEST if imu == unseen else TRAIN)
-        for unseen in recordings
+        for unseen in tested
         for imu, own in recordings.items()
         for number in own
         if held_out is None or (number in held_out) == (imu == unseen)

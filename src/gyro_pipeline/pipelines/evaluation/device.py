@@ -54,7 +54,10 @@ class TestDevice:
 
 
 def describe_unseen(
-    recordings: xr.Dataset, allan: xr.Dataset, places: Sequence[tuple[int, int]]
+    recordings: xr.Dataset,
+    allan: xr.Dataset,
+    places: Sequence[tuple[int, int]],
+    imus: Sequence[int],
 ) -> TestDevice:
     """Several devices, as one knows them who has never seen them.
 
@@ -66,11 +69,11 @@ def describe_unseen(
         recordings: With the drawn values on simulated data.
         allan: Allan variances.
         places: IMU and number of the recordings to learn the noise from.
+        imus: The devices.
 
     Returns:
         The axes of one IMU after those of another, in order. There is no interval.
     """
-    imus = sorted({imu for imu, _ in places})
     if recordings.attrs["simulated"]:
         noise = recordings.true_noise.to_numpy()
         drawn = [_drawn_models(recordings.sel(imu=imu)) or () for imu in imus]

@@ -87,7 +87,7 @@ def evaluate(
     if "imu" in roles:  # every IMU in turn is an unseen device
         imus = tuple(sorted(roles.fold.unique().tolist()))
         fitted = FittedToOthers(recordings, roles)
-        device = describe_unseen(recordings, allan, known_places(roles))
+        device = describe_unseen(recordings, allan, known_places(roles), imus)
     else:
         imus, seed = (TEST_IMU,), evaluation.bootstrap_seed
         fitted = Fitted(recordings, roles, virtual)

@@ -1,5 +1,7 @@
 """Nodes of the windowed-splits stage. Windows are cut as views where they are used."""
 
+import logging
+
 import numpy as np
 import pandas as pd
 import xarray as xr
@@ -7,6 +9,8 @@ import xarray as xr
 from gyro_pipeline.fingerprints import data_hash
 from gyro_pipeline.parameters import Splits
 from gyro_pipeline.protocol.splits import assign_roles, leave_one_device_out, refuse_copies
+
+logger = logging.getLogger(__name__)
 
 
 def split_recordings(recordings: xr.Dataset, splits: Splits) -> pd.DataFrame:
@@ -46,6 +50,12 @@ def split_devices(recordings: xr.Dataset, splits: Splits) -> pd.DataFrame:
     for imu, number in sorted(contents):
         present.setdefault(imu, []).append(number)
     roles = leave_one_device_out(present, splits, _given(recordings))
+    untested = sorted(set(present) - set(roles.fold))
+    if untested:
+        logger.info(
+            "%s: IMUs %s have no test recording and only train",
+            *(recordings.attrs["sensor"], ", ".join(map(str, untested))),
+        )
     refuse_copies(contents, roles)
     return roles
 
