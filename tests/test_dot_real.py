@@ -138,7 +138,7 @@ def test_copies_in_other_formats_and_units_give_the_same_biases(
     source = FileLogs(
         "dot",
         {"dot": sensors["sensors"]["dot"] | {"samples": 14448, "recording_s": 120.4}},
-        *("copies", str(tmp_path), name, reader),
+        *("copies", str(tmp_path), name, {"path": str(tmp_path / "read")}, reader),
     )
     asked = parameters("dot_real").quality
     serial = Execution(executor="serial", workers=None)

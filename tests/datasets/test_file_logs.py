@@ -28,7 +28,8 @@ SENSORS = {
 
 
 def file_logs(folder, pattern, **options):
-    options = {"sensor": "dot", "sensors": SENSORS, "source": "mine"} | options
+    cache = {"path": str(folder / ".read")}
+    options = {"sensor": "dot", "sensors": SENSORS, "source": "mine", "cache": cache} | options
     return FileLogs(path=str(folder), pattern=pattern, **options)
 
 
@@ -111,6 +112,11 @@ def test_names_that_became_numbers_are_said(tmp_path, caplog):
         ([], "{imu}.csv", ["got none"]),
         (["1.csv", "01.csv"], "{imu}.csv", ["01.csv and 1.csv", "recording 1 of IMU 1", "remove"]),
         (["1/2_a.csv", "1/2_b.csv"], "{imu}/{recording}_*.csv", ["1/2_a.csv and 1/2_b.csv"]),
+        (
+            [f"{imu}/{imu}{number}.csv" for imu in "abc" for number in range(3)],
+            "{imu:name}/{recording:name}.csv",
+            ["9 recordings of 3 IMUs with 9 different numbers", "write * for the recording"],
+        ),
         (["0.csv"], "{imu}.csv", ["0.csv", "from 1 on for {imu}", "{imu:name}"]),
     ],
 )
@@ -135,7 +141,18 @@ def test_a_missing_folder(tmp_path):
         ({"pattern": "{imu}_{imu}.csv"}, "{imu} is there twice"),
         ({"pattern": "{imu.csv"}, "expected {imu}"),
         ({"sensor": "dott"}, "unknown sensor 'dott'"),
+        (
+            {"pattern": "{imu}{recording}.csv"},
+            "expected a character of the names before {recording}",
+        ),
+        ({"pattern": "dot*{imu}.csv"}, "expected a character of the names before {imu}"),
+        ({"pattern": 5}, "dot: pattern in the catalog entry: expected a text"),
         ({"reader": {"unit": "deg/s"}}, "dot: reader in the catalog entry"),
+        (
+            {"cache": "data"},
+            "dot: cache in the catalog entry: expected {path: a folder}, got 'data'",
+        ),
+        ({"cache": {}}, "dot: cache in the catalog entry: expected {path: a folder}, got {}"),
     ],
 )
 def test_a_wrong_entry_is_refused_before_anything_is_read(tmp_path, options, words):
@@ -185,7 +202,7 @@ def read_all(logs):
 def test_what_was_read_before_is_not_read_again_and_the_same(tmp_path, counted, caplog):
     names, log = counted
     put(tmp_path, "1.csv", "2.csv")
-    logs = file_logs(tmp_path, "{imu}.csv", cache={"path": str(tmp_path / ".read")})
+    logs = file_logs(tmp_path, "{imu}.csv")
     logs.load().entries[0].read()  # and then it was interrupted
     with caplog.at_level(logging.INFO, "gyro_pipeline"):
         again, _ = read_all(logs)
@@ -208,7 +225,7 @@ def touch(path):
 @pytest.mark.parametrize("change", [rewrite, touch])
 def test_a_changed_file_is_read_anew_and_its_old_reading_removed(tmp_path, counted, change):
     put(tmp_path, "1.csv", "2.csv")
-    logs = file_logs(tmp_path, "{imu}.csv", cache={"path": str(tmp_path / ".read")})
+    logs = file_logs(tmp_path, "{imu}.csv")
     read_all(logs)
     change(tmp_path / "1.csv")
     read_all(logs)
@@ -218,18 +235,17 @@ def test_a_changed_file_is_read_anew_and_its_old_reading_removed(tmp_path, count
 
 def test_other_options_and_other_readers_read_anew(tmp_path, counted, monkeypatch):
     put(tmp_path, "1.csv")
-    cache = {"cache": {"path": str(tmp_path / ".read")}}
-    read_all(file_logs(tmp_path, "{imu}.csv", **cache))
+    read_all(file_logs(tmp_path, "{imu}.csv"))
     slow = {"dot": SENSORS["dot"] | {"recording_s": 20}}
-    read_all(file_logs(tmp_path, "{imu}.csv", **cache, sensors=slow))
+    read_all(file_logs(tmp_path, "{imu}.csv", sensors=slow))
     monkeypatch.setattr("gyro_pipeline.datasets.file_logs._readers_hash", lambda: "another")
-    read_all(file_logs(tmp_path, "{imu}.csv", **cache, sensors=slow))
+    read_all(file_logs(tmp_path, "{imu}.csv", sensors=slow))
     assert counted[0] == ["1.csv"] * 3
 
 
 def test_a_damaged_reading_is_none(tmp_path, counted):
     put(tmp_path, "1.csv")
-    logs = file_logs(tmp_path, "{imu}.csv", cache={"path": str(tmp_path / ".read")})
+    logs = file_logs(tmp_path, "{imu}.csv")
     read_all(logs)
     (kept,) = (tmp_path / ".read").iterdir()
     kept.write_bytes(kept.read_bytes()[:-30])
@@ -237,12 +253,32 @@ def test_a_damaged_reading_is_none(tmp_path, counted):
     assert counted[0] == ["1.csv"] * 2
 
 
-def test_files_that_cannot_be_used_and_binary_ones_are_not_kept(tmp_path, counted):
+def test_why_a_file_is_refused_is_kept_too(tmp_path, counted):
     (tmp_path / "1.csv").write_text("bad")
-    put(tmp_path, "2.parquet")
-    logs = file_logs(tmp_path, "{imu}.*", cache={"path": str(tmp_path / ".read")})
-    assert [log is None for log in read_all(logs)] == [True, False]
-    assert not (tmp_path / ".read").exists()
+    logs = file_logs(tmp_path, "{imu}.csv")
+    (entry,) = logs.load().entries
+    for _ in range(2):
+        with pytest.raises(InputError, match="^1.csv: bad$"):
+            entry.read()
+    assert counted[0] == ["1.csv"]
+
+
+def test_that_a_file_could_not_be_read_this_time_is_not_kept(tmp_path):
+    put(tmp_path, "1.csv")
+    (entry,) = file_logs(tmp_path, "{imu}.csv").load().entries
+    (tmp_path / "1.csv").rename(tmp_path / "away")
+    with pytest.raises(InputError, match="cannot be read"):
+        entry.read()
+    (tmp_path / "away").rename(tmp_path / "1.csv")
+    assert len(entry.read().samples) == 10
+
+
+def test_files_of_every_kind_are_parsed_once(tmp_path, counted):
+    put(tmp_path, "1.parquet")
+    logs = file_logs(tmp_path, "{imu}.parquet")
+    read_all(logs)
+    read_all(logs)
+    assert counted[0] == ["1.parquet"]
 
 
 def test_only_readings_are_tidied_away(tmp_path):

@@ -24,9 +24,6 @@ _LOG = logging.getLogger(__name__)
 _NAMED = 5
 """So many files that do not match are named."""
 
-_BINARY = {".npy", ".npz", ".mat", ".parquet"}
-"""What is read as fast as anything that could be kept of it."""
-
 _KEPT = ".reading"
 """Suffix of what is kept of a file; no logger's."""
 
@@ -45,13 +42,12 @@ class FileLogs(LogSource):
             numbers; ``{imu:name}`` and ``{recording:name}`` for names, which are numbered in
             their order; ``*`` for anything but a slash. Without an IMU all files are of IMU 1;
             without a recording the files of an IMU are numbered in their order.
+        cache: ``{"path": folder}`` for what was read of the files, which are parsed once only, also
+            where a run was interrupted. (Kedro makes a ``path`` absolute.)
         reader: How the files are read (:class:`gyro_pipeline.parameters.ReaderOptions`).
-        cache: ``{"path": folder}`` for what was read of text files, so that an interrupted run
-            goes on where it was; None: nothing is kept, and each file is read twice. (Kedro makes
-            a ``path`` absolute.)
 
     Raises:
-        InputError: An unknown sensor, a pattern or reader options that are not usable.
+        InputError: An unknown sensor; a pattern, cache or reader options that are not usable.
     """
 
     def __init__(
@@ -61,8 +57,8 @@ class FileLogs(LogSource):
         source: str,
         path: str,
         pattern: str,
+        cache: Mapping[str, str],
         reader: Mapping[str, Any] | None = None,
-        cache: Mapping[str, str] | None = None,
         metadata: dict[str, Any] | None = None,
     ) -> None:
         super().__init__(sensor, sensors, source, path, metadata)
@@ -72,7 +68,11 @@ class FileLogs(LogSource):
             self._options = ReaderOptions.model_validate(reader or {})
         except ValidationError as error:
             raise InputError(f"{sensor}: reader in the catalog entry: {error}") from error
-        self._cache = None if cache is None else Path(cache["path"])
+        if not isinstance(cache, Mapping) or not isinstance(cache.get("path"), str):
+            raise InputError(
+                f"{sensor}: cache in the catalog entry: expected {{path: a folder}}, got {cache!r}"
+            )
+        self._cache = Path(cache["path"])
 
     def load(self) -> Logs:
         """List the recordings; their files are read later, one at a time.
@@ -84,7 +84,7 @@ class FileLogs(LogSource):
         found = self._matching()
         numbers = _numbered(self._sensor, self._pattern, found)
         readings = self._readings(found)
-        self._tidy([one.kept_as for one in readings.values() if one.kept_as is not None])
+        self._tidy([one.kept_as for one in readings.values()])
         entries = [
             LogEntry(*numbers[name], name, reading, reading.path.stat().st_size)
             for name, reading in readings.items()
@@ -132,18 +132,15 @@ class FileLogs(LogSource):
         settings = [self._options.model_dump(mode="json"), self.entry.rate_hz, _readers_hash()]
         found = {}
         for name in names:
-            path, kept_as = self._path / name, None
-            if self._cache is not None and path.suffix.lower() not in _BINARY:
-                state = path.stat()
-                key = fingerprint([str(path), state.st_size, state.st_mtime_ns, settings])
-                kept_as = self._cache / f"{key}{_KEPT}"
+            path = self._path / name
+            state = path.stat()
+            key = fingerprint([str(path), state.st_size, state.st_mtime_ns, settings])
+            kept_as = self._cache / f"{key}{_KEPT}"
             found[name] = Reading(path, self._options, self.entry.rate_hz, kept_as)
         return found
 
     def _tidy(self, wanted: Sequence[Path]) -> None:
         """Say what is there of an earlier run, and remove what is of other files."""
-        if self._cache is None:
-            return
         # the folder may hold other files, and the hidden ones that another process is writing
         there = {path for path in self._cache.glob(f"*{_KEPT}") if not path.name.startswith(".")}
         for path in there.difference(wanted):
@@ -155,9 +152,19 @@ class FileLogs(LogSource):
 
 def _compiled(sensor: str, pattern: str) -> re.Pattern[str]:
     """The pattern as a regular expression."""
+    if not isinstance(pattern, str):
+        raise InputError(
+            f"{sensor}: pattern in the catalog entry: expected a text such as imu{{imu}}/*.csv, "
+            f"got {pattern!r}"
+        )
     written, last = "", 0
     for part in _PART.finditer(pattern):
         name, named, _ = part.groups()
+        if written and part.start() == last:
+            raise InputError(
+                f"{sensor}: pattern {pattern}: expected a character of the names before {part[0]}, "
+                "or it cannot be told where it begins"
+            )
         written += re.escape(pattern[last : part.start()])
         last = part.end()
         if f"<{name}>" in written:
@@ -188,7 +195,19 @@ def _numbered(sensor: str, pattern: str, found: Mapping[str, re.Match[str]]) -> 
                 f"{sensor}: {other} and {name} are both recording {number[1]} of IMU {imu} by the "
                 f"pattern {pattern}; remove one of them, or correct the pattern in the catalog"
             )
+    _refuse_sparse(sensor, pattern, list(taken))
     return {name: number for number, name in taken.items()}
+
+
+def _refuse_sparse(sensor: str, pattern: str, numbers: Sequence[tuple[int, int]]) -> None:
+    """Refuse IMUs of which hardly any have the same recordings: all are stored side by side."""
+    imus, recordings = (len({number[part] for number in numbers}) for part in (0, 1))
+    if 2 * len(numbers) < imus * recordings:
+        raise InputError(
+            f"{sensor}: expected recordings of the same numbers of most IMUs, got {len(numbers)} "
+            f"recordings of {imus} IMUs with {recordings} different numbers by the pattern "
+            f"{pattern}; write * for the recording, to have those of an IMU numbered in their order"
+        )
 
 
 def _numbers(

@@ -1,4 +1,4 @@
-"""Text files that were read once, kept in a form that is read in a hundredth of the time."""
+"""Files that were read once, kept in a form that is read in a hundredth of the time of a text."""
 
 import json
 from dataclasses import dataclass
@@ -6,29 +6,33 @@ from pathlib import Path
 
 import numpy as np
 
+from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.atomic import replacing
 from gyro_pipeline.logs import Finding, Log
 from gyro_pipeline.parameters import ReaderOptions
 from gyro_pipeline.readers import read_log
+
+_PASSING = (OSError, MemoryError)
+"""Reasons for which a file may be refused that say nothing of the file."""
 
 
 @dataclass(frozen=True)
 class Reading:
     """Reads a file of a logger, or what was kept of it when it was read before.
 
-    Samples are kept in float32, as recordings are stored.
+    Samples are kept in float32, as recordings are stored; of a file that is refused, why.
 
     Attributes:
         path: The file.
         options: How it is read.
         rate_hz: Expected.
-        kept_as: The file in which its reading is kept; None: it is not.
+        kept_as: The file in which its reading is kept.
     """
 
     path: Path
     options: ReaderOptions
     rate_hz: float
-    kept_as: Path | None
+    kept_as: Path
 
     def __call__(self) -> Log:
         """Read it.
@@ -36,35 +40,50 @@ class Reading:
         Raises:
             InputError: The file cannot be used.
         """
-        kept = None if self.kept_as is None else _load(self.kept_as)
-        if kept is not None:
-            return kept
-        log = read_log(self.path, self.options, self.rate_hz)
-        if self.kept_as is not None:
-            _save(log, self.kept_as)
-        return log
+        known = _load(self.kept_as)
+        if known is None:
+            known = self._read()
+            _save(known, self.kept_as)
+        if isinstance(known, InputError):
+            raise known
+        return known
+
+    def _read(self) -> Log | InputError:
+        """The recording, or why the file is refused, for good."""
+        try:
+            return read_log(self.path, self.options, self.rate_hz)
+        except InputError as error:
+            if isinstance(error.__cause__, _PASSING):
+                raise
+            return error
 
 
-def _save(log: Log, path: Path) -> None:
+def _save(known: Log | InputError, path: Path) -> None:
     """Arrays one after the other, which takes half the time of an archive of them."""
-    findings = [[finding.check, finding.outcome, finding.detail] for finding in log.findings]
-    known = json.dumps([log.rate_hz, log.gap_rows.tolist(), findings])
-    with np.errstate(over="ignore"):
-        arrays = [np.array(known), log.samples.astype(np.float32)]
-    if log.temperature_c is not None:
-        arrays.append(log.temperature_c.astype(np.float32))
+    if isinstance(known, InputError):
+        arrays = [np.array(json.dumps(str(known)))]
+    else:
+        findings = [[finding.check, finding.outcome, finding.detail] for finding in known.findings]
+        said = json.dumps([known.rate_hz, known.gap_rows.tolist(), findings])
+        with np.errstate(over="ignore"):
+            arrays = [np.array(said), known.samples.astype(np.float32)]
+        if known.temperature_c is not None:
+            arrays.append(known.temperature_c.astype(np.float32))
     with replacing(path) as temporary, temporary.open("wb") as file:
         for array in arrays:
             np.save(file, array)
 
 
-def _load(path: Path) -> Log | None:
-    """None where there is none that can be read."""
+def _load(path: Path) -> Log | InputError | None:
+    """None where there is nothing that can be read."""
     try:
         with path.open("rb") as file:
-            known, samples = np.load(file), np.load(file)  # never unpickles
+            said = json.loads(str(np.load(file)))  # never unpickles
+            if isinstance(said, str):
+                return InputError(said)
+            samples = np.load(file)
             warmth = np.load(file) if file.peek(1) else None
-        rate_hz, gap_rows, findings = json.loads(str(known))
+        rate_hz, gap_rows, findings = said
         found = tuple(Finding(*finding) for finding in findings)
         return Log(samples, rate_hz, np.array(gap_rows, np.intp), warmth, found)
     except Exception:  # a damaged file fails in many ways, and is read anew in all of them
