@@ -97,6 +97,12 @@ def as_rad_per_s(table, path):
     pd.DataFrame({"Time (s)": table.Time, **rates}).to_csv(path, index=False, na_rep="NaN")
 
 
+def as_dot_in_rad_per_s(table, path):
+    """The format's own names, in another unit than its files have."""
+    rates = ["w_x", "w_y", "w_z"]
+    table.assign(**np.deg2rad(table[rates])).to_csv(path, index=False, na_rep="NaN")
+
+
 def as_artemis(table, path):
     """Times of day in hundredths of a second, as that logger writes them."""
     times = pd.Timestamp("2024-05-06 12:00") + pd.to_timedelta(table.Time, unit="s")
@@ -122,6 +128,7 @@ def as_parquet(table, path):
     ("write", "name", "reader"),
     [
         (as_rad_per_s, "rad_{imu}.csv", {}),
+        (as_dot_in_rad_per_s, "rad_{imu}.csv", {"units": "rad/s"}),
         (as_artemis, "artemis_{imu}.csv", {}),
         (as_parquet, "dot_{imu}.parquet", {"time_column": "time_s", "time_units": "s"}),
     ],

@@ -8,6 +8,7 @@ import io
 
 import numpy as np
 import pytest
+import scipy.io
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -95,7 +96,8 @@ def test_a_mutated_text_gives_the_good_rows_or_a_message(logger, edits, good, ra
 
 @SEVERAL
 @given(
-    edits=st.lists(EDITS, min_size=1, max_size=3), kind=st.sampled_from(["npy", "npz", "parquet"])
+    edits=st.lists(EDITS, min_size=1, max_size=3),
+    kind=st.sampled_from(["npy", "npz", "parquet", "mat"]),
 )
 def test_a_mutated_binary_file_gives_a_recording_or_a_message(edits, kind, rates, frame, tmp_path):
     buffer = io.BytesIO()
@@ -103,6 +105,8 @@ def test_a_mutated_binary_file_gives_a_recording_or_a_message(edits, kind, rates
         np.save(buffer, rates)
     elif kind == "npz":
         np.savez(buffer, gyro_dps=rates)
+    elif kind == "mat":
+        scipy.io.savemat(buffer, {"log": {"gyro_dps": rates}})
     else:
         frame.to_parquet(buffer)
     data = buffer.getvalue()

@@ -4,7 +4,7 @@ What a file is, its first bytes tell; its name and suffix are never asked.
 """
 
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -118,7 +118,7 @@ class _Parquet:
     @classmethod
     def open(cls, path: Path) -> "_Parquet":
         fields = list(pq.read_schema(path))
-        times = [number for number, field in enumerate(fields) if _is_time(field.type)]
+        times = [number for number, field in enumerate(fields) if _microseconds(field.type)]
         return cls(path, tuple(field.name for field in fields), frozenset(times))
 
     def read(self, columns: Sequence[int], lenient: int | None = None) -> Values:
@@ -136,22 +136,30 @@ class _Parquet:
 
     def _numbers(self, name: str, column: Any) -> NDArray[np.float64]:
         kind = column.type
-        if _is_time(kind):
-            to = pa.time64("us") if pa.types.is_time(kind) else pa.timestamp("us", kind.tz)
-            micros = column.cast(to, safe=False).cast(pa.int64()).to_numpy()
-            return (micros - (micros[:1] if len(micros) else 0)) * 1e-6
+        if to := _microseconds(kind):
+            micros = np.array(column.cast(to, safe=False).cast(pa.int64()).to_numpy(), np.float64)
+            known = micros[np.isfinite(micros)]
+            return (micros - known[:1] if len(known) else micros) * 1e-6
         if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
             raise InputError(f"{self.path}: expected numbers in column {name!r}, got {kind}")
         return np.array(column.cast(pa.float64(), safe=False).to_numpy())
 
 
-def _is_time(kind: Any) -> bool:
-    return pa.types.is_timestamp(kind) or pa.types.is_time(kind)
+def _microseconds(kind: Any) -> Any:
+    """Arrow's type of microseconds, for one of clock times, dates with times or durations."""
+    if pa.types.is_time(kind):
+        return pa.time64("us")
+    if pa.types.is_timestamp(kind):
+        return pa.timestamp("us", kind.tz)
+    return pa.duration("us") if pa.types.is_duration(kind) else None
 
 
 @dataclass(frozen=True)
 class _Arrays:
-    """Numeric arrays: vectors are a column each, matrices one a column of theirs."""
+    """Numeric arrays: vectors are a column each, matrices one a column of theirs.
+
+    What is in fields of arrays or structures is named by them: ``log.gyro`` is ``gyro`` of ``log``.
+    """
 
     path: Path
     arrays: Mapping[str, NDArray[Any]]
@@ -160,9 +168,10 @@ class _Arrays:
     in_seconds: frozenset[int] = frozenset()
 
     @classmethod
-    def of(cls, path: Path, arrays: Mapping[str, NDArray[Any]]) -> "_Arrays":
+    def of(cls, path: Path, stored: Any) -> "_Arrays":
         """Name the columns: ``t`` of a vector, ``gyro.x`` of three, ``all.0`` of others."""
         columns: dict[str, NDArray[Any]] = {}
+        arrays = dict(_arrays_in(stored, ""))
         for name, array in arrays.items():
             if array.size < 2 or array.dtype.kind not in "iuf" or array.ndim > 2:  # noqa: PLR2004
                 continue
@@ -174,10 +183,10 @@ class _Arrays:
                 continue
             labels = AXES if width == len(AXES) else tuple(map(str, range(width)))
             for number, label in enumerate(labels):
-                columns[f"{name}.{label}" if name else label] = array[:, number]
+                columns[_inside(name, label)] = array[:, number]
         if not columns:
             found = ", ".join(
-                f"{array.dtype} {array.shape} {name}" for name, array in arrays.items()
+                f"{array.dtype} {array.shape} {name}".rstrip() for name, array in arrays.items()
             )
             raise InputError(
                 f"{path}: expected arrays of numbers with a row a sample, such as (n, 3), got "
@@ -194,12 +203,28 @@ class _Arrays:
         return [np.array(found[self.names[n]], np.float64) for n in columns], ()
 
 
+def _arrays_in(stored: Any, name: str) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Arrays in arrays of fields and in mappings, by the names that lead to them."""
+    if isinstance(stored, np.ndarray) and stored.dtype.names is None:
+        yield name, stored
+    elif isinstance(stored, np.ndarray):
+        for label in stored.dtype.names:
+            yield from _arrays_in(stored[label], _inside(name, label))
+    elif isinstance(stored, Mapping):
+        for label, one in stored.items():
+            yield from _arrays_in(one, _inside(name, label))
+
+
+def _inside(name: str, label: str) -> str:
+    return f"{name}.{label}" if name else label
+
+
 def _open_npy(path: Path) -> _Arrays:
     # maps the file, so that a damaged header cannot ask for more memory than there is
     array: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
-    if array.ndim != 2:  # noqa: PLR2004
-        raise InputError(f"{path}: expected shape (n, 3), got {array.shape}")
-    return _Arrays.of(path, {"": array})
+    if array.ndim != 2 and array.dtype.names is None:  # noqa: PLR2004
+        raise InputError(f"{path}: expected shape (n, 3), or named fields, got {array.shape}")
+    return _Arrays.of(path, array)
 
 
 def _open_npz(path: Path) -> _Arrays:
@@ -212,23 +237,36 @@ def _open_npz(path: Path) -> _Arrays:
         )
     if not members or not all(name.endswith(".npy") for name in members):
         raise InputError(f"{path}: expected a recording, got a zip archive; unpack it")
-    with np.load(path, allow_pickle=False) as arrays:
-        return _Arrays.of(path, dict(arrays))
+    with np.load(path, allow_pickle=False) as archive:
+        return _Arrays.of(path, {name: _member(archive, name) for name in archive})
+
+
+def _member(archive: Any, name: str) -> NDArray[Any]:
+    """An array; of objects, which are never unpickled, an empty one."""
+    try:
+        return np.asarray(archive[name])
+    except ValueError as error:
+        if "allow_pickle" in str(error):
+            return np.empty(0, object)
+        raise
 
 
 def _open_mat5(path: Path) -> _Arrays:
-    arrays = scipy.io.loadmat(path)
-    return _Arrays.of(path, {n: a for n, a in arrays.items() if isinstance(a, np.ndarray)})
+    return _Arrays.of(path, scipy.io.loadmat(path, simplify_cells=True))
 
 
 def _open_hdf5(path: Path) -> _Arrays:
     """MATLAB 7.3, which stores arrays transposed; other HDF5 as it is."""
     with path.open("rb") as start:
         matlab = start.read(len(_MATLAB)) == _MATLAB
+    arrays: dict[str, NDArray[Any]] = {}
+
+    def add(name: str, data: Any) -> None:
+        kind = data.attrs.get("MATLAB_class")
+        if isinstance(data, h5py.Dataset) and kind != b"char" and not name.startswith("#"):
+            array = np.asarray(data[()])
+            arrays[name.replace("/", ".")] = array.T if matlab or kind is not None else array
+
     with h5py.File(path) as file:
-        arrays = {
-            name: data[()].T if matlab or "MATLAB_class" in data.attrs else data[()]
-            for name, data in file.items()
-            if isinstance(data, h5py.Dataset) and data.attrs.get("MATLAB_class") != b"char"
-        }
+        file.visititems(add)
     return _Arrays.of(path, arrays)
