@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.io
 
 from gyro_pipeline.conventions import InputError
 
@@ -126,6 +127,20 @@ def npy(array):
         buffer = io.BytesIO()
         np.save(buffer, array, allow_pickle=True)
         return buffer.getvalue()
+
+    return saved
+
+
+def matlab(at, old, new):
+    """A structure of an array as MATLAB 5 stores it, with other bytes behind its name."""
+
+    def saved(text):
+        buffer = io.BytesIO()
+        scipy.io.savemat(buffer, {"log": {"gyro_dps": np.ones((60, 3))}})
+        data = buffer.getvalue()
+        place = data.index(b"gyro_dps") + at
+        assert data[place : place + len(old)] == old
+        return data[:place] + new + data[place + len(new) :]
 
     return saved
 
@@ -328,6 +343,22 @@ CASES = {
     "an npy file of pickles": (ANGLES, npy(np.array([{}, []], object)), Refused("copy it anew")),
     "an npy file of one column": (ANGLES, npy(np.ones(50)), Refused(r"expected shape \(n, 3\)")),
     "an npy file transposed": (ANGLES, npy(np.ones((3, 50))), Refused("with a row a sample")),
+    # SciPy would end the process, or fill the memory
+    "a MATLAB file with data of no type": (
+        ANGLES,
+        matlab(64, b"\x09\0\0\0\xa0\x05\0\0", b"\x09\x38"),
+        Refused("data of type 14345 and 1440 bytes; it is damaged"),
+    ),
+    "a MATLAB file with an array of no class": (
+        ANGLES,
+        matlab(32, b"\x06\0\0\0", b"\x60"),
+        Refused("an array of class 96"),
+    ),
+    "a MATLAB file with an array larger than it": (
+        ANGLES,
+        matlab(48, b"\x3c\0\0\0\x03\0\0\0", b"\x3c\0\0\x40"),
+        Refused(r"an array of \(1073741884, 3\) in"),
+    ),
     "another delimiter": (
         ANGLES,
         replaced((",", "|")),

@@ -17,6 +17,7 @@ import scipy.io
 from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import AXES, InputError
+from gyro_pipeline.readers import mat5
 from gyro_pipeline.readers.headers import listed
 from gyro_pipeline.readers.sniffing import open_text
 from gyro_pipeline.readers.text import Values
@@ -252,6 +253,7 @@ def _member(archive: Any, name: str) -> NDArray[Any]:
 
 
 def _open_mat5(path: Path) -> _Arrays:
+    mat5.check(path.read_bytes())
     return _Arrays.of(path, scipy.io.loadmat(path, simplify_cells=True))
 
 
