@@ -5,15 +5,21 @@ another unit: rows are those of the good file, up to the few that were touched.
 """
 
 import io
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
+import pandas as pd
 import pytest
 import scipy.io
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.parameters import ReaderOptions
+from gyro_pipeline.datasets.file_logs import FileLogs
+from gyro_pipeline.datasets.recordings import Recordings
+from gyro_pipeline.parameters import Execution, ReaderOptions
+from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs, require_enough
 from gyro_pipeline.readers import read_log
 
 LOGGERS = ["movella_dot", "movella_dot_angles", "openlog_artemis", "ngimu", "general"]
@@ -137,3 +143,49 @@ def test_no_byte_lost_or_delimiter_added_in_a_header_moves_columns_or_units(
 def rates_header(data):
     """The first of the names of the rates that a header has."""
     return next(name for name in (b"Gyr_X", b"w_x", b"gX", b"Gyroscope", b"gx") if name in data)
+
+
+SENSOR = {
+    **{"imus": 2, "recordings": 2, "train_recordings": 1, "samples": 1200, "recording_s": 12},
+    "simulated": {
+        "noise_mdps_rts": [5, 5, 5],
+        "turn_on_spread_mdps": [0, 0, 0],
+        "unit_bias_dps": 1,
+    },
+}
+TWELVE_S = np.random.default_rng(8).normal([3.0, -0.9, 0.4], 0.06, (1200, 3)).round(5)
+SOUND = "".join(
+    ["t (s);gx (deg/s);gy (deg/s);gz (deg/s)\n"]
+    + [f"{k / 100:.2f};{x};{y};{z}\n" for k, (x, y, z) in enumerate(TWELVE_S.tolist())]
+).encode()
+
+
+@settings(SEVERAL, max_examples=20)
+@given(edits=st.lists(EDITS, min_size=1, max_size=3))
+def test_a_folder_with_a_mutated_file_is_stored_whole_and_the_same_again(edits, parameters):
+    damaged = SOUND
+    for edit in edits:
+        damaged = mutated(damaged, edit)
+    asked = parameters("base").quality.model_copy(update={"needed_pct": 1.0})
+    serial = Execution(executor="serial", workers=None)
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "1.csv").write_bytes(SOUND)
+        (folder / "2.csv").write_bytes(damaged)
+        source = FileLogs(
+            *("dot", {"dot": SENSOR}, "mine", name, "{imu}.csv"), cache={"path": f"{name}/.read"}
+        )
+        recordings, table = inspect_logs(source.load(), asked, serial)
+        store = Recordings(f"{name}/recordings.nc")
+        store.save(require_enough(recordings, table, asked))
+        again, table_again = inspect_logs(source.load(), asked, serial)  # from what was kept
+        stored = store.load()
+    pd.testing.assert_frame_equal(table, table_again)
+    assert again.attrs == recordings.attrs == stored.attrs
+    assert set(recordings.imu.values) == set(table.imu[table.outcome != "rejected"])
+    assert "1.csv" in table.file[table.outcome != "rejected"].tolist()
+    means = recordings.angular_rate.mean("sample").squeeze("recording").values
+    np.testing.assert_allclose(
+        means - TWELVE_S.mean(axis=0), 0, atol=0.02
+    )  # in deg/s, and in order
+    assert table.findings[table.outcome != "kept"].notna().all()
