@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 SAMPLES, RECORDINGS = 1300, 7
 
@@ -120,6 +121,27 @@ def test_an_only_that_matches_nothing(new_project, pipeline, only):
     output = refused(new_project(), pipeline, env="smoke", only=only)
     assert "matches nothing" in output
     assert all(name in output for name in only)
+
+
+# the catalog
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"patern": "*.npy"}, ["unexpected keyword argument 'patern'", "memsense.raw_logs.files"]),
+        ({"files": None}, ["missing 1 required positional argument: 'files'"]),
+    ],
+)
+def test_keys_of_a_catalog_entry(mine, change, words):
+    project = mine(good())
+    entries = yaml.safe_load((project.folder / "conf/mine/catalog.yml").read_text())
+    entry = entries["memsense.raw_logs.files"] | change
+    entry = {key: value for key, value in entry.items() if value is not None}
+    project.configure("mine", catalog={"memsense.raw_logs.files": entry})
+    output = refused(project)
+    for word in ["error: catalog: ArrayLogs", *words]:
+        assert word in output
 
 
 # files of recordings

@@ -13,7 +13,7 @@ from typing import Any
 
 from kedro.framework.context import KedroContext
 from kedro.framework.hooks import hook_impl
-from kedro.io import CatalogProtocol
+from kedro.io import CatalogProtocol, DatasetError
 from kedro.pipeline import Node, Pipeline
 from pydantic import ValidationError
 
@@ -25,6 +25,9 @@ from gyro_pipeline.parameters import Parameters
 from gyro_pipeline.studies import LEAKAGE, leak_sensors, used_sensors
 
 logger = logging.getLogger(__name__)
+
+_OTHER_ARGUMENTS = "must only contain arguments valid for the constructor"
+"""In Kedro's words: a key of a catalog entry is unknown, or lacking."""
 
 
 class Preflight:
@@ -126,10 +129,12 @@ def _explain(kind: type[BaseException], error: BaseException, trace: TracebackTy
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, InputError):
         cause = cause.__cause__
-    if cause is None:
-        sys.__excepthook__(kind, error, trace)
-    else:
+    if cause is not None:
         logger.error("error: %s", cause)
+    elif isinstance(error, DatasetError) and _OTHER_ARGUMENTS in str(error):
+        logger.error("error: catalog: %s", " ".join(str(error).split()))
+    else:
+        sys.__excepthook__(kind, error, trace)
 
 
 def _explained(error: ValidationError) -> str:
