@@ -45,7 +45,7 @@ def test_each_logger_is_told_by_its_header_and_read_in_deg_per_s(name, good, rat
 
 def test_the_unit_of_a_format_is_said_unless_file_or_options_say_it(good, read):
     (finding,) = read(good["movella_dot"]).findings
-    assert finding.detail == "deg/s, which files of this format have; the file itself does not say"
+    assert finding.detail == "deg/s, by the format; the file does not say"
     assert not read(good["movella_dot"], units="deg/s").findings
 
 

@@ -139,7 +139,7 @@ class Reader:
         findings: tuple[Finding, ...] = ()
         if unit is None and options.units is None and self.units and not unknown:
             unit = self.units
-            text = f"{unit}, which files of this format have; the file itself does not say"
+            text = f"{unit}, by the format; the file does not say"
             findings = (Finding("unit", KEPT, text),)
         unit = unit or options.units
         if unit == "raw" and options.scale_dps is None:
