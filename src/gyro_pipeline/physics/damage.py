@@ -95,8 +95,8 @@ def saturated(rates: NDArray[np.float64]) -> NDArray[np.bool_]:
         (axis, n).
     """
     found = np.zeros(rates.shape, bool)
-    for sign in (1, -1):
-        tops = sign * np.fmax.reduce(sign * rates, axis=1)
+    for sign, extreme in ((1, np.fmax), (-1, np.fmin)):
+        tops = extreme.reduce(rates, axis=1)
         at_top = rates == tops[:, None]
         counts = np.count_nonzero(at_top, axis=1)
         for axis in np.flatnonzero(counts >= FLAT_TOP):
@@ -117,12 +117,12 @@ def quantisation_steps(rates: NDArray[np.float64]) -> NDArray[np.float64]:
     Returns:
         (axis,), deg/s; 0 for an axis that hardly ever repeats a value.
     """
-    changes = np.abs(np.diff(rates, axis=1))
     steps = np.zeros(len(rates))
-    repeated = np.count_nonzero(changes == 0, axis=1) > _QUANTISED * changes.shape[1]
-    for axis in np.flatnonzero(repeated & changes.any(axis=1)):
-        moved = changes[axis][changes[axis] > 0]
-        steps[axis] = np.quantile(moved, _STEP_QUANTILE, method="lower")
+    same = np.count_nonzero(rates[:, 1:] == rates[:, :-1], axis=1)
+    for axis in np.flatnonzero(same > _QUANTISED * (rates.shape[1] - 1)):
+        changes = np.abs(np.diff(rates[axis]))
+        if changes.any():
+            steps[axis] = np.quantile(changes[changes > 0], _STEP_QUANTILE, method="lower")
     return steps
 
 

@@ -96,10 +96,12 @@ def excursions(blocks: Blocks, false_alarm: float) -> NDArray[np.integer]:
     """
     limits = -special.ndtri(false_alarm / (2 * blocks.rates.size)) * blocks.noise
     middle = blocks.size // 2
-    medians = np.partition(blocks.rates, middle, axis=-1)[..., middle, None]
-    beyond = np.abs(blocks.rates - medians) > limits[:, None, None]
+    wide = np.flatnonzero((np.ptp(blocks.rates, axis=-1) > limits[:, None]).any(axis=0))
+    rates = blocks.rates[:, wide]  # in all others no two samples are so far apart
+    medians = np.partition(rates, middle, axis=-1)[..., middle, None]
+    beyond = np.abs(rates - medians) > limits[:, None, None]
     block, sample = np.nonzero(beyond.any(axis=0))
-    return np.unique(blocks.starts[block] + sample)
+    return np.unique(blocks.starts[wide[block]] + sample)
 
 
 def bursts(rows: NDArray[np.integer], apart: int) -> NDArray[np.integer]:

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
 
 from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding
 
@@ -84,7 +84,7 @@ class _Steps:
         """
         late = np.where(self.steps < 0, 0.0, self.steps - step * self.counts)
         total = np.cumsum(late)
-        least = pd.Series(total[::-1]).rolling(_AHEAD, min_periods=1).min().to_numpy()[::-1]
+        least = minimum_filter1d(total, _AHEAD, mode="nearest", origin=-(_AHEAD // 2))  # ahead only
         return least - (total - late)
 
 
