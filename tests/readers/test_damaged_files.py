@@ -359,6 +359,31 @@ CASES = {
         matlab(48, b"\x3c\0\0\0\x03\0\0\0", b"\x3c\0\0\x40"),
         Refused(r"an array of \(1073741884, 3\) in"),
     ),
+    "a MATLAB file with an array larger than it, in unsigned numbers": (
+        ANGLES,
+        matlab(40, b"\5\0\0\0\x08\0\0\0\x3c\0\0\0", b"\6\0\0\0\x08\0\0\0\x3c\0\0\x40"),
+        Refused(r"an array of \(1073741884, 3\) in"),
+    ),
+    "a MATLAB file with a size of the class that is not one": (
+        ANGLES,
+        matlab(28, b"\x08\0\0\0", b"\x18"),
+        Refused("an array without a class"),
+    ),
+    "a MATLAB file with an array of reals called complex": (
+        ANGLES,
+        matlab(32, b"\6\0", b"\6\x08"),
+        Refused(r"an array of class 6 of data of types \[6, 5, 1, 9\]"),
+    ),
+    "a MATLAB file with a full array called sparse": (
+        ANGLES,
+        matlab(32, b"\6\0", b"\5"),
+        Refused(r"an array of class 5 of data of types \[6, 5, 1, 9\]"),
+    ),
+    "a MATLAB file with an array whose name takes in its values": (
+        ANGLES,
+        matlab(56, b"\1\0\0\0\0\0\0\0", b"\1\0\0\0\xa8\5"),
+        Refused(r"an array of class 6 of data of types \[6, 5, 1\]"),
+    ),
     "another delimiter": (
         ANGLES,
         replaced((",", "|")),

@@ -1,8 +1,8 @@
 """A look through a MATLAB file of version 5 before SciPy reads it.
 
-SciPy finds the kind of data by a number in the file, which it does not check, and makes room for as
-many values as an array is said to have: one damaged byte can end the process, or fill the memory
-(scipy 1.17).
+SciPy finds the kind of data by a number in the file, which it does not check, looks for as many
+elements as the class of an array has, whether they are there or not, and makes room for as many
+values as it is said to have: one damaged byte can end the process, or fill the memory (scipy 1.17).
 
 Source: MathWorks, MAT-File Format, chapter 1: a header of 128 bytes, then elements of a tag, which
 has the type and the number of bytes, and of data in whole eights. An array is an element of
@@ -16,9 +16,10 @@ from collections.abc import Iterator
 
 _HEADER, _ORDERS = 128, {b"IM": "<", b"MI": ">"}
 _TAG, _EIGHT, _SHORT = 8, 8, 4  # bytes of a tag; of which data fill up whole ones; that a tag holds
+_FLAGS = 8  # bytes with the class of an array, which SciPy takes for granted
 _TYPES = {*range(1, 8), 9, *range(12, 19)}
 _INT32, _UINT32, _ARRAY, _COMPRESSED = 5, 6, 14, 15
-_CLASSES, _SPARSE = range(1, 19), 5
+_CLASSES, _VALUES, _SPARSE = range(1, 19), range(4, 16), 5
 _DEEPEST = 32
 
 
@@ -44,12 +45,16 @@ def check(data: bytes) -> None:
 def _check_array(data: memoryview, order: str, depth: int) -> None:
     parts = list(_elements(data, order))
     kinds = [kind for kind, _ in parts]
-    if kinds[:1] != [_UINT32] or depth > _DEEPEST:
+    if kinds[:1] != [_UINT32] or len(parts[0][1]) != _FLAGS or depth > _DEEPEST:
         raise ValueError(f"an array without a class, or {depth} deep in others")
-    kind = parts[0][1][0] if order == "<" else parts[0][1][3]
+    (flags,) = struct.unpack_from(f"{order}I", parts[0][1])
+    kind, is_complex = flags & 0xFF, flags >> 11 & 1
     if kind not in _CLASSES:
         raise ValueError(f"an array of class {kind}")
-    if kinds[1:2] == [_INT32] and kind != _SPARSE:
+    needed = 4 + 2 * (kind == _SPARSE) + is_complex  # flags, size, name; two of places; values
+    if kind in _VALUES and (len(parts) < needed or {_ARRAY, _COMPRESSED} & {*kinds}):
+        raise ValueError(f"an array of class {kind} of data of types {kinds}")
+    if kinds[1:2] in ([_INT32], [_UINT32]) and kind != _SPARSE:  # SciPy takes either
         lengths = struct.unpack(f"{order}{len(parts[1][1]) // 4}i", parts[1][1])
         if math.prod(lengths) > len(data) or min(lengths) < 0:
             raise ValueError(f"an array of {lengths} in {len(data)} bytes")
