@@ -132,11 +132,11 @@ def npy(array):
 
 
 def matlab(at, old, new):
-    """A structure of an array as MATLAB 5 stores it, with other bytes behind its name."""
+    """A structure of an array, and an array, of MATLAB 5, with other bytes in the former."""
 
     def saved(text):
         buffer = io.BytesIO()
-        scipy.io.savemat(buffer, {"log": {"gyro_dps": np.ones((60, 3))}})
+        scipy.io.savemat(buffer, {"log": {"gyro_dps": np.ones((60, 3))}, "t": np.ones(60)})
         data = buffer.getvalue()
         place = data.index(b"gyro_dps") + at
         assert data[place : place + len(old)] == old

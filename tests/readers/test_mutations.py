@@ -112,7 +112,7 @@ def test_a_mutated_binary_file_gives_a_recording_or_a_message(edits, kind, rates
     elif kind == "npz":
         np.savez(buffer, gyro_dps=rates)
     elif kind == "mat":
-        scipy.io.savemat(buffer, {"log": {"gyro_dps": rates}})
+        scipy.io.savemat(buffer, {"log": {"gyro_dps": rates}, "t": rates[:, 0]})
     else:
         frame.to_parquet(buffer)
     data = buffer.getvalue()
