@@ -222,7 +222,15 @@ def _inside(name: str, label: str) -> str:
 
 def _open_npy(path: Path) -> _Arrays:
     # maps the file, so that a damaged header cannot ask for more memory than there is
-    array: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
+    try:
+        array: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
+    except ValueError as error:
+        if "Python objects" not in str(error):
+            raise
+        raise InputError(
+            f"{path}: expected numbers, got Python objects, which are never unpickled; save the "
+            "columns of numbers alone"
+        ) from error
     if array.ndim != 2 and array.dtype.names is None:  # noqa: PLR2004
         raise InputError(f"{path}: expected shape (n, 3), or named fields, got {array.shape}")
     return _Arrays.of(path, array)
