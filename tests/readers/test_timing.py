@@ -239,6 +239,7 @@ def test_another_rate_is_rejected_with_advice(rate, advice):
 STAMPS = st.one_of(
     arrays(float, st.integers(2, 40), elements=st.sampled_from([0.0, 0.01, 0.02, 0.1, 1.0, 500])),
     arrays(float, st.integers(2, 40), elements=st.one_of(st.integers(0, 60), st.just(np.nan))),
+    arrays(float, st.integers(2, 40), elements=st.sampled_from([0.0, 1e-322, 1e-150, 1.0, 1e306])),
 )
 
 

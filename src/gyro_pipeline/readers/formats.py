@@ -258,8 +258,8 @@ class General(Reader):
         return [rates[number] for number in order]
 
     def time_column(self, table: Table) -> Column | None:
-        """The first column that is named time or timestamp."""
-        stems = [split_unit(name, UNITS)[0].lower() for name in table.names]
+        """The first column that is named time or timestamp, be it in a structure."""
+        stems = [split_unit(name, UNITS)[0].lower().split(".")[-1] for name in table.names]
         return next((n for n, stem in enumerate(stems) if stem in ("time", "timestamp", "t")), None)
 
     def temperature_column(self, table: Table) -> Column | None:

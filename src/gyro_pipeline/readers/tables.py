@@ -187,7 +187,10 @@ class _Arrays:
                 columns[_inside(name, label)] = array[:, number]
         if not columns:
             found = ", ".join(
-                f"{array.dtype} {array.shape} {name}".rstrip() for name, array in arrays.items()
+                f"objects {name}, which are not read"
+                if array.dtype.hasobject
+                else f"{array.dtype} {array.shape} {name}".rstrip()
+                for name, array in arrays.items()
             )
             raise InputError(
                 f"{path}: expected arrays of numbers with a row a sample, such as (n, 3), got "

@@ -33,6 +33,9 @@ _AHEAD = 1000
 _ROUNDS = 4
 """How often gaps are found from the step between samples, and that without the gaps."""
 
+_LEAST, _LARGEST = 1e-100, 1e100
+"""No clock's step, and no clock's time: garbage bytes may be read as such."""
+
 _JITTER = 0.1
 """Scatter of the steps, relative to their mean, that is worth a word."""
 
@@ -102,8 +105,9 @@ def from_stamps(stamps: Floats, unit_s: float | None) -> Timing:
         Rows behind missing samples, which make all later stamps late, and those at which time goes
         back are gaps. What is missing within a burst, or the resolution of stamps, is not seen.
     """
+    stamps = np.where(np.abs(stamps) < _LARGEST, stamps, np.nan)
     every = np.diff(stamps)
-    if len(every) and every.min() > 0 and np.ptp(every) <= _JITTER * every.mean():
+    if len(every) and every.min() > _LEAST and np.ptp(every) <= _JITTER * every.mean():
         return Timing(_rate(every.mean(), unit_s))  # as most are: there is nothing to find
     found = _Steps.between(stamps, unit_s)
     steps, back = found.steps, found.steps < 0
@@ -111,7 +115,7 @@ def from_stamps(stamps: Floats, unit_s: float | None) -> Timing:
         *_at("wrap-around", found.rows[found.wraps], "the counter of the timestamps starts anew"),
         *_at("time order", found.rows[back], "time goes back", REPAIRED),
     ]
-    if not (steps > 0).any():
+    if not steps.max(initial=0.0) > _LEAST:
         text = "timestamps do not advance: the rate is not measured"
         findings.append(Finding("timestamps", KEPT, text))
         return Timing(gap_rows=found.rows[back], findings=tuple(findings))
