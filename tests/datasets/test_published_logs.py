@@ -548,8 +548,8 @@ def test_the_environment_reads_the_published_files_of_all_sensors(server, made_u
 
 
 def test_of_devices_that_are_unseen_those_with_test_recordings_are_tested(server, made_up):
-    only = {"published_address": server.address, "only": {"sensor": "dot"}}
-    done = made_up.run_here("unseen_devices", "published", **only)
+    given = {"published_address": server.address, "only": {"sensor": "dot", "window_s": 10.0}}
+    done = made_up.run_here("unseen_devices", "published", **given, evaluation={"resamples": 100})
     assert done.code == 0, done.output
     assert "dot: IMUs 2, 3, 4 have no test recording and only train" in done.output
     roles = pd.read_csv(made_up.folder / "data/05_model_input/published_all/dot/devices.csv")

@@ -160,7 +160,7 @@ SOUND = "".join(
 ).encode()
 
 
-@settings(SEVERAL, max_examples=20)
+@settings(SEVERAL, max_examples=12)
 @given(edits=st.lists(EDITS, min_size=1, max_size=3))
 def test_a_folder_with_a_mutated_file_is_stored_whole_and_the_same_again(edits, parameters):
     damaged = SOUND
