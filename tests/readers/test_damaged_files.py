@@ -175,6 +175,7 @@ CASES = {
         Read(rate_hz=100),
     ),
     "no trailing delimiter in the header": (ANGLES, headers("w_z,", "w_z"), Read()),
+    "a header that is a comment": (GENERAL, lambda text: f"# {text}", Read(rate_hz=100)),
     "sep line": (ANGLES, lambda text: f"sep=,\n{text}", Read()),
     "sep line of another delimiter": (
         ANGLES,

@@ -15,6 +15,7 @@ from gyro_pipeline.readers.text import TextTable
 
 _HEAD = 1 << 14
 _SEPARATOR_LINE = re.compile(r'"?sep=(.)"?,*', re.IGNORECASE)
+_COMMENT = "#% "  # before a header, as NumPy and MATLAB write it
 _ZEROS = 0.1  # a larger share of zero bytes: not a text
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 _UTF8 = b"\xef\xbb\xbf"
@@ -163,7 +164,7 @@ def _names(path: Path, header: _Line | None, rows: _Rows) -> tuple[str, ...]:
     width = len(rows.fields)
     if header is None:
         return ("",) * width
-    names = split(header.text, rows.delimiter)
+    names = split(header.text.lstrip(_COMMENT), rows.delimiter)
     ends = bool(names[-1]), bool(rows.fields[-1])
     if ends == (False, True) and len(names) == width + 1:
         return tuple(names[:-1])
