@@ -1,7 +1,9 @@
+import errno
 import logging
 import os
 import pickle
 
+import h5py
 import numpy as np
 import pytest
 from kedro.io import DatasetError
@@ -271,6 +273,47 @@ def test_that_a_file_could_not_be_read_this_time_is_not_kept(tmp_path):
         entry.read()
     (tmp_path / "away").rename(tmp_path / "1.csv")
     assert len(entry.read().samples) == 10
+
+
+def chained(*causes):
+    """An InputError from the first of them, which is from the second, and so on."""
+    error = InputError("1.csv: refused")
+    last = error
+    for cause in causes:
+        last.__cause__ = cause
+        last = cause
+    return error
+
+
+@pytest.mark.parametrize(
+    ("causes", "kept"),
+    [
+        ([], 1),
+        ([OSError("truncated file")], 1),  # as h5py and Arrow say it of a damaged file
+        ([OSError(errno.EIO, "Input/output error")], 0),
+        ([OSError("Reader needs file name"), PermissionError(errno.EACCES, "denied")], 0),  # SciPy
+        ([MemoryError()], 0),
+    ],
+)
+def test_only_reasons_that_lie_in_the_file_are_kept(tmp_path, monkeypatch, causes, kept):
+    def read_log(*_):
+        raise chained(*causes)
+
+    monkeypatch.setattr(parse_cache, "read_log", read_log)
+    put(tmp_path, "1.csv")
+    assert read_all(file_logs(tmp_path, "{imu}.csv")) == [None]
+    assert len(list(tmp_path.glob(".read/*"))) == kept
+
+
+def test_why_a_damaged_hdf5_file_is_refused_is_kept(tmp_path):
+    path = tmp_path / "1.h5"
+    with h5py.File(path, "w") as file:
+        file["w_x (deg/s)"] = np.zeros(5000)
+    path.write_bytes(path.read_bytes()[:-1000])
+    (entry,) = file_logs(tmp_path, "{imu}.h5").load().entries
+    with pytest.raises(InputError, match="truncated"):
+        entry.read()
+    assert len(list((tmp_path / ".read").iterdir())) == 1
 
 
 def test_files_of_every_kind_are_parsed_once(tmp_path, counted):

@@ -12,9 +12,6 @@ from gyro_pipeline.logs import Finding, Log
 from gyro_pipeline.parameters import ReaderOptions
 from gyro_pipeline.readers import read_log
 
-_PASSING = (OSError, MemoryError)
-"""Reasons for which a file may be refused that say nothing of the file."""
-
 
 @dataclass(frozen=True)
 class Reading:
@@ -53,9 +50,20 @@ class Reading:
         try:
             return read_log(self.path, self.options, self.rate_hz)
         except InputError as error:
-            if isinstance(error.__cause__, _PASSING):
+            if _passes(error.__cause__):
                 raise
             return error
+
+
+def _passes(cause: BaseException | None) -> bool:
+    """Whether it, or what it comes from, says nothing of the file.
+
+    Of a damaged file libraries raise OSError as well, but only the system's has a number.
+    """
+    if cause is None:
+        return False
+    of_system = isinstance(cause, OSError) and cause.errno is not None
+    return of_system or isinstance(cause, MemoryError) or _passes(cause.__cause__)
 
 
 def _save(known: Log | InputError, path: Path) -> None:
