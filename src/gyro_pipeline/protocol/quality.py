@@ -57,7 +57,7 @@ _LEAST_BLOCK = 5
 
 
 _TURNS = 0.5
-"""Between medians of even and odd rows, over the noise. At most 0.1 on the public files."""
+"""Between medians of even and odd rows, over the noise. At most 0.06 on the public files."""
 
 
 @dataclass(frozen=True)
