@@ -80,6 +80,10 @@ def interleaved(rates):
     rates[1::2] += [0.0, 0.0, 0.8 * SIGMA]
 
 
+def garbled(rates):
+    rates[200, 1] = 2000
+
+
 def rounded(step):
     def change(rates):
         rates[:] = step * np.round(rates / step)
@@ -99,6 +103,7 @@ def test_a_sound_recording_is_kept_whole_without_a_finding(samples, quality):
         (held, {"stuck values": REPAIRED}, (400, ROWS)),
         (lost, {"non-finite values": REPAIRED, "dropouts": REPAIRED}, (702, ROWS)),
         (knocked, {"shocks": REPAIRED}, (554, ROWS)),  # and half a second behind it
+        (garbled, {"shocks": REPAIRED}, (251, ROWS)),
         (clipped, {"saturation": REPAIRED, "too short": REJECTED}, None),
         (turned, {"motion": REJECTED}, None),
         (rotating, {"motion": REJECTED}, None),
