@@ -134,13 +134,9 @@ def with_fields(rates):
 
 
 def save_v73_struct(path, log):
-    """As MATLAB does: a group, its arrays transposed."""
-    with h5py.File(path, "w", userblock_size=512) as file:
-        for name, array in log.items():
-            file[f"log/{name}"] = np.atleast_2d(array).T if array.ndim == 2 else array[None]
-        file["#refs#/a"] = np.ones((60, 3))
-    with path.open("r+b") as file:
-        file.write(b"MATLAB 7.3 MAT-file".ljust(512))
+    """A structure is a group; what cells refer to is beside it."""
+    arrays = {f"log/{name}": array for name, array in log.items()}
+    save_v73(path, arrays | {"#refs#/a": np.ones((60, 3))})
 
 
 @pytest.mark.parametrize(

@@ -183,9 +183,10 @@ def _gaps(found: _Steps, clock: _Clock) -> tuple[float, Mask, int]:
     for _ in range(_ROUNDS):
         delays = found.delays(step)
         gaps = delays > max(step / 2, clock.coarseness * (1 + 1e-6))  # differences are rounded
-        stalls = (steps > 1.5 * step) & ~gaps
-        twice = (steps == 0) & (clock.coarseness < step / 2) & ~stalls.any()  # one row too many
-        step = found.per_row(clock.counted & (steps >= 0) & ~gaps & ~twice)
+        counted = clock.counted & (steps >= 0) & ~gaps
+        if clock.coarseness < step / 2 and not ((steps > 1.5 * step) & ~gaps).any():
+            counted &= steps > 0  # nothing catches up: a row of a repeated stamp is one too many
+        step = found.per_row(counted)
     return step, gaps, max(round(delays[gaps].sum() / step), 1)
 
 
