@@ -197,6 +197,87 @@ def test_a_writer_that_stalls_and_catches_up_loses_nothing():
     assert timing.rate_hz == pytest.approx(120, rel=1e-9)
 
 
+UNITS = [(1.0, 1.0), (1e-3, 1e3), (1e-6, 1e6)]
+
+
+def ticks(rate, tick, rows):
+    """Stamps of a clock that knows whole ticks, from 1,000 s on."""
+    return np.floor((1000 + np.arange(rows) / rate) / tick + 1e-6) * tick
+
+
+@pytest.mark.parametrize(("unit_s", "scale"), UNITS)
+@pytest.mark.parametrize(
+    ("rate", "tick", "rows", "stall_s"),
+    [
+        (1000, 1e-3, 12_000, 0.5),
+        (100, 1e-3, 12_000, 2.0),
+        (120, 1e-2, 1500, 0.5),
+        (400, 1e-3, 1500, 0.5),
+        (1600, 1e-3, 1500, 0.1),
+        (833, 1e-3, 12_000, 2.0),
+        (104, 1e-2, 12_000, 1.0),
+    ],
+)
+def test_a_stall_is_none_whatever_the_rate_the_ticks_and_the_unit(
+    rate, tick, rows, stall_s, unit_s, scale
+):
+    stamps = ticks(rate, tick, rows)
+    late = slice(rows // 2, rows // 2 + round(stall_s * rate))
+    stamps[late] = stamps[late.stop]
+    timing = from_stamps(stamps * scale, unit_s)
+    assert timing.rate_hz == pytest.approx(rate, rel=1e-3)
+    assert not len(timing.gap_rows)
+
+
+@pytest.mark.parametrize(("unit_s", "scale"), UNITS)
+@pytest.mark.parametrize(
+    ("rate", "tick"), [(1000, 1e-3), (120, 1e-2), (833, 1e-3), (100, 0.1), (97, 0.1), (250, 1e-6)]
+)
+def test_a_jump_of_the_clock_is_a_gap_and_does_not_spoil_the_rate(rate, tick, unit_s, scale):
+    first, middle = ticks(rate, tick, 6000), ticks(rate, tick, 6000)
+    first[0] = 0
+    middle[3000:] += 3600
+    for stamps, row in ((first, 1), (middle, 3000)):
+        timing = from_stamps(stamps * scale, unit_s)
+        assert timing.rate_hz == pytest.approx(rate, rel=5e-3)
+        assert timing.gap_rows.tolist() == [row]
+
+
+@pytest.mark.parametrize("stray", [0.0, 4e9, 1e150, np.nan])
+@pytest.mark.parametrize(("rate", "tick"), [(1000, 1e-3), (120, 1e-2), (100, 0.1), (250, 1e-6)])
+def test_a_stray_stamp_is_ignored(rate, tick, stray):
+    stamps = ticks(rate, tick, 6000)
+    stamps[[700, 3000]] = stray
+    timing = from_stamps(stamps, 1.0)
+    assert timing.rate_hz == pytest.approx(rate, rel=2e-3)
+    assert not len(timing.gap_rows)
+    if stray < 1e100:
+        assert "ignored: 2 times, at rows 700, 3000" in timing.findings[0].detail
+
+
+def test_swapped_rows_are_out_of_order_and_no_strays():
+    stamps = np.arange(N) / 100
+    stamps[[400, 401]] = stamps[[401, 400]]
+    assert 401 in from_stamps(stamps, 1.0).gap_rows
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_last_stamp_may_be_late(seed):
+    late = np.random.default_rng(seed).exponential(0.2, N)
+    late[-1] = 0.9
+    written = np.maximum.accumulate((np.arange(N) + late) / 100)
+    timing = from_stamps(np.round(written, 4), 1.0)
+    assert not len(timing.gap_rows)
+
+
+def test_a_stray_packet_number_is_ignored():
+    counts = np.arange(N, dtype=float)
+    counts[300] = 60_000
+    timing = from_counter(counts, 16)
+    assert not len(timing.gap_rows)
+    assert timing.findings[0].detail.endswith("and ignored: once, at row 300")
+
+
 @pytest.mark.parametrize("bits", [8, 16])
 def test_a_packet_counter_may_wrap_but_not_skip(bits):
     counts = np.mod(np.arange(N) + 2**bits - 100, 2**bits).astype(float)

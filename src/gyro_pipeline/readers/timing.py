@@ -1,6 +1,8 @@
 """Sample rate and gaps, from timestamps and packet counters."""
 
 from dataclasses import dataclass, field
+from math import floor, log10
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +19,6 @@ _SHORT = 0.1
 _LONG, _LONG_TIME = 0.005, 0.5
 """The same, if a larger share is far above it, and makes up more of the time than this."""
 
-_HOLE = 3.0
-"""A step so many times longer than those from burst to burst is none of them."""
 
 _REGULAR, _MOST = 0.25, 0.75
 """Rounding lengthens steps at intervals of which most differ by less than this; losses come at
@@ -27,8 +27,28 @@ random ones."""
 _FEW, _MANY = 3, 10
 """Long steps that it takes to tell: of stamps as coarse as the step, and of others."""
 
-_AHEAD = 1000
+_BLOCKS, _ADVANCES = 20, 5
+"""Parts of a recording whose median is taken, at most: one stall, gap or jump is in few of them;
+and steps forward in each of them, at least."""
+
+_ALIKE = 3.0
+"""Parts are alike that differ from the median by so many times what they differ in the median."""
+
+_FAR = 10
+"""So many steps beside both of its neighbours, a stamp is no measured time."""
+
+_AHEAD = 4000
 """Rows within which a stamp that was written late is followed by one in time."""
+
+_LAST, _LATE = 10, 3.0
+"""Rows after which it is known whether stamps stay late; the last are judged by how far the middle
+60 % of the steps are apart, so many times."""
+
+_HOLE = 3.0
+"""A step so many times longer than those from burst to burst is none of them."""
+
+_ROUNDED = 1e-6
+"""Differences of rounded stamps vary by so much of themselves."""
 
 _ROUNDS = 4
 """How often gaps are found from the step between samples, and that without the gaps."""
@@ -73,11 +93,30 @@ class _Steps:
     def between(cls, stamps: Floats, unit_s: float | None) -> "_Steps":
         rows = np.flatnonzero(np.isfinite(stamps))
         steps, wraps = _unwrapped(np.diff(stamps[rows]), unit_s)
+        steps[np.abs(steps) < _LEAST] = 0.0
         return cls(rows[1:], np.diff(rows), steps, wraps)
 
     def per_row(self, where: Mask) -> float:
-        """Mean of those steps, for each row."""
-        return float(self.steps[where].sum() / self.counts[where].sum())
+        """Mean of those steps, for each row; 0 without any."""
+        return float(self.steps[where].sum() / max(self.counts[where].sum(), 1))
+
+    def by_block(self, values: NDArray[Any]) -> Floats:
+        """Sums of (k,) values in parts of the recording that hold some steps forward each."""
+        blocks = max(min(int(np.count_nonzero(self.steps > 0)) // _ADVANCES, _BLOCKS), 1)
+        starts = np.linspace(0, len(values), blocks, endpoint=False, dtype=np.intp)
+        return np.add.reduceat(values, starts, dtype=np.float64)
+
+    def usual_per_row(self, where: Mask, coarseness: float) -> float:
+        """The same, of parts of the recording that agree with most others."""
+        rows = self.by_block(where * self.counts)
+        slopes = self.by_block(where * self.steps) / np.maximum(rows, 1)
+        known = rows > 0
+        if not known.any():
+            return 0.0
+        rows, slopes = rows[known], slopes[known]
+        apart = np.abs(slopes - np.quantile(slopes, 0.5, method="lower"))
+        alike = apart <= np.maximum(_ALIKE * np.median(apart), 2 * coarseness / rows)
+        return float(np.average(slopes[alike], weights=rows[alike]))
 
     def delays(self, step: float) -> Floats:
         """How much later than the stamp before one lets expect it and all that follow are.
@@ -105,17 +144,18 @@ def from_stamps(stamps: Floats, unit_s: float | None) -> Timing:
         Rows behind missing samples, which make all later stamps late, and those at which time goes
         back are gaps. What is missing within a burst, or the resolution of stamps, is not seen.
     """
-    stamps = np.where(np.abs(stamps) < _LARGEST, stamps, np.nan)
+    stamps, strays = _without_strays(np.where(np.abs(stamps) < _LARGEST, stamps, np.nan))
     every = np.diff(stamps)
     if len(every) and every.min() > _LEAST and np.ptp(every) <= _JITTER * every.mean():
         return Timing(_rate(every.mean(), unit_s))  # as most are: there is nothing to find
     found = _Steps.between(stamps, unit_s)
     steps, back = found.steps, found.steps < 0
     findings = [
+        *_at("timestamps", strays, "a timestamp is far from those beside it, and ignored"),
         *_at("wrap-around", found.rows[found.wraps], "the counter of the timestamps starts anew"),
         *_at("time order", found.rows[back], "time goes back", REPAIRED),
     ]
-    if not steps.max(initial=0.0) > _LEAST:
+    if not steps.max(initial=0.0) > 0:
         text = "timestamps do not advance: the rate is not measured"
         findings.append(Finding("timestamps", KEPT, text))
         return Timing(gap_rows=found.rows[back], findings=tuple(findings))
@@ -146,8 +186,9 @@ class _Clock:
 
     @classmethod
     def of(cls, found: _Steps, stamps: Floats) -> "_Clock":
-        steps, forward = found.steps, found.steps >= 0
-        median = max(float(np.quantile(steps, 0.5, method="lower")), 0.0)
+        steps = found.steps
+        forward = np.maximum(steps, 0.0)
+        median = float(np.quantile(forward / found.counts, 0.5, method="lower"))
         usual = median * found.counts
         long = steps > 1.5 * usual
 
@@ -158,35 +199,44 @@ class _Clock:
         rows = found.rows[double & (found.delays(median) > median / 2)]
         regular = len(rows) >= (_FEW if coarse else _MANY) and _at_regular_intervals(rows)
         if coarse and len(rows) >= _FEW and not regular:
-            resolution = 0.0  # of an exact clock, whose step it is
+            resolution, coarse = 0.0, False  # of an exact clock, whose step it is
 
-        short = forward & (steps < usual / 2 - resolution)
+        size, time = found.by_block(found.counts), found.by_block(forward)
+        short = found.by_block((steps >= 0) & (steps < usual / 2 - resolution)) / size
+        in_long = found.by_block(np.where(long, steps, 0.0)) / np.where(time > 0, time, np.inf)
         many = median == 0 or long.mean() > _LONG
-        lasts = steps[long].sum() > _LONG_TIME * steps[forward].sum()
-        if regular or short.mean() > _SHORT or (many and lasts):
-            between = double if regular else steps >= steps[forward].mean()
-            burst = float(np.quantile(steps[between], 0.95))
-            ends = np.flatnonzero(between)
-            counted = np.ones(len(steps), bool)
-            counted[: ends[0] + 1] = counted[ends[-1] + 1 :] = len(ends) == 1
-            ordinary = forward & (steps <= _HOLE * burst)
-            return cls(found.per_row(ordinary & counted), burst, True, counted)
+        lasts = many and np.median(in_long) > _LONG_TIME
+        in_bursts = bool(regular or np.median(short) > _SHORT or lasts)
+        if not (in_bursts or coarse):
+            ordinary = (steps >= 0) & (np.abs(steps - usual) <= usual / 2 + resolution)
+            step = found.per_row(ordinary)
+            return cls(step, resolution, False, ordinary | (found.counts == 1))
 
-        ordinary = forward & (np.abs(steps - usual) <= usual / 2 + resolution)
-        return cls(found.per_row(ordinary), resolution, False, ordinary | (found.counts == 1))
+        # stamps do not tell steps from row to row, but those of whole blocks
+        between = forward >= found.usual_per_row(steps >= 0, 0.0) * (1 - _ROUNDED)
+        burst = float(np.quantile(steps[between], 0.95))
+        counted = np.ones(len(steps), bool)
+        ends = np.flatnonzero(between)
+        if in_bursts and len(ends) > 1:
+            counted[: ends[0] + 1] = counted[ends[-1] + 1 :] = False
+        ordinary = counted & (steps >= 0) & (steps <= _HOLE * burst)
+        return cls(found.usual_per_row(ordinary, burst), burst, in_bursts, counted)
 
 
 def _gaps(found: _Steps, clock: _Clock) -> tuple[float, Mask, int]:
     """The step from sample to sample, behind which steps samples are missing, and how many."""
-    steps, step = found.steps, clock.step
+    steps, step = found.steps, clock.step or found.per_row(found.steps > 0)
     gaps, delays = steps < 0, steps
+    least_late = np.zeros(len(steps))
+    least_late[-_LAST:] = _LATE * np.ptp(np.quantile(steps / found.counts, [0.2, 0.8]))
     for _ in range(_ROUNDS):
         delays = found.delays(step)
-        gaps = delays > max(step / 2, clock.coarseness * (1 + 1e-6))  # differences are rounded
+        gaps = delays > np.maximum(least_late, max(step / 2, clock.coarseness * (1 + _ROUNDED)))
         counted = clock.counted & (steps >= 0) & ~gaps
         if clock.coarseness < step / 2 and not ((steps > 1.5 * step) & ~gaps).any():
             counted &= steps > 0  # nothing catches up: a row of a repeated stamp is one too many
-        step = found.per_row(counted)
+        step = found.usual_per_row(counted, clock.coarseness) or step
+    step = found.per_row(counted) or step
     return step, gaps, max(round(delays[gaps].sum() / step), 1)
 
 
@@ -231,6 +281,7 @@ def from_counter(counts: Floats, bits: int) -> Timing:
     """
     if (np.diff(counts) == 1).all():  # as most are
         return Timing()
+    counts, strays = _without_strays(counts)
     there = np.flatnonzero(np.isfinite(counts))
     rows, steps = there[1:], np.diff(counts[there])
     broken = np.mod(steps - np.diff(there), 2.0**bits) != 0
@@ -239,6 +290,7 @@ def from_counter(counts: Floats, bits: int) -> Timing:
     return Timing(
         gap_rows=rows[broken],
         findings=(
+            *_at("packet counter", strays, "a number is far from those beside it, and ignored"),
             *_at("wrap-around", rows[wraps], f"the {bits}-bit packet counter starts anew"),
             *_at("packet counter", rows[broken], what, REPAIRED),
         ),
@@ -278,12 +330,33 @@ def _unwrapped(steps: Floats, unit_s: float | None) -> tuple[Floats, Mask]:
     return steps, wraps
 
 
+def _without_strays(stamps: Floats) -> tuple[Floats, Rows]:
+    """Stamps, NaN where one is far from both beside it, which are near each other; and where.
+
+    Of these the time is not known, but the samples may be whole.
+    """
+    rows = np.flatnonzero(np.isfinite(stamps))
+    before, here, after = (stamps[rows[n : len(rows) - 2 + n]] for n in range(3))
+    away = np.maximum(before - here, here - after)
+    if not (away > 0).any():  # as most are
+        return stamps, rows[:0]
+    near = np.maximum(after - before, np.median(after - before) / 2)
+    strays = rows[1:-1][(after >= before) & (away > _FAR * near)]
+    known = stamps.copy()
+    known[strays] = np.nan
+    return known, strays
+
+
 def _resolution(stamps: Floats, step: float) -> float:
-    """Decimal unit that all stamps are multiples of, but for how floats are rounded."""
+    """Decimal unit that all stamps are multiples of, but for how floats are rounded.
+
+    It is looked for from the step, in whichever unit that is, to a hundredth of it.
+    """
+    if step <= 0:
+        return 0.0
     rounded = 4 * np.spacing(np.abs(stamps).max())
-    for unit in (1.0, 0.1, 0.01, 1e-3, 1e-4):
-        if unit < step / 100:
-            break
+    largest = floor(log10(step) + _ROUNDED)
+    for unit in (10.0**power for power in range(largest, largest - 3, -1)):
         if (np.abs(stamps - unit * np.rint(stamps / unit)) <= rounded).all():
             return unit
     return 0.0
