@@ -84,7 +84,7 @@ class Sensor(Parameter):
         return self
 
 
-RateUnits = Literal["deg/s", "rad/s", "mdps", "raw"]
+RateUnits = Literal["deg/s", "rad/s", "mdps", "mrad/s", "deg/h", "raw"]
 TimeUnits = Literal["s", "ms", "us", "ns"]
 Column = Annotated[str | Annotated[int, Field(ge=0)], Field(description="a name, or from 0")]
 
@@ -104,7 +104,9 @@ class ReaderOptions(Parameter):
     )
     time_column: Column | None = None
     time_units: TimeUnits | None = Field(None, description="of the time column")
-    temperature_column: Column | None = Field(None, description="degrees Celsius")
+    temperature_column: Column | None = Field(
+        None, description="degrees Celsius, unless its header says another unit"
+    )
     counter_column: Column | None = Field(None, description="counts packets, one a row")
     counter_bits: int | None = Field(
         None, ge=2, le=32, description="it starts anew after 2 to this; null: the format's, or 16"

@@ -6,6 +6,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import scipy.io
 from pydantic import ValidationError
@@ -53,12 +55,41 @@ def test_a_temperature_column_is_kept(good, read):
     np.testing.assert_array_equal(read(good["openlog_artemis"]).temperature_c, 25.0 + np.arange(60))
     np.testing.assert_array_equal(read(good["general"]).temperature_c, 25 + np.arange(60) / 8)
     assert read(good["ngimu"]).temperature_c is None
-    log = read(good["ngimu"], temperature_column="Barometer")
-    assert (log.temperature_c == 1013).all()
+    with pytest.raises(InputError, match="expected a temperature in degC.*'Barometer .hPa.'"):
+        read(good["ngimu"], temperature_column="Barometer")
 
 
-def test_a_temperature_in_fahrenheit_is_not_taken_for_celsius(good, read):
-    assert read(good["general"].replace("(°C)", "(°F)")).temperature_c is None
+@pytest.mark.parametrize(
+    ("header", "first_c"),
+    [("temperature (°F)", -3.8888889), ("T_temp [K]", -248.15), ("imu_degC", 25), ("temp_c", 25)],
+)
+def test_temperatures_become_degrees_celsius(header, first_c, good, read):
+    text = good["general"].replace("temperature (°C)", header)
+    for options in ({}, {"temperature_column": 1}):
+        log = read(text, **options)
+        assert log.temperature_c[0] == pytest.approx(first_c)
+        assert not log.findings
+
+
+def test_a_temperature_without_unit_is_kept_and_that_is_said(good, read):
+    log = read(good["general"].replace("temperature (°C)", "Temperature"))
+    np.testing.assert_array_equal(log.temperature_c, 25 + np.arange(60) / 8)
+    (said,) = log.findings
+    assert said.detail == "'Temperature' has no unit and is taken for degrees Celsius"
+
+
+@pytest.mark.parametrize("kind", [float, str])
+def test_of_two_temperatures_none_is_kept_and_text_is_none(kind, rates, read):
+    table = pd.DataFrame({f"g{axis}_dps": rates[:, n] for n, axis in enumerate("xyz")})
+    table["temp_board"] = pd.Series(np.arange(60.0)).astype(kind)
+    log = read(table.to_parquet, name="log.parquet")
+    assert (log.temperature_c is None) == (kind is str)
+    table["temp_gyro"] = 30.0
+    log = read(table.to_parquet, name="log.parquet")
+    assert log.temperature_c is None
+    assert "none of 'temp_board', 'temp_gyro' is kept" in log.findings[-1].detail
+    log = read(table.to_parquet, name="log.parquet", temperature_column="temp_gyro")
+    assert (log.temperature_c == 30).all()
 
 
 @pytest.mark.parametrize("header", ["sep=,\n", "", "DeviceTag:,1\nSyncStatus:,0\n\n"])
@@ -222,7 +253,8 @@ def test_the_first_of_parquets_times_may_be_missing(times, rates, read):
 @pytest.mark.parametrize(
     "header",
     ["X (deg/s),Y (deg/s),Z (deg/s)", "gx_dps,gy_dps,gz_dps", "w x [°/s],w y [°/s],w z [°/s]",
-     "X (DPS),Y (DPS),Z (DPS)", "a.x (deg s^-1),a.y (deg s^-1),a.z (deg s^-1)"],
+     "X (DPS),Y (DPS),Z (DPS)", "a.x (deg s^-1),a.y (deg s^-1),a.z (deg s^-1)",
+     "gx deg per s,gy deg per s,gz deg per s", "gx_degps,gy_degps,gz_degps"],
 )  # fmt: skip
 def test_units_of_a_header_in_the_spellings_that_are_met(header, rates, read):
     rows = "\n".join(f"{k},{x},{y},{z}" for k, (x, y, z) in enumerate(rates.tolist()))
@@ -282,8 +314,68 @@ def test_a_row_of_units_is_not_overruled(good, rates, read):
     assert log.rate_hz == pytest.approx(1000)
     with pytest.raises(InputError, match="the header says rad/s.*and units of the options deg/s"):
         read(text, columns=(1, 2, 3), units="deg/s")
-    with pytest.raises(InputError, match="expected columns of angular rate about x, y, z"):
-        read(text)
+    by_name = read(text.replace("t;wx", "t;gyro_x"), columns=("gyro_x", "wy", "wz"))
+    np.testing.assert_allclose(by_name.samples, np.degrees(rates))
+    told = read(text)
+    np.testing.assert_allclose(told.samples, np.degrees(rates))
+    assert told.rate_hz == pytest.approx(1000)
+
+
+@pytest.mark.parametrize(
+    "line", ["# units: rad/s", "# angular rate in rad/s, time in us", "[rad s-1]"]
+)
+def test_a_format_whose_first_lines_say_another_unit_is_refused(line, good, rates, read):
+    table = good["movella_dot"][good["movella_dot"].index("PacketCounter") :]
+    with pytest.raises(InputError, match="of this format is deg/s, but lines above.*say rad/s"):
+        read(f"{line}\n{table}")
+    log = read(f"{line}\n{table}", units="rad/s")
+    np.testing.assert_allclose(log.samples, np.degrees(rates), rtol=1e-14)
+    assert not log.findings
+    (said,) = read(f"{line}\n{table}", units="deg/s").findings
+    assert said.detail == "deg/s, by units of the options; lines above the rows say rad/s"
+    assert not read(f"{line.replace('rad', 'deg')}\n{table}").findings
+
+
+@pytest.mark.parametrize("name", ["gx [frob]", "gx (1/s)"])
+def test_options_overrule_an_unknown_unit_of_the_header_and_say_so(name, rates, read):
+    names = [name.replace("x", axis) for axis in "xyz"]
+    rows = "\n".join(f"{x},{y},{z}" for x, y, z in rates.tolist())
+    log = read(f"{','.join(names)}\n{rows}\n", units="deg/s")
+    assert "which is not known" in log.findings[0].detail
+    axes = read(f"gyro[x],gyro[y],gyro[z]\n{rows}\n", units="deg/s")
+    assert checks(axes) == [("timestamps", "kept")]
+
+
+@pytest.mark.parametrize(
+    ("unit", "deg_per_s"),
+    [("rad s^-1", 180 / np.pi), ("rad·s⁻¹", 180 / np.pi), ("rad*s^-1", 180 / np.pi),
+     ("Rad. per second", 180 / np.pi), ("mrad/s", 0.18 / np.pi), ("deg/h", 1 / 3600),
+     ("°/h", 1 / 3600), ("m°/s", 1e-3)],
+)  # fmt: skip
+def test_units_of_a_header_scale_the_rates(unit, deg_per_s, rates, read):
+    rows = "\n".join(f"{x},{y},{z}" for x, y, z in rates.tolist())
+    log = read(f"gx [{unit}],gy [{unit}],gz [{unit}]\n{rows}\n")
+    np.testing.assert_allclose(log.samples, rates * deg_per_s)
+    with pytest.raises(InputError, match="the header says .* and units of the options deg/s"):
+        read(f"gx [{unit}],gy [{unit}],gz [{unit}]\n{rows}\n", units="deg/s")
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".h5"])
+def test_units_in_attributes_of_columns_count(suffix, rates, read):
+    def save(path):
+        if suffix == ".h5":
+            with h5py.File(path, "w") as file:
+                file["gyro"] = rates
+                file["gyro"].attrs["units"] = "rad/s"
+            return
+        fields = [pa.field(f"gyro.{n}", pa.float64(), metadata={"unit": "rad/s"}) for n in "xyz"]
+        pq.write_table(pa.table(list(rates.T), schema=pa.schema(fields)), path)
+
+    for options in ({}, {"columns": ("gyro.x", "gyro.y", "gyro.z")}):
+        log = read(save, name=f"log{suffix}", **options)
+        np.testing.assert_allclose(log.samples, np.degrees(rates))
+    with pytest.raises(InputError, match="the header says rad/s"):
+        read(save, name=f"log{suffix}", units="deg/s")
 
 
 def test_the_header_wins_over_the_format(good, rates, read):
@@ -293,7 +385,7 @@ def test_the_header_wins_over_the_format(good, rates, read):
     np.testing.assert_allclose(read(text).samples, np.degrees(rates), rtol=1e-14)
 
 
-@pytest.mark.parametrize("unit", ["deg/h", "rpm", "mrad/s", "LSB"])
+@pytest.mark.parametrize("unit", ["rpm", "rev/s", "LSB"])
 def test_an_unknown_unit_in_the_header_is_refused_even_of_a_known_format(unit, good, read):
     text = good["movella_dot"]
     for axis in "XYZ":

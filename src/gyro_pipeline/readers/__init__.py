@@ -39,6 +39,10 @@ def read_log(path: Path, options: ReaderOptions, expected_rate_hz: float | None 
     counts = Timing()
     if layout.counter is not None:
         counts = from_counter(column[layout.counter], layout.counter_bits)
+    temperature_c = None
+    if layout.temperature is not None and np.isfinite(column[layout.temperature]).any():
+        a, b = layout.celsius
+        temperature_c = a * column[layout.temperature] + b
     rate: tuple = ()
     if stamps.rate_hz is not None and expected_rate_hz is not None:
         rate = check_rate(stamps.rate_hz, expected_rate_hz, options.rate_tolerance_pct)
@@ -46,6 +50,6 @@ def read_log(path: Path, options: ReaderOptions, expected_rate_hz: float | None 
         samples=np.stack([column[n] for n in layout.rates]).T * layout.scale_dps,
         rate_hz=stamps.rate_hz,
         gap_rows=np.union1d(stamps.gap_rows, counts.gap_rows),
-        temperature_c=None if layout.temperature is None else column[layout.temperature],
+        temperature_c=temperature_c,
         findings=(*damage, *layout.findings, *stamps.findings, *counts.findings, *rate),
     )

@@ -12,6 +12,7 @@ from gyro_pipeline.conventions import AXES, InputError
 from gyro_pipeline.logs import KEPT, Finding
 from gyro_pipeline.parameters import Column, RateUnits, ReaderOptions, TimeUnits
 from gyro_pipeline.readers.headers import (
+    CELSIUS,
     DEG_PER_S,
     SECONDS,
     TIME_UNITS,
@@ -21,6 +22,7 @@ from gyro_pipeline.readers.headers import (
     listed,
     matching,
     rate_unit,
+    rate_units_in,
     split_unit,
 )
 from gyro_pipeline.readers.tables import Table
@@ -35,7 +37,8 @@ class Layout:
         scale_dps: deg/s in one unit of them.
         time: Timestamps.
         time_s: Seconds in one unit of them; None: not known.
-        temperature: Degrees Celsius.
+        temperature: Degrees Celsius are ``celsius[0]`` times it, plus ``celsius[1]``.
+        celsius: As above.
         counter: Packets, one more each row.
         counter_bits: The counter starts anew after ``2**counter_bits``.
         findings: What the header does not say.
@@ -46,6 +49,7 @@ class Layout:
     time: int | None
     time_s: float | None
     temperature: int | None
+    celsius: tuple[float, float]
     counter: int | None
     counter_bits: int
     findings: tuple[Finding, ...]
@@ -61,7 +65,6 @@ class Reader:
     units: ClassVar[RateUnits | None] = None
     time: ClassVar[str | None] = None
     time_units: ClassVar[TimeUnits | None] = None
-    temperature: ClassVar[str | None] = None
     counter: ClassVar[str | None] = None
     counter_bits: ClassVar[int] = 16
 
@@ -78,10 +81,6 @@ class Reader:
     def time_column(self, table: Table) -> Column | None:
         """The column of the timestamps, if there is one."""
         return self._if_there(table, self.time)
-
-    def temperature_column(self, table: Table) -> Column | None:
-        """The column of the temperature, if there is one."""
-        return self._if_there(table, self.temperature)
 
     def layout(self, table: Table, options: ReaderOptions, where: str) -> Layout:
         """Find the columns and their units: what options say, the header, the format, in turn.
@@ -101,17 +100,19 @@ class Reader:
         if len(set(rates)) < len(AXES):
             raise InputError(f"{where}: expected three columns of rates, got {list(columns)}")
         time = number(options.time_column, self.time_column(table))
-        scale_dps, by_format = self._scale([names[n] for n in rates], options, where)
+        scale_dps, of_unit = self._scale(table, rates, options, where)
+        temperature, celsius, of_temperature = self._temperature(table, options, where)
         time_s, without_unit = self._time_unit(table, time, options, where)
         return Layout(
             rates=rates,
             scale_dps=scale_dps,
             time=time,
             time_s=time_s,
-            temperature=number(options.temperature_column, self.temperature_column(table)),
+            temperature=temperature,
+            celsius=celsius,
             counter=number(options.counter_column, self._if_there(table, self.counter)),
             counter_bits=options.counter_bits or self.counter_bits,
-            findings=(*by_format, *without_unit),
+            findings=(*of_unit, *without_unit, *of_temperature),
         )
 
     @staticmethod
@@ -119,9 +120,10 @@ class Reader:
         return name if name and matching(table.names, name) else None
 
     def _scale(
-        self, headers: Sequence[str], options: ReaderOptions, where: str
+        self, table: Table, rates: Sequence[int], options: ReaderOptions, where: str
     ) -> tuple[float, tuple[Finding, ...]]:
-        """deg/s in one unit of the rates; a finding if the format alone says which."""
+        """deg/s in one unit of the rates; a finding if the header does not say which."""
+        headers = [table.names[number] for number in rates]
         said = {split_unit(header, UNITS)[1] for header in headers}
         found = {rate_unit(header) for header in headers}
         if len(found) > 1:
@@ -129,19 +131,17 @@ class Reader:
                 f"{where}: expected one unit of all rates, got {listed(headers)}; correct the "
                 "header"
             )
-        unit = found.pop()
+        unit: str | None = found.pop()
         if unit and options.units and unit != options.units:
             raise InputError(
                 f"{where}: the header says {unit}, {listed(headers)}, and units of the options "
                 f"{options.units}; correct the one that is wrong"
             )
-        unknown = next(iter(said)) if unit is None else None
         findings: tuple[Finding, ...] = ()
-        if unit is None and options.units is None and self.units and not unknown:
-            unit = self.units
-            text = f"{unit}, by the format; the file does not say"
-            findings = (Finding("unit", KEPT, text),)
-        unit = unit or options.units
+        if unit is None:
+            # where they differ they are the axes: gyro[x]
+            unknown = said.pop() if len(said) == 1 else None
+            unit, findings = self._unit_without(unknown, table.preamble, options.units, where)
         if unit == "raw" and options.scale_dps is None:
             raise InputError(f"{where}: raw counts: give units: raw and scale_dps, deg/s a count")
         if unit is None:
@@ -150,6 +150,56 @@ class Reader:
                 f"{', '.join(DEG_PER_S)} or raw (with scale_dps)"
             )
         return options.scale_dps or DEG_PER_S[unit], findings
+
+    def _unit_without(
+        self, unknown: str | None, preamble: str, by_options: str | None, where: str
+    ) -> tuple[str | None, tuple[Finding, ...]]:
+        """What options or else the format say, beside an unknown unit and lines above the rows."""
+        above = rate_units_in(preamble)
+        if by_options:
+            but = f"the header says {unknown}, which is not known" if unknown else ""
+            if others := above - {by_options}:
+                but = f"lines above the rows say {', '.join(sorted(others))}"
+            text = f"{by_options}, by units of the options; {but}"
+            return by_options, (Finding("unit", KEPT, text),) if but else ()
+        if unknown or self.units is None or above == {self.units}:
+            return None if unknown else self.units, ()
+        if above:
+            raise InputError(
+                f"{where}: the unit of this format is {self.units}, but lines above the rows say "
+                f"{', '.join(sorted(above))}; give units"
+            )
+        return self.units, (
+            Finding("unit", KEPT, f"{self.units}, by the format; the file does not say"),
+        )
+
+    @staticmethod
+    def _temperature(
+        table: Table, options: ReaderOptions, where: str
+    ) -> tuple[int | None, tuple[float, float], tuple[Finding, ...]]:
+        """A column of the options, or the one that is named so; how it becomes °C."""
+        nothing, as_it_is = None, (1.0, 0.0)
+        if options.temperature_column is not None:
+            number = find(table.names, options.temperature_column, where)
+            header = table.names[number]
+            unit = split_unit(header, tuple(CELSIUS))[1]
+            if unit and unit not in CELSIUS:
+                raise InputError(
+                    f"{where}: expected a temperature in degC, degF or K, got {header!r}; correct "
+                    "temperature_column"
+                )
+            return number, CELSIUS[unit] if unit else as_it_is, ()
+        found = _temperatures(table.names)
+        if len(found) > 1:
+            names = listed([table.names[number] for number in found])
+            text = f"none of {names} is kept; name one by temperature_column"
+            return nothing, as_it_is, (Finding("temperature", KEPT, text),)
+        for number, unit in found.items():
+            if unit:
+                return number, CELSIUS[unit], ()
+            text = f"{table.names[number]!r} has no unit and is taken for degrees Celsius"
+            return number, as_it_is, (Finding("temperature", KEPT, text),)
+        return nothing, as_it_is, ()
 
     def _time_unit(
         self, table: Table, time: int | None, options: ReaderOptions, where: str
@@ -226,7 +276,6 @@ class OpenLogArtemis(Reader):
     rates = ("gX", "gY", "gZ")
     units = "deg/s"
     time = "rtcTime"
-    temperature = "imu_degC"
 
 
 class Ngimu(Reader):
@@ -262,14 +311,22 @@ class General(Reader):
         stems = [split_unit(name, UNITS)[0].lower().split(".")[-1] for name in table.names]
         return next((n for n, stem in enumerate(stems) if stem in ("time", "timestamp", "t")), None)
 
-    def temperature_column(self, table: Table) -> Column | None:
-        """The one column that is named a temperature, in degrees Celsius."""
-        named = [(n, *split_unit(name, ("degc", "°c"))) for n, name in enumerate(table.names)]
-        found = [n for n, stem, unit in named if "temp" in stem.lower() and unit in _CELSIUS]
-        return found[0] if len(found) == 1 else None
+
+_DEGREES_C = ("degc", "°c", "celsius")
 
 
-_CELSIUS = ("°c", "ºc", "c", "degc", "celsius")
+def _temperatures(names: Sequence[str]) -> dict[int, str | None]:
+    """Columns with a unit of temperature, or named one and without a unit, and their unit."""
+    found: dict[int, str | None] = {}
+    for number, name in enumerate(names):
+        named = "temp" in name.lower()
+        unit = split_unit(name, tuple(CELSIUS) if named else _DEGREES_C)[1]
+        if unit in _DEGREES_C or (named and (unit is None or unit in CELSIUS)):
+            found[number] = unit
+    if any(found.values()):
+        return {number: unit for number, unit in found.items() if unit}
+    return found
+
 
 READERS: dict[str, Reader] = {
     "movella_dot": MovellaDot(),

@@ -9,16 +9,26 @@ from math import pi
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 from gyro_pipeline.parameters import Column
 
-DEG_PER_S = {"deg/s": 1.0, "rad/s": 180 / pi, "mdps": MDPS}
+DEG_PER_S = {
+    "deg/s": 1.0,
+    "rad/s": 180 / pi,
+    "mdps": MDPS,
+    "mrad/s": 0.18 / pi,
+    "deg/h": 1 / 3600,
+}
 """deg/s in one of each unit of angular rate but raw counts."""
 
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Seconds in one of each unit of time."""
 
-_SPELLINGS = {
-    "deg/s": "deg/s dps °/s º/s deg/sec degree/s degrees/s degrees/sec deg_s deg·s-1 deg.s-1",
-    "rad/s": "rad/s rad/sec radian/s radians/s radians/sec rad_s rad·s-1 rad.s-1",
+_SPELLINGS = {  # as `_written` has them
+    "deg/s": "deg/s dps degps °/s deg/sec deg/second degree/s degrees/s degrees/sec degree/second "
+    "degrees/second deg_s",
+    "rad/s": "rad/s radps rad/sec rad/second radian/s radians/s radians/sec radian/second "
+    "radians/second rad_s",
     "mdps": "mdps mdeg/s m°/s mdeg/sec mdeg_s",
+    "mrad/s": "mrad/s mradps mrad/sec mrad_s",
+    "deg/h": "deg/h dph °/h deg/hr deg/hour degree/hour degrees/h degrees/hour deg_h",
     "raw": "raw lsb count counts",
     "s": "s sec secs second seconds",
     "ms": "ms msec millisecond milliseconds",
@@ -30,8 +40,20 @@ TIME_UNITS = {text: unit for unit in SECONDS for text in _SPELLINGS[unit].split(
 UNITS = (*RATE_UNITS, *TIME_UNITS)
 """All spellings."""
 
+CELSIUS = {
+    **dict.fromkeys(("degc", "°c", "celsius", "c"), (1.0, 0.0)),
+    **dict.fromkeys(("degf", "°f", "fahrenheit", "f"), (5 / 9, -160 / 9)),
+    **dict.fromkeys(("degk", "kelvin", "k"), (1.0, -273.15)),
+}
+"""By the spelling of a unit of temperature: degrees Celsius are a times a value, plus b."""
+
 _BRACKETED = re.compile(r"\s*[(\[]([^()\[\]]*)[)\]]\s*$")
 _AXIS = re.compile(r"\.[xyz]$")  # of an array of three columns
+_SEPARATOR = re.compile(r"[ _.]+")
+_TIMES = re.compile(r"[\s^*·⋅.]")
+_EACH = re.compile(r"(?<=.)(?:per(s|sec|second|h|hr|hour)|(s|sec|h|hr)-1)$")
+_WORDS = re.compile(r"[\s,;:=()\[\]\"'#%]+")
+_LONGEST = 3  # words of a unit, such as "rad per s"
 
 
 @lru_cache(1 << 12)  # a folder's files have the same headers
@@ -39,22 +61,39 @@ def split_unit(header: str, spellings: tuple[str, ...]) -> tuple[str, str | None
     """Part a header into its name and its unit as written.
 
     Args:
-        header: Such as ``Gyroscope X (deg/s)``, ``w_x [rad/s]``, ``gx_dps`` or ``w_x``.
+        header: Such as ``Gyroscope X (deg/s)``, ``w_x [rad s^-1]``, ``gx_dps`` or ``w_x``.
         spellings: Units to look for where there are no brackets.
 
     Returns:
         The name, and what is in brackets at the end, else a spelling behind a space, dot or
-        underscore at the end, or all of it, in lower case without spaces; None if there is none.
+        underscore, or all of it, in lower case, without spaces and with a slash; None if there is
+        none.
     """
     axis = match[0] if (match := _AXIS.search(header)) else ""
     text = header.removesuffix(axis)
     if found := _BRACKETED.search(text):
-        return text[: found.start()] + axis, re.sub(r"\s|\^", "", found[1].lower())
-    for unit in sorted(spellings, key=len, reverse=True):
-        name = text[: -len(unit)]
-        if text.lower().endswith(unit) and (not name or name.endswith((" ", "_", "."))):
-            return name.rstrip(" _.") + axis, unit
+        return text[: found.start()] + axis, _written(found[1])
+    for name, start in [(0, 0), *(one.span() for one in _SEPARATOR.finditer(text))]:
+        if (unit := _written(text[start:])) in spellings:
+            return text[:name] + axis, unit
     return header, None
+
+
+def _written(unit: str) -> str:
+    """A unit as it is spelled here: ``deg/s`` of ``deg·s⁻¹``, ``Deg. per s`` or ``deg s^-1``."""
+    text = unit.lower().replace("⁻¹", "-1").replace("º", "°")
+    return _EACH.sub(r"/\1\2", _TIMES.sub("", text))
+
+
+def rate_units_in(text: str) -> set[str]:
+    """Units of angular rate, but raw counts, that a text names."""
+    words = _WORDS.split(text)
+    parts = (
+        _written(" ".join(words[at : at + count]))
+        for count in range(1, _LONGEST + 1)
+        for at in range(len(words) - count + 1)
+    )
+    return {RATE_UNITS[part] for part in parts if part in RATE_UNITS} - {"raw"}
 
 
 def rate_unit(header: str) -> str | None:

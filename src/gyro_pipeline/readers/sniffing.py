@@ -4,13 +4,14 @@ Where that leaves a choice, the file is refused.
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 from gyro_pipeline.conventions import AXES, InputError
 from gyro_pipeline.readers.fields import DELIMITERS, is_number, split, time_type
-from gyro_pipeline.readers.headers import listed
+from gyro_pipeline.readers.headers import UNITS, listed, rate_unit, split_unit
 from gyro_pipeline.readers.text import TextTable
 
 _HEAD = 1 << 14
@@ -56,7 +57,7 @@ def open_text(path: Path) -> TextTable:
     head = data[start : start + _HEAD].decode("latin-1")
     return TextTable(
         path=path,
-        names=_names(path, _header(above, rows), rows),
+        names=_names(path, above, rows),
         preamble="\n".join(line.text for line in lines[: rows.at]),
         data=data,
         start=start,
@@ -156,15 +157,21 @@ def _header(above: list[_Line], rows: _Rows) -> _Line | None:
     return above[wide[-1]] if wide else None
 
 
-def _names(path: Path, header: _Line | None, rows: _Rows) -> tuple[str, ...]:
+def _names(path: Path, above: list[_Line], rows: _Rows) -> tuple[str, ...]:
     """The header, as long as the rows; a delimiter at the end of one alone does not count.
 
-    A header with a delimiter too many or too few elsewhere would shift the names: it is refused.
+    It may be two lines, of names and of their units. A header with a delimiter too many or too few
+    elsewhere would shift the names: it is refused.
     """
     width = len(rows.fields)
+    header = _header(above, rows)
     if header is None:
         return ("",) * width
     names = split(header.text.lstrip(_COMMENT), rows.delimiter)
+    if _are_units(names) and len(above) > 1:
+        over = split(above[above.index(header) - 1].text.lstrip(_COMMENT), rows.delimiter)
+        if len(over) == len(names) and not _are_units(over):
+            names = [_with_unit(*both) for both in zip(over, names, strict=True)]
     ends = bool(names[-1]), bool(rows.fields[-1])
     if ends == (False, True) and len(names) == width + 1:
         return tuple(names[:-1])
@@ -177,6 +184,17 @@ def _names(path: Path, header: _Line | None, rows: _Rows) -> tuple[str, ...]:
             "correct it"
         )
     return tuple(names)
+
+
+def _are_units(names: Sequence[str]) -> bool:
+    """Whether at least three are a unit of angular rate and nothing else."""
+    return sum(
+        not split_unit(name, UNITS)[0] and rate_unit(name) is not None for name in names
+    ) >= len(AXES)
+
+
+def _with_unit(name: str, unit: str) -> str:
+    return f"{name} [{unit.strip('[]() ')}]" if unit else name
 
 
 def _decimal_point(path: Path, head: str, delimiter: str) -> str:

@@ -113,6 +113,7 @@ def _guarded(path: Path, read: Callable[[Path], Any]) -> Any:
 class _Parquet:
     path: Path
     names: tuple[str, ...]
+    fields: tuple[str, ...]
     in_seconds: frozenset[int]
     preamble: str = ""
 
@@ -120,30 +121,45 @@ class _Parquet:
     def open(cls, path: Path) -> "_Parquet":
         fields = list(pq.read_schema(path))
         times = [number for number, field in enumerate(fields) if _microseconds(field.type)]
-        return cls(path, tuple(field.name for field in fields), frozenset(times))
+        names = [_with_unit(field.name, field.metadata or {}) for field in fields]
+        return cls(path, tuple(names), tuple(field.name for field in fields), frozenset(times))
 
     def read(self, columns: Sequence[int], lenient: int | None = None) -> Values:
-        del lenient  # a column is of one type: all can be read or none
-        names = [self.names[number] for number in columns]
-        if twice := {name for name in names if self.names.count(name) > 1}:
+        names = [self.fields[number] for number in columns]
+        if twice := {name for name in names if self.fields.count(name) > 1}:
             raise InputError(f"{self.path}: expected one column each, got twice {listed([*twice])}")
 
         def read(path: Path) -> list[NDArray[np.float64]]:
             with pq.ParquetFile(path) as file:
                 table = file.read(columns=sorted({*names}), use_threads=False)
-            return [self._numbers(name, table[name]) for name in names]
+            return [
+                self._numbers(name, table[name], number == lenient)
+                for number, name in zip(columns, names, strict=True)
+            ]
 
         return _guarded(self.path, read), ()
 
-    def _numbers(self, name: str, column: Any) -> NDArray[np.float64]:
+    def _numbers(self, name: str, column: Any, lenient: bool) -> NDArray[np.float64]:
         kind = column.type
         if to := _microseconds(kind):
             micros = np.array(column.cast(to, safe=False).cast(pa.int64()).to_numpy(), np.float64)
             known = micros[np.isfinite(micros)]
             return (micros - known[:1] if len(known) else micros) * 1e-6
         if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
+            if lenient:
+                return np.full(len(column), np.nan)
             raise InputError(f"{self.path}: expected numbers in column {name!r}, got {kind}")
         return np.array(column.cast(pa.float64(), safe=False).to_numpy())
+
+
+def _with_unit(name: str, attributes: Mapping[Any, Any]) -> str:
+    """A name, and the unit that attributes of its column give, in brackets."""
+    for key in ("unit", "units"):
+        said = attributes.get(key, attributes.get(key.encode(), b""))
+        text = said.decode("utf-8", "replace") if isinstance(said, bytes) else said
+        if isinstance(text, str) and text:
+            return f"{name} [{text}]"
+    return name
 
 
 def _microseconds(kind: Any) -> Any:
@@ -278,7 +294,9 @@ def _open_hdf5(path: Path) -> _Arrays:
         kind = data.attrs.get("MATLAB_class")
         if isinstance(data, h5py.Dataset) and kind != b"char" and not name.startswith("#"):
             array = np.asarray(data[()])
-            arrays[name.replace("/", ".")] = array.T if matlab or kind is not None else array
+            arrays[_with_unit(name.replace("/", "."), data.attrs)] = (
+                array.T if matlab or kind is not None else array
+            )
 
     with h5py.File(path) as file:
         file.visititems(add)
