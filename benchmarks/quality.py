@@ -31,7 +31,7 @@ SENSORS = {
     name: Sensor(**entry)
     for name, entry in yaml.safe_load((CONF / "globals.yml").read_text())["sensors"].items()
 }
-FLICKER, WARM_UP, WARM_UP_S = 3 * MDPS, (20 * MDPS, 5 * MDPS), 30.0
+FLICKER = 3 * MDPS
 
 Samples = NDArray[np.float64]
 Disturb = Callable[[np.random.Generator, Samples, float], None]
@@ -42,7 +42,8 @@ def at_rest(
     sensor: Sensor,
     flicker_dps: float = 0.0,
     lag1: float | None = None,
-    warm: bool = False,
+    warm_up_mdps: float = 0.0,
+    warm_up_s: float = 30.0,
     samples: int = 13_000,
 ) -> Samples:
     """One recording at rest, (n, 3), deg/s."""
@@ -55,10 +56,10 @@ def at_rest(
         simulated.lag1_correlation if lag1 is None else lag1,
         flicker_dps,
     ).T.astype(np.float64)
-    if warm:
+    if warm_up_mdps:
         signs = generator.choice([-1, 1], len(AXES))
-        amplitudes = signs * generator.normal(*WARM_UP, len(AXES))
-        rates += warm_up(amplitudes, WARM_UP_S, samples, rate_hz).T
+        amplitudes = signs * warm_up_mdps * MDPS * generator.normal(1, 0.25, len(AXES))
+        rates += warm_up(amplitudes, warm_up_s, samples, rate_hz).T
     return rates + generator.uniform(-1, 1, len(AXES)) * simulated.unit_bias_dps
 
 
@@ -83,6 +84,12 @@ def slow_onset(generator: np.random.Generator, rates: Samples, rate_hz: float) -
     start = int(generator.uniform(0.1, 0.9) * rates.shape[0])
     ramp = np.clip((np.arange(rates.shape[0]) - start) / (5 * rate_hz), 0, 1)
     rates[:, generator.integers(3)] += generator.choice([-1, 1]) * 0.5 * ramp
+
+
+def small_step(generator: np.random.Generator, rates: Samples, rate_hz: float) -> None:
+    """0.1 deg/s about some axis, from between a tenth and nine tenths of the recording on."""
+    start = int(generator.uniform(0.1, 0.9) * rates.shape[0])
+    rates[start:, generator.integers(3)] += generator.choice([-1, 1]) * 0.1
 
 
 def shock(generator: np.random.Generator, rates: Samples, rate_hz: float) -> None:
@@ -114,6 +121,7 @@ DISTURBED: dict[str, tuple[Disturb, set[str]]] = {
     "2 s turn, 5 to 60 deg/s": (turn, {"motion"}),
     "0.5 deg/s from midway": (rotation, {"motion"}),
     "0.5 deg/s from midway, within 5 s": (slow_onset, {"motion"}),
+    "0.1 deg/s from midway": (small_step, {"motion"}),
     "shock, 3 to 50 deg/s": (shock, {"shocks"}),
     "carried throughout, 2 deg/s": (carried, {"motion", "noise level"}),
     "vibration for 2 s, 4 sigma": (vibration, {"motion", "shocks"}),
@@ -122,8 +130,9 @@ AT_REST: dict[str, dict[str, object]] = {
     "white, lag 1 of the sensor": {},
     "lag-1 correlation -0.15": {"lag1": -0.15},
     "flicker 3 mdps": {"flicker_dps": FLICKER},
-    "warm-up 20 +- 5 mdps": {"warm": True},
-    "flicker and warm-up": {"flicker_dps": FLICKER, "warm": True},
+    "warm-up 20 +- 5 mdps": {"warm_up_mdps": 20.0},
+    "flicker and warm-up": {"flicker_dps": FLICKER, "warm_up_mdps": 20.0},
+    "warm-up 300 +- 75 mdps, within 5 s": {"warm_up_mdps": 300.0, "warm_up_s": 5.0},
 }
 
 
@@ -173,10 +182,10 @@ def show_margins(generator: np.random.Generator, count: int) -> None:
             rates = at_rest(generator, SENSORS["dot"], **options)  # type: ignore[arg-type]
             size = round(QUALITY.block_s * SENSORS["dot"].rate_hz)
             blocks = stationarity.Blocks.of(np.ascontiguousarray(rates.T), size)
-            calm = np.ones(len(blocks.starts), bool)
+            means = stationarity.Means.of(blocks, np.ones(len(blocks.starts), bool))
             lags = [round(lag_s / QUALITY.block_s) for lag_s in QUALITY.lags_s]
             for level in levels:
-                alarms[level] += bool(stationarity.changes(blocks, calm, lags, level).any())
+                alarms[level] += bool(stationarity.changes(means, lags, level).any())
         print(f"{name:36s} " + "  ".join(f"{level:g}: {alarms[level]}" for level in levels))
 
 

@@ -84,6 +84,14 @@ def garbled(rates):
     rates[200, 1] = 2000
 
 
+def doubled(rates):
+    rates[1::2] = rates[::2]
+
+
+def copied(rates):
+    rates[:, 2] = rates[:, 0]
+
+
 def rounded(step):
     def change(rates):
         rates[:] = step * np.round(rates / step)
@@ -110,6 +118,8 @@ def test_a_sound_recording_is_kept_whole_without_a_finding(samples, quality):
         (shaken, {"motion": REJECTED}, None),
         (carried, {"motion": REJECTED}, None),
         (interleaved, {"alternating rows": REJECTED}, None),
+        (doubled, {"repeated rows": KEPT}, (0, ROWS)),
+        (copied, {"equal axes": REJECTED}, None),
         (warming, {"warm-up drift": KEPT}, (0, ROWS)),
         (rounded(0.3 * SIGMA), {}, (0, ROWS)),
         (rounded(1.3 * SIGMA), {"coarse quantisation": KEPT}, (0, ROWS)),
@@ -206,11 +216,14 @@ def test_what_is_no_gyroscope_at_rest_is_refused_for_its_noise(samples, quality)
     assert "quality.largest_noise_dps" in detail(inspected, "noise level")
 
 
-def test_a_sensor_behind_a_narrow_low_pass_filter_is_at_rest(quality):
-    filtered = signal.butter(2, 5, fs=250, output="sos")
+@pytest.mark.parametrize("rate_hz", [100, 250, 1000])
+def test_a_sensor_behind_a_narrow_low_pass_filter_is_at_rest(quality, rate_hz):
+    filtered = signal.butter(2, 5, fs=rate_hz, output="sos")
     for seed in range(5):
-        rates = signal.sosfilt(filtered, np.random.default_rng(seed).normal(0, 1, (13_000, 3)), 0)
-        assert inspect(Log(rates[500:]), 250.0, quality).outcome == KEPT
+        noise = np.random.default_rng(seed).normal(0, 1, (60 * rate_hz, 3))
+        rates = signal.sosfilt(filtered, noise, 0)[5 * rate_hz :]
+        rates = np.round(0.05 * rates / rates.std() / 0.001) * 0.001
+        assert inspect(Log(rates), rate_hz, quality).outcome == KEPT
 
 
 @pytest.mark.parametrize("rate_hz", [0.1, 2.0])
@@ -309,6 +322,32 @@ def test_of_100_disturbances_at_least_99_are_found(parameters, disturb, check):
             inspected = inspect(Log(rates), sensor.rate_hz, p.quality)
             found += check in checks(inspected) and inspected.outcome != KEPT
     assert found >= 99
+
+
+@pytest.mark.parametrize(
+    ("amplitude_dps", "time_constant_s"), [(0.2, 3), (0.3, 5), (0.5, 5), (1, 10), (0.1, 1)]
+)
+def test_a_quick_warm_up_is_at_rest(parameters, amplitude_dps, time_constant_s):
+    p, generator = parameters("base"), np.random.default_rng(11)
+    for sensor in p.sensors.values():
+        for sign in (-1, 1):
+            rates = at_rest(generator, sensor)
+            amplitudes = sign * amplitude_dps * np.array([1, 0.6, 0.4])
+            rates += warm_up(amplitudes, time_constant_s, len(rates), sensor.rate_hz).T
+            inspected = inspect(Log(rates), sensor.rate_hz, p.quality)
+            assert checks(inspected) == {"warm-up drift": KEPT}
+
+
+@pytest.mark.parametrize(("size_dps", "within_s"), [(0.5, 20), (0.3, 10), (0.5, 5), (0.1, 0)])
+def test_a_slow_or_small_onset_is_motion_and_no_warm_up(parameters, size_dps, within_s):
+    p, generator = parameters("base"), np.random.default_rng(12)
+    for name in ("dot", "sparkfun"):  # of 87 s and more; in Memsense's 52 s a ramp is a drift
+        sensor = p.sensors[name]
+        for start in (0.2, 0.4, 0.6):
+            rates = at_rest(generator, sensor)
+            seconds = (np.arange(len(rates)) - start * len(rates)) / sensor.rate_hz
+            rates[:, 1] += size_dps * np.clip(seconds / max(within_s, 1e-9), 0, 1)
+            assert checks(inspect(Log(rates), sensor.rate_hz, p.quality))["motion"] == REJECTED
 
 
 @pytest.mark.parametrize("colour", ["white", "lag 1", "flicker", "warm-up"])

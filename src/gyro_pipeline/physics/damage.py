@@ -8,6 +8,10 @@ FLAT_TOP = 8
 """Samples at an extreme value that make it a limit, if they are twice as many as at the next value.
 None of 18,000 axes of Gaussian noise has them, whatever their step (benchmarks/quality.py)."""
 
+_TIMES, _FAR = 4, 3
+"""Times that a limit is reached; or else usual changes from sample to sample, from the top of a
+clipped shock to the next value."""
+
 _QUANTISED = 0.1
 """Share of samples that equal the one before: white noise has it at a step of 0.36 sigma."""
 
@@ -82,6 +86,19 @@ def stuck(rates: NDArray[np.float64], least: int, false_alarm: float) -> NDArray
     return found
 
 
+def repeated_rows(rates: NDArray[np.float64]) -> float:
+    """Share of rows that repeat the one before on all axes, beyond what chance makes of the axes.
+
+    Args:
+        rates: (axis, n), deg/s.
+    """
+    same = rates[:, 1:] == rates[:, :-1]
+    shares = np.count_nonzero(same, axis=1) / same.shape[1]
+    if shares.min() == 0:  # as in most recordings
+        return 0.0
+    return float(np.logical_and.reduce(same).mean() - np.prod(shares))
+
+
 def saturated(rates: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Samples at the largest or smallest value of an axis, where that is a limit.
 
@@ -98,14 +115,26 @@ def saturated(rates: NDArray[np.float64]) -> NDArray[np.bool_]:
     for sign, extreme in ((1, np.fmax), (-1, np.fmin)):
         tops = extreme.reduce(rates, axis=1)
         at_top = rates == tops[:, None]
-        counts = np.count_nonzero(at_top, axis=1)
-        for axis in np.flatnonzero(counts >= FLAT_TOP):
+        for axis in np.flatnonzero(np.count_nonzero(at_top, axis=1) >= FLAT_TOP):
             below = sign * rates[axis][sign * rates[axis] < sign * tops[axis]]
             # one more value at least: of two alone, the step is too coarse to speak of tails
-            if below.size and below.min() < below.max():
-                if counts[axis] >= 2 * np.count_nonzero(below == below.max()):
-                    found[axis] |= at_top[axis]
+            if not below.size or below.min() == below.max():
+                continue
+            if np.count_nonzero(at_top[axis]) < 2 * np.count_nonzero(
+                rates[axis] == sign * below.max()
+            ):
+                continue
+            # behind a low-pass filter a peak lasts, but comes once, and what is next is near
+            usual = np.nanmedian(np.abs(np.diff(rates[axis])))
+            far = sign * tops[axis] - below.max() > _FAR * usual
+            if far or _runs(at_top[axis]) >= _TIMES:
+                found[axis] |= at_top[axis]
     return found
+
+
+def _runs(where: NDArray[np.bool_]) -> int:
+    """Runs of true values, (n,)."""
+    return int(where[0]) + int(np.count_nonzero(where[1:] & ~where[:-1]))
 
 
 def quantisation_steps(rates: NDArray[np.float64]) -> NDArray[np.float64]:

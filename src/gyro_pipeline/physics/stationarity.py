@@ -7,14 +7,14 @@ is not zero but a bias that may drift: a gyroscope that warms up is at rest.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
+from scipy import optimize, special
 
-_TIME_CONSTANTS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1)
+_TIME_CONSTANTS = (1 / 128, 1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1)
 """Tried for a warm-up, in durations of the recording; the fit hardly differs between neighbours."""
 
 
@@ -119,57 +119,108 @@ def bursts(rows: NDArray[np.integer], apart: int) -> NDArray[np.integer]:
     return np.stack([rows[firsts], rows[lasts]], axis=1) if rows.size else np.empty((0, 2), int)
 
 
-def mean_noise(blocks: Blocks, calm: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Standard deviation of the mean of a block, from the differences of neighbours.
+@dataclass(frozen=True)
+class Means:
+    """Means of the blocks of one recording.
 
-    Differences leave a drift out, and their median leaves out what a few blocks do. It is at least
-    that of white noise: the median of a few differences is now and then far too small.
-
-    Args:
-        blocks: Of a recording.
-        calm: (block,), the ones to use.
-
-    Returns:
-        (axis,), deg/s.
+    Attributes:
+        rates: (axis, block), deg/s.
+        calm: (block,), those to use.
+        times: (block,), from the start of the recording to their middles, in durations of it.
+        noise: (axis,), deg/s: standard deviation of the mean of a block at rest.
     """
-    white = blocks.noise / np.sqrt(blocks.size)
-    differences = np.abs(np.diff(blocks.means, axis=-1))[:, calm[1:] & calm[:-1]]
-    if not differences.size:
-        return white
-    # of |d|, d normal with variance 2 s^2, the median is 0.6745 sqrt(2) s
-    return np.maximum(np.median(differences, axis=-1) / (special.ndtri(0.75) * np.sqrt(2)), white)
+
+    rates: NDArray[np.float64]
+    calm: NDArray[np.bool_]
+    times: NDArray[np.float64]
+    noise: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, blocks: Blocks, calm: NDArray[np.bool_]) -> "Means":
+        """Take the noise from the differences of neighbours.
+
+        Differences leave a drift out, and their median leaves out what a few blocks do. It is at
+        least that of white noise: the median of a few differences is now and then far too small.
+        """
+        noise = blocks.noise / np.sqrt(blocks.size)
+        differences = np.abs(np.diff(blocks.means, axis=-1))[:, calm[1:] & calm[:-1]]
+        if differences.size:
+            # of |d|, d normal with variance 2 s^2, the median is 0.6745 sqrt(2) s
+            usual = np.median(differences, axis=-1) / (special.ndtri(0.75) * np.sqrt(2))
+            noise = np.maximum(usual, noise)
+        duration = blocks.starts[-1] + blocks.size
+        return cls(blocks.means, calm, (blocks.starts + blocks.size / 2) / duration, noise)
+
+    def without(self, rates: NDArray[np.float64]) -> "Means":
+        """The same less rates, (axis, block), deg/s."""
+        return replace(self, rates=self.rates - rates)
+
+    @property
+    def decays(self) -> NDArray[np.float64]:
+        """Exponentials that begin with the recording: (time constant, block)."""
+        return np.exp(-self.times / np.array(_TIME_CONSTANTS)[:, None])
 
 
-def changes(
-    blocks: Blocks, calm: NDArray[np.bool_], lags: Sequence[int], false_alarm: float
-) -> NDArray[np.bool_]:
+def changes(means: Means, lags: Sequence[int], false_alarm: float) -> NDArray[np.bool_]:
     """Blocks about which the rate departs from a steady or steadily drifting one.
 
-    For blocks k - L, k and k + L, the generalised likelihood ratio of any three rates against three
-    on a straight line is, twice its logarithm, the sum over axes of
-    (m[k - L] - 2 m[k] + m[k + L])^2 / (6 s^2), chi-squared with a degree of freedom per axis at
-    rest, where s is the standard deviation of a block's mean m. Neither white nor flicker noise
-    has more of it at longer averaging times, so the s of blocks serves for all lags.
+    For three neighbouring stretches of L blocks, the generalised likelihood ratio of any three
+    rates against three on a straight line is, twice its logarithm, the sum over axes of
+    (m[1] - 2 m[2] + m[3])^2 / (6 s^2), chi-squared with a degree of freedom per axis at rest, where
+    s is the standard deviation of the mean m of a stretch. It is that of a block over the root of
+    L, or what most of the stretches show if that is more, as flicker noise makes it. At least half
+    of a stretch is calm; its mean is that of its calm blocks.
 
     Args:
-        blocks: Of a recording.
-        calm: (block,), the ones to use.
-        lags: L, in blocks; a short one for quick movements, a long one for slow onsets.
+        means: Of the blocks of a recording.
+        lags: L, in blocks; a short one for quick movements, a long one for slow or small ones.
         false_alarm: Probability that white noise has any change.
 
     Returns:
-        (block,), true for a middle block k.
+        (block,), true for a block in the middle.
     """
-    count = calm.size
+    count = means.calm.size
     found = np.zeros(count, bool)
-    scale = 6 * mean_noise(blocks, calm)[:, None] ** 2
-    limit = special.chdtri(len(blocks.means), false_alarm / (len(lags) * count))
-    for lag in (lag for lag in lags if 2 * lag < count):
-        left, middle, right = (slice(i * lag, count - (2 - i) * lag) for i in range(3))
-        bend = blocks.means[:, left] - 2 * blocks.means[:, middle] + blocks.means[:, right]
-        ratio = (bend**2 / scale).sum(axis=0)
-        found[middle] |= (ratio > limit) & calm[left] & calm[middle] & calm[right]
+    limit = special.chdtri(len(means.rates), false_alarm / (len(lags) * count))
+    totals = np.zeros((1 + len(means.rates), count + 1))  # up to each block
+    np.cumsum(np.vstack([means.calm, means.rates * means.calm]), axis=1, out=totals[:, 1:])
+    for lag in (lag for lag in lags if 3 * lag <= count):
+        sums = totals[:, lag:] - totals[:, :-lag]
+        used, rates = sums[0], sums[1:] / np.maximum(sums[0], 1)
+        first, last = used.size - 2 * lag, used.size - lag  # ends of the left and middle ones
+        left, middle, right = rates[:, :first], rates[:, lag:last], rates[:, 2 * lag :]
+        a, b, c = used[:first], used[lag:last], used[2 * lag :]
+        usable = 2 * np.minimum(np.minimum(a, b), c) >= lag
+        if not usable.any():
+            continue
+        variance = 1 / a[usable] + 4 / b[usable] + 1 / c[usable]
+        bends = np.abs(left - 2 * middle + right)[:, usable] / np.sqrt(variance)
+        most = np.partition(bends, bends.shape[1] // 2, axis=1)[:, bends.shape[1] // 2]
+        noise = np.maximum(means.noise, most / special.ndtri(0.75))
+        ratio = ((bends / noise[:, None]) ** 2).sum(axis=0)
+        found[lag + lag // 2 + np.flatnonzero(usable)[ratio > limit]] = True
     return found
+
+
+def settling(means: Means) -> NDArray[np.float64]:
+    """The warm-up of each axis, as a sum of exponentials of one sign that begin with the recording.
+
+    Args:
+        means: Of the blocks of a recording, two of them calm at least.
+
+    Returns:
+        (axis, block), deg/s, of least squares, but for a constant.
+    """
+    calm = means.calm
+    shapes = means.decays.T
+    shapes -= shapes[calm].mean(axis=0)
+    rates = means.rates - means.rates[:, calm].mean(axis=-1, keepdims=True)
+    fits = []
+    for axis in rates:
+        both = [(sign, *optimize.nnls(shapes[calm], sign * axis[calm])) for sign in (1, -1)]
+        sign, weights, _ = min(both, key=lambda fit: fit[2])
+        fits.append(sign * shapes @ weights)
+    return np.array(fits)
 
 
 @dataclass(frozen=True)
@@ -181,34 +232,25 @@ class Drift:
     time_constant_s: float
 
 
-def drifts(
-    blocks: Blocks,
-    calm: NDArray[np.bool_],
-    rate_hz: float,
-    false_alarm: float,
-    least_dps: float,
-) -> list[Drift]:
+def drifts(means: Means, duration_s: float, false_alarm: float, least_dps: float) -> list[Drift]:
     """The warm-up of each axis that has one: exponentials fitted to the means of blocks.
 
     Args:
-        blocks: Of a recording.
-        calm: (block,), the ones to use; at least three.
-        rate_hz: Samples per second.
+        means: Of the blocks of a recording, three of them calm at least.
+        duration_s: Of the recording.
         false_alarm: Probability that white noise has any drift.
         least_dps: Smaller ones are left out: flicker noise wanders as well.
 
     Returns:
         By axis, those whose likelihood ratio against a constant bias is significant.
     """
-    duration_s = (blocks.starts[-1] + blocks.size) / rate_hz
     constants_s = duration_s * np.array(_TIME_CONSTANTS)
-    time_s = (blocks.starts[calm] + blocks.size / 2) / rate_hz
-    shapes = np.exp(-time_s / constants_s[:, None])
+    shapes = means.decays[:, means.calm]
     shapes -= shapes.mean(axis=-1, keepdims=True)
-    means = blocks.means[:, calm]
-    means = means - means.mean(axis=-1, keepdims=True)
-    products, energies = means @ shapes.T, (shapes**2).sum(axis=-1)
-    ratios = products**2 / energies / mean_noise(blocks, calm)[:, None] ** 2
+    rates = means.rates[:, means.calm]
+    rates = rates - rates.mean(axis=-1, keepdims=True)
+    products, energies = rates @ shapes.T, (shapes**2).sum(axis=-1)
+    ratios = products**2 / energies / means.noise[:, None] ** 2
     best = ratios.argmax(axis=-1)
     limit = special.chdtri(1, false_alarm / ratios.size)
     sizes = products / energies * np.expm1(-duration_s / constants_s)

@@ -11,6 +11,8 @@
 | too short | what remains is too short, or too little of the recording | rejected |
 | coarse quantisation | a step beside the noise; one too large to trust the mean | kept; rejected |
 | noise level | more noise than a gyroscope at rest has | rejected |
+| repeated rows | rows are there twice or more: written so, or read faster than measured | kept |
+| equal axes | two axes have the same values: one column taken twice | rejected |
 | alternating rows | every other row is at another level: two sensors in one file | rejected |
 | motion | the rate, or the noise, changes as neither noise nor a drift does | rejected |
 | shocks | a rate beyond the noise for an instant | repaired |
@@ -29,6 +31,7 @@ how it ends. The exceptions are zeros, and the largest noise of a sensor at rest
 """
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,14 +50,17 @@ _NOISE_RISE = 2
 noise is partly coloured; in white noise 2 has a probability of 4e-6 per recording even at 7 samples
 per block, and far less with more."""
 
-_COLOUR = 8
-"""Scatter of block means over what white noise of the same samples has, for motion throughout. At
-rest it is 0.7 to 1.2 on the public files, and up to 7 behind a low-pass filter of 5 Hz at 250 Hz;
-of a sensor that is carried about, 13 to 29."""
+_SWAY = 1
+"""Scatter of block means over that of samples within a block, for motion throughout. At rest it is
+at most 0.2 on the public files, and 0.6 behind a low-pass filter of 5 Hz; of a sensor that is
+carried about, 1.7 to 2.6."""
 
 _LEAST_BLOCK = 5
 """Samples. The noise of shorter blocks is known too badly for a median of them."""
 
+_REPEATED = 0.05
+"""Share of rows that repeat the one before, beyond chance. A packet sent twice now and then harms
+nothing."""
 
 _TURNS = 0.5
 """Between even and odd rows, over the noise. At most 0.07 on the public files."""
@@ -187,20 +193,21 @@ def _check_rest(
         *_check_steps(rates, blocks, quality),
         *_check_noise(blocks, quality),
         *_check_turns(blocks, quality),
+        *_check_copies(rates),
     ]
     if _rejects(findings):
         return at_rest, findings
     rows = stationarity.excursions(blocks, quality.false_alarm)
     bursts = stationarity.bursts(rows, blocks.size)
-    calm = blocks.apart_from(bursts)
-    moved = _movements(blocks, bursts, calm, first_row, rate_hz, quality)
+    means = stationarity.Means.of(blocks, blocks.apart_from(bursts))
+    moved = _movements(blocks, means, bursts, first_row, rate_hz, quality)
     if moved:
         return at_rest, [*findings, Finding("motion", REJECTED, "; ".join(moved))]
     for first, last in bursts:  # and a block on either side, where it may still ring
         at_rest[max(first - blocks.size, 0) : last + 1 + blocks.size] = False
     if len(bursts):
         findings.append(_shocks(rates, rows, bursts, first_row))
-    return at_rest, findings + _check_drift(blocks, calm, rate_hz, quality)
+    return at_rest, findings + _check_drift(means, rates.shape[1] / rate_hz, quality)
 
 
 def _check_steps(
@@ -255,10 +262,23 @@ def _check_turns(blocks: stationarity.Blocks, quality: Quality) -> list[Finding]
     return [Finding("alternating rows", REJECTED, detail)]
 
 
+def _check_copies(rates: NDArray[np.float64]) -> list[Finding]:
+    """Whether rows or axes are there more than once."""
+    for one, other in combinations(range(len(AXES)), 2):
+        if np.array_equal(rates[one], rates[other]):
+            detail = f"axes {AXES[one]} and {AXES[other]} have the same values: correct the columns"
+            return [Finding("equal axes", REJECTED, detail)]
+    share = damage.repeated_rows(rates)
+    if share <= _REPEATED:
+        return []
+    detail = f"{share:.0%} of the rows repeat the one before: doubled, or read faster than measured"
+    return [Finding("repeated rows", KEPT, detail)]
+
+
 def _movements(  # noqa: PLR0917 - a stretch, what was found in it, and where it is
     blocks: stationarity.Blocks,
+    means: stationarity.Means,
     bursts: NDArray[np.integer],
-    calm: NDArray[np.bool_],
     first_row: int,
     rate_hz: float,
     quality: Quality,
@@ -268,18 +288,21 @@ def _movements(  # noqa: PLR0917 - a stretch, what was found in it, and where it
     long = bursts[np.diff(bursts)[:, 0] >= quality.shock_s * rate_hz]
     if len(long):
         found.append(f"the rate is beyond the noise {_span(first_row + long[0], rate_hz)}")
-    scatter = stationarity.mean_noise(blocks, calm) / (blocks.noise / np.sqrt(blocks.size))
-    if scatter.max() > _COLOUR:
+    scatter = means.noise / blocks.noise
+    if scatter.max() > _SWAY:
         axis = int(np.argmax(scatter))
-        found.append(f"means scatter {scatter[axis]:.2g} times more than noise, axis {AXES[axis]}")
+        found.append(f"means scatter {scatter[axis]:.2g} times the noise, axis {AXES[axis]}")
     lags = [max(round(lag_s / quality.block_s), 1) for lag_s in quality.lags_s]
-    changed = stationarity.changes(blocks, calm, lags, quality.false_alarm)
+    changed = stationarity.changes(means, lags, quality.false_alarm)
+    if changed.any():  # a quick warm-up does so as well
+        settled = means.without(stationarity.settling(means))
+        changed = stationarity.changes(settled, lags, quality.false_alarm)
     if changed.any():
-        spread = np.ptp(blocks.means[:, calm], axis=1)
-        axis = int(np.argmax(spread / stationarity.mean_noise(blocks, calm)))
+        spread = np.ptp(means.rates[:, means.calm], axis=1)
+        axis = int(np.argmax(spread / means.noise))
         about = _span(first_row + blocks.span(changed), rate_hz)
         found.append(f"the rate changes by {spread[axis]:.2g} deg/s, axis {AXES[axis]}, {about}")
-    noisy = calm & blocks.noisier_than(_NOISE_RISE)
+    noisy = means.calm & blocks.noisier_than(_NOISE_RISE)
     if noisy.any():
         found.append(f"the noise rises {_span(first_row + blocks.span(noisy), rate_hz)}")
     return found
@@ -302,13 +325,11 @@ def _shocks(
     return Finding("shocks", REPAIRED, detail)
 
 
-def _check_drift(
-    blocks: stationarity.Blocks, calm: NDArray[np.bool_], rate_hz: float, quality: Quality
-) -> list[Finding]:
-    if np.count_nonzero(calm) < LEAST_BLOCKS:
+def _check_drift(means: stationarity.Means, duration_s: float, quality: Quality) -> list[Finding]:
+    if np.count_nonzero(means.calm) < LEAST_BLOCKS:
         return []
     least_dps = quality.drift_mdps * MDPS
-    drifts = stationarity.drifts(blocks, calm, rate_hz, quality.false_alarm, least_dps)
+    drifts = stationarity.drifts(means, duration_s, quality.false_alarm, least_dps)
     details = [
         f"axis {AXES[one.axis]} by {one.size_dps / MDPS:+.3g} mdps"
         f" (time constant about {one.time_constant_s:.3g} s)"
