@@ -77,6 +77,41 @@ def test_the_pattern_gives_imu_and_recording(tmp_path, pattern, expected):
     assert numbers(file_logs(tmp_path, pattern)) == expected
 
 
+def test_files_behind_links_count_and_circles_end(tmp_path):
+    put(tmp_path, "in/1/1.csv", "elsewhere/1.csv")
+    (tmp_path / "in/2").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "in/1/back").symlink_to(tmp_path / "in")
+    assert numbers(file_logs(tmp_path / "in", "{imu}/{recording}.csv")) == {
+        "1/1.csv": (1, 1),
+        "2/1.csv": (2, 1),
+    }
+    (tmp_path / "in/1/2.csv").symlink_to(tmp_path / "nowhere")
+    message = refusal(file_logs(tmp_path / "in", "{imu}/{recording}.csv"))
+    assert "1/2.csv: cannot be read: No such file or directory; correct the link" in message
+
+
+def test_lock_files_are_no_recordings(tmp_path):
+    put(tmp_path, "1.csv", "~$1.csv")
+    assert numbers(file_logs(tmp_path, "{imu:name}.csv")) == {"1.csv": (1, 1)}
+
+
+def test_a_cache_that_cannot_be_written_to_is_refused(tmp_path):
+    put(tmp_path, "1.csv")
+    (tmp_path / "file").touch()
+    message = refusal(file_logs(tmp_path, "{imu}.csv", cache={"path": str(tmp_path / "file")}))
+    assert "is a file where a folder is needed" in message
+
+
+def test_sensors_may_share_a_cache(tmp_path, counted):
+    put(tmp_path, "a/1.csv", "b/1.csv")
+    both = SENSORS | {"other": SENSORS["dot"]}
+    cache = {"path": str(tmp_path / "read")}
+    for _ in range(2):
+        read_all(file_logs(tmp_path / "a", "{imu}.csv", cache=cache))
+        read_all(file_logs(tmp_path / "b", "{imu}.csv", cache=cache, sensor="other", sensors=both))
+    assert counted[0] == ["1.csv"] * 2
+
+
 def test_entries_are_in_the_order_of_imu_and_recording_and_read_their_own_file(tmp_path):
     put(tmp_path, "2_1.csv", "1_10.csv", "1_9.csv")
     logs = file_logs(tmp_path, "{imu}_{recording}.csv").load()
@@ -120,6 +155,7 @@ def test_names_that_became_numbers_are_said(tmp_path, caplog):
             ["9 recordings of 3 IMUs with 9 different numbers", "write * for the recording"],
         ),
         (["0.csv"], "{imu}.csv", ["0.csv", "from 1 on for {imu}", "{imu:name}"]),
+        (["9" * 30 + ".csv"], "{imu}.csv", ["at most 18 digits for {imu}", "{imu:name}"]),
     ],
 )
 def test_files_that_cannot_be_told_apart_are_refused(tmp_path, names, pattern, words):
@@ -148,8 +184,15 @@ def test_a_missing_folder(tmp_path):
             "expected a character of the names before {recording}",
         ),
         ({"pattern": "dot*{imu}.csv"}, "expected a character of the names before {imu}"),
+        ({"pattern": "{imu}0{recording}.csv"}, "expected no digit behind a number, got '0'"),
+        ({"pattern": "{imu}7.csv"}, "expected no digit behind a number, got '7'"),
         ({"pattern": 5}, "dot: pattern in the catalog entry: expected a text"),
         ({"reader": {"unit": "deg/s"}}, "dot: reader in the catalog entry"),
+        (
+            {"reader": {"format": "movela_dot"}},
+            "dot: reader in the catalog entry: expected format auto, movella_dot, ",
+        ),
+        ({"cache": {"path": ""}}, "dot: cache in the catalog entry: expected {path: a folder}"),
         (
             {"cache": "data"},
             "dot: cache in the catalog entry: expected {path: a folder}, got 'data'",
@@ -327,8 +370,8 @@ def test_files_of_every_kind_are_parsed_once(tmp_path, counted):
 def test_only_readings_are_tidied_away(tmp_path):
     put(tmp_path, "1.csv")
     logs = file_logs(tmp_path, "{imu}.csv", cache={"path": str(tmp_path)})
-    for name in ("mine.npy", "notes.txt", ".0123456789abcdef.1.reading", "gone.reading"):
+    for name in ("mine.npy", "notes.txt", ".dot.01234567.1.reading", "dot.gone.reading"):
         (tmp_path / name).touch()
     logs.load()
     left = {path.name for path in tmp_path.iterdir()}
-    assert left == {"1.csv", "mine.npy", "notes.txt", ".0123456789abcdef.1.reading"}
+    assert left == {"1.csv", "mine.npy", "notes.txt", ".dot.01234567.1.reading"}

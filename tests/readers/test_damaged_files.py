@@ -343,7 +343,7 @@ CASES = {
     "an npy file cut": (ANGLES, lambda t: npy(np.ones((50, 3)))(t)[:400], Refused("copy it anew")),
     "an npy file of pickles": (ANGLES, npy(np.array([{}], object)), Refused("got Python objects")),
     "an npy file of one column": (ANGLES, npy(np.ones(50)), Refused(r"expected shape \(n, 3\)")),
-    "an npy file transposed": (ANGLES, npy(np.ones((3, 50))), Refused("with a row a sample")),
+    "an npy file transposed": (ANGLES, npy(np.ones((6, 50))), Refused("with a row a sample")),
     # SciPy would end the process, or fill the memory
     "a MATLAB file with data of no type": (
         ANGLES,

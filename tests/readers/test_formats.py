@@ -204,6 +204,15 @@ def test_objects_in_an_archive_are_left_alone_and_never_unpickled(rates, read):
         read(alone, name="log.npz")
 
 
+@pytest.mark.parametrize("save", [np.save, lambda path, rates: np.savez(path, g=rates, t=rates[0])])
+def test_three_rows_of_rates_are_three_columns(save, rates, tmp_path):
+    path = tmp_path / ("log.npy" if save is np.save else "log.npz")
+    save(path, rates.T)
+    columns = None if save is np.save else ("g.x", "g.y", "g.z")
+    log = read_log(path, ReaderOptions(columns=columns, units="deg/s"))
+    np.testing.assert_array_equal(log.samples, rates)
+
+
 @pytest.mark.parametrize("dtype", [np.float64, np.float32, np.int16])
 def test_an_npy_file_of_three_columns_needs_a_unit(dtype, rates, read):
     counts = (rates * 100).astype(dtype)

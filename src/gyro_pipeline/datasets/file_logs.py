@@ -1,11 +1,13 @@
 """Logs as loggers write them: a folder of files, one a recording."""
 
+import glob
 import importlib
 import logging
+import os
 import pkgutil
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from pydantic import ValidationError
 
 from gyro_pipeline import readers
 from gyro_pipeline.conventions import InputError
+from gyro_pipeline.datasets.atomic import check_writable
 from gyro_pipeline.datasets.log_source import LogSource
 from gyro_pipeline.datasets.parse_cache import Reading
 from gyro_pipeline.fingerprints import code_hash, fingerprint
@@ -27,7 +30,8 @@ _NAMED = 5
 _KEPT = ".reading"
 """Suffix of what is kept of a file; no logger's."""
 
-_HIDDEN = re.compile(r"(^|/)\.")
+_HIDDEN = re.compile(r"(^|/)(\.|~\$)")  # the latter while Excel has a file open
+_DIGITS = 18  # of a number that fits an integer
 _PART = re.compile(r"\{(imu|recording)(:name)?\}|(\*)")
 
 Numbers = dict[str, tuple[int, int]]
@@ -68,7 +72,10 @@ class FileLogs(LogSource):
             self._options = ReaderOptions.model_validate(reader or {})
         except ValidationError as error:
             raise InputError(f"{sensor}: reader in the catalog entry: {error}") from error
-        if not isinstance(cache, Mapping) or not isinstance(cache.get("path"), str):
+        readers.check_format(self._options.format, f"{sensor}: reader in the catalog entry")
+        if not (
+            isinstance(cache, Mapping) and cache.get("path") and isinstance(cache["path"], str)
+        ):
             raise InputError(
                 f"{sensor}: cache in the catalog entry: expected {{path: a folder}}, got {cache!r}"
             )
@@ -79,10 +86,11 @@ class FileLogs(LogSource):
 
         Raises:
             InputError: As the cause of Kedro's ``DatasetError``, no such folder, no file that
-                matches, or two files of one recording.
+                matches, two files of one recording, or a cache that cannot be written to.
         """
         found = self._matching()
         numbers = _numbered(self._sensor, self._pattern, found)
+        check_writable(self._cache / _KEPT)
         readings = self._readings(found)
         self._tidy([one.kept_as for one in readings.values()])
         entries = [
@@ -123,8 +131,7 @@ class FileLogs(LogSource):
                 f"{self._sensor} {self._path}: no such folder; put the files there, or name "
                 "another path in the catalog"
             )
-        files = (path for path in self._path.rglob("*") if path.is_file())
-        names = (path.relative_to(self._path).as_posix() for path in files)
+        names = (path.relative_to(self._path).as_posix() for path in _files(self._path))
         return sorted((name for name in names if not _HIDDEN.search(name)), key=_natural)
 
     def _readings(self, names: Iterable[str]) -> dict[str, Reading]:
@@ -133,21 +140,34 @@ class FileLogs(LogSource):
         found = {}
         for name in names:
             path = self._path / name
-            state = path.stat()
+            try:
+                state = path.stat()
+            except OSError as error:
+                raise InputError(
+                    f"{self._sensor} {path}: cannot be read: {error.strerror}; correct the link, "
+                    "or remove it"
+                ) from error
             key = fingerprint([str(path), state.st_size, state.st_mtime_ns, settings])
-            kept_as = self._cache / f"{key}{_KEPT}"
+            kept_as = self._cache / f"{self._sensor}.{key}{_KEPT}"
             found[name] = Reading(path, self._options, self.entry.rate_hz, kept_as)
         return found
 
     def _tidy(self, wanted: Sequence[Path]) -> None:
         """Say what is there of an earlier run, and remove what is of other files."""
-        # the folder may hold other files, and the hidden ones that another process is writing
-        there = {path for path in self._cache.glob(f"*{_KEPT}") if not path.name.startswith(".")}
+        there = set(self._cache.glob(f"{glob.escape(self._sensor)}.*{_KEPT}"))  # and other files
         for path in there.difference(wanted):
             path.unlink(missing_ok=True)
         before = len(there.intersection(wanted))
         if before:
             _LOG.info("%s: %d of %d files were read before", self._sensor, before, len(wanted))
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """All files in a folder and in those below it, also behind links, but not in circles."""
+    for here, inner, names in os.walk(folder, followlinks=True):
+        above = {os.path.realpath(path) for path in (Path(here), *Path(here).parents)}
+        inner[:] = [name for name in inner if os.path.realpath(Path(here, name)) not in above]
+        yield from (Path(here, name) for name in names)
 
 
 def _compiled(sensor: str, pattern: str) -> re.Pattern[str]:
@@ -157,9 +177,11 @@ def _compiled(sensor: str, pattern: str) -> re.Pattern[str]:
             f"{sensor}: pattern in the catalog entry: expected a text such as imu{{imu}}/*.csv, "
             f"got {pattern!r}"
         )
-    written, last = "", 0
+    written, last, ends_in_digits = "", 0, False
     for part in _PART.finditer(pattern):
         name, named, _ = part.groups()
+        _refuse_digits(sensor, pattern, pattern[last : part.start()] if ends_in_digits else "")
+        ends_in_digits = bool(name) and not named
         if written and part.start() == last:
             raise InputError(
                 f"{sensor}: pattern {pattern}: expected a character of the names before {part[0]}, "
@@ -172,12 +194,21 @@ def _compiled(sensor: str, pattern: str) -> re.Pattern[str]:
         text = "[^/]+?" if named else "[0-9]+"
         written += f"(?P<{name}>{text})" if name else "[^/]*"
     rest = pattern[last:]
+    _refuse_digits(sensor, pattern, rest if ends_in_digits else "")
     if set("{}") & set(_PART.sub("", pattern)):
         raise InputError(
             f"{sensor}: pattern {pattern}: expected {{imu}}, {{recording}}, {{imu:name}}, "
             "{recording:name} and * as its parts"
         )
     return re.compile(written + re.escape(rest))
+
+
+def _refuse_digits(sensor: str, pattern: str, behind_number: str) -> None:
+    if behind_number[:1].isdigit():
+        raise InputError(
+            f"{sensor}: pattern {pattern}: expected no digit behind a number, got "
+            f"{behind_number[0]!r}, or it cannot be told where the number ends"
+        )
 
 
 def _numbered(sensor: str, pattern: str, found: Mapping[str, re.Match[str]]) -> Numbers:
@@ -220,6 +251,12 @@ def _numbers(
         named = ", ".join(f"{text} is {place}" for text, place in list(order.items())[:_NAMED])
         _LOG.info("%s: %d %ss by name: %s", sensor, len(order), part, named)
         return {name: order[text] for name, text in texts.items()}
+    for name, text in texts.items():
+        if len(text.lstrip("0")) > _DIGITS:
+            raise InputError(
+                f"{sensor}: {name}: expected a number of at most {_DIGITS} digits for {{{part}}}; "
+                f"write {{{part}:name}} to have them numbered in their order"
+            )
     numbers = {name: int(text) for name, text in texts.items()}
     for name in (name for name, number in numbers.items() if number < 1):
         raise InputError(

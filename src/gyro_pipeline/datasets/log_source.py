@@ -35,6 +35,10 @@ class LogSource(AbstractDataset[Logs, Logs]):
         metadata: dict[str, Any] | None,
     ) -> None:
         self.entry = _entry(sensor, sensors)
+        if not isinstance(path, str):
+            raise InputError(
+                f"{sensor}: path in the catalog entry: expected a folder, got {path!r}"
+            )
         self._sensor = sensor
         self._source = source
         self._path = Path(path)

@@ -4,11 +4,11 @@ import numpy as np
 
 from gyro_pipeline.logs import Log
 from gyro_pipeline.parameters import ReaderOptions
-from gyro_pipeline.readers.formats import READERS, Reader, reader_of
+from gyro_pipeline.readers.formats import READERS, Reader, check_format, reader_of
 from gyro_pipeline.readers.tables import Table, open_table
 from gyro_pipeline.readers.timing import Timing, check_rate, from_counter, from_stamps
 
-__all__ = ["READERS", "Reader", "Table", "read_log"]
+__all__ = ["READERS", "Reader", "Table", "check_format", "read_log"]
 
 
 def read_log(path: Path, options: ReaderOptions, expected_rate_hz: float | None = None) -> Log:

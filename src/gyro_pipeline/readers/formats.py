@@ -338,16 +338,23 @@ READERS: dict[str, Reader] = {
 """Formats by the name that ``format`` of the options has; the first that claims a file reads it."""
 
 
+def check_format(name: str, where: str) -> None:
+    """Refuse a name that no format has.
+
+    Raises:
+        InputError: So it is.
+    """
+    if name != "auto" and name not in READERS:
+        raise InputError(f"{where}: expected format auto, {', '.join(READERS)}, got {name!r}")
+
+
 def reader_of(table: Table, options: ReaderOptions, path: Path) -> Reader:
     """The format that the options name, or the first that claims the table.
 
     Raises:
         InputError: There is no format of that name.
     """
+    check_format(options.format, str(path))
     if options.format == "auto":
         return next(reader for reader in READERS.values() if reader.claims(table))
-    if options.format not in READERS:
-        raise InputError(
-            f"{path}: expected format auto, {', '.join(READERS)}, got {options.format!r}"
-        )
     return READERS[options.format]

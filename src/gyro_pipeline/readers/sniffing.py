@@ -71,7 +71,10 @@ def open_text(path: Path) -> TextTable:
 
 def _decoded(path: Path) -> bytes:
     """Bytes of the text, without byte order mark; UTF-16 becomes UTF-8."""
-    data = path.read_bytes()
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     if data.startswith(_UTF16):
         data = data.decode("utf-16", "replace").encode()
     data = data.removeprefix(_UTF8)

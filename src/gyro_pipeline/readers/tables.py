@@ -173,7 +173,7 @@ def _microseconds(kind: Any) -> Any:
 
 @dataclass(frozen=True)
 class _Arrays:
-    """Numeric arrays: vectors are a column each, matrices one a column of theirs.
+    """Numeric arrays: vectors are a column each, matrices one a column, or a row where three are.
 
     What is in fields of arrays or structures is named by them: ``log.gyro`` is ``gyro`` of ``log``.
     """
@@ -195,12 +195,14 @@ class _Arrays:
             if 1 in array.shape or array.ndim == 1:
                 columns[name] = array.reshape(-1)
                 continue
-            rows, width = array.shape
+            of_rates = len(array) == len(AXES) < array.shape[1]
+            table = array.T if of_rates else array
+            rows, width = table.shape
             if width > rows:  # not a row a sample
                 continue
             labels = AXES if width == len(AXES) else tuple(map(str, range(width)))
             for number, label in enumerate(labels):
-                columns[_inside(name, label)] = array[:, number]
+                columns[_inside(name, label)] = table[:, number]
         if not columns:
             found = ", ".join(
                 f"objects {name}, which are not read"
