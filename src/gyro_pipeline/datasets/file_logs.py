@@ -90,6 +90,12 @@ class FileLogs(LogSource):
         """
         found = self._matching()
         numbers = _numbered(self._sensor, self._pattern, found)
+        imus = len({imu for imu, _ in numbers.values()})
+        if imus != self.entry.imus:
+            _LOG.warning(
+                "%s: files of %d IMUs in %s, where globals.yml says imus: %d",
+                *(self._sensor, imus, self._path, self.entry.imus),
+            )
         check_writable(self._cache / _KEPT)
         readings = self._readings(found)
         self._tidy([one.kept_as for one in readings.values()])
