@@ -3,10 +3,12 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gyro_pipeline.conventions import InputError
+from gyro_pipeline.conventions import AXES, InputError
 from gyro_pipeline.datasets.atomic import replacing
 from gyro_pipeline.logs import Finding, Log
 from gyro_pipeline.parameters import ReaderOptions
@@ -67,32 +69,43 @@ def _passes(cause: BaseException | None) -> bool:
 
 
 def _save(known: Log | InputError, path: Path) -> None:
-    """Arrays one after the other, which takes half the time of an archive of them."""
+    """A line of JSON, then the values of each axis, and of the temperature: read at disk speed."""
+    said: dict[str, Any]
+    values: list[NDArray[np.float64]] = []
     if isinstance(known, InputError):
-        arrays = [np.array(json.dumps(str(known)))]
+        said = {"refused": str(known)}
     else:
-        findings = [[finding.check, finding.outcome, finding.detail] for finding in known.findings]
-        said = json.dumps([known.rate_hz, known.gap_rows.tolist(), findings])
-        with np.errstate(over="ignore"):
-            arrays = [np.array(said), known.samples.astype(np.float32)]
-        if known.temperature_c is not None:
-            arrays.append(known.temperature_c.astype(np.float32))
+        warmth = [] if known.temperature_c is None else [known.temperature_c]
+        values = [*known.samples.T, *warmth]
+        said = {
+            "rows": len(known.samples),
+            "rate_hz": known.rate_hz,
+            "gap_rows": known.gap_rows.tolist(),
+            "findings": [[one.check, one.outcome, one.detail] for one in known.findings],
+        }
     with replacing(path) as temporary, temporary.open("wb") as file:
-        for array in arrays:
-            np.save(file, array)
+        file.write(json.dumps(said).encode() + b"\n")
+        with np.errstate(over="ignore"):
+            file.write(np.array(values, np.float32).data)
 
 
 def _load(path: Path) -> Log | InputError | None:
     """None where there is nothing that can be read."""
     try:
-        with path.open("rb") as file:
-            said = json.loads(str(np.load(file)))  # never unpickles
-            if isinstance(said, str):
-                return InputError(said)
-            samples = np.load(file)
-            warmth = np.load(file) if file.peek(1) else None
-        rate_hz, gap_rows, findings = said
-        found = tuple(Finding(*finding) for finding in findings)
-        return Log(samples, rate_hz, np.array(gap_rows, np.intp), warmth, found)
+        line, values = path.read_bytes().split(b"\n", 1)
+        said = json.loads(line)
+        if "refused" in said:
+            return InputError(said["refused"])
+        columns = np.frombuffer(values, np.float32).reshape(-1, said["rows"])
+        axes, warmth = columns[: len(AXES)], columns[len(AXES) :]
+        if len(axes) < len(AXES):
+            return None
+        return Log(
+            samples=axes.T,
+            rate_hz=said["rate_hz"],
+            gap_rows=np.array(said["gap_rows"], np.intp),
+            temperature_c=warmth[0] if len(warmth) else None,
+            findings=tuple(Finding(*one) for one in said["findings"]),
+        )
     except Exception:  # a damaged file fails in many ways, and is read anew in all of them
         return None

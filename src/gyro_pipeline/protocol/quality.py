@@ -52,8 +52,8 @@ per block, and far less with more."""
 
 _SWAY = 1
 """Scatter of block means over that of samples within a block, for motion throughout. At rest it is
-at most 0.2 on the public files, and 0.6 behind a low-pass filter of 5 Hz; of a sensor that is
-carried about, 1.7 to 2.6."""
+at most 0.2 on the public files, and 0.7 behind a low-pass filter of 5 Hz; of a sensor that is
+carried about (benchmarks/quality.py), 1.4 to 2.1."""
 
 _LEAST_BLOCK = 5
 """Samples. The noise of shorter blocks is known too badly for a median of them."""
