@@ -92,6 +92,22 @@ def copied(rates):
     rates[:, 2] = rates[:, 0]
 
 
+def swaying(rates):
+    rates[:, 2] += np.sin(2 * np.pi / 80 * np.arange(ROWS) / RATE_HZ)
+
+
+def speeding_up(rates):
+    rates[:, 0] += 5 * np.exp((np.arange(ROWS) / RATE_HZ - 60) / 15)
+
+
+def spiky(rates):
+    rates[np.random.default_rng(1).random(ROWS) < 0.05, 1] += 20 * SIGMA
+
+
+def calmed(rates):
+    rates[3000:] = rates.mean(axis=0) + (rates[3000:] - rates.mean(axis=0)) / 2
+
+
 def rounded(step):
     def change(rates):
         rates[:] = step * np.round(rates / step)
@@ -117,6 +133,10 @@ def test_a_sound_recording_is_kept_whole_without_a_finding(samples, quality):
         (rotating, {"motion": REJECTED}, None),
         (shaken, {"motion": REJECTED}, None),
         (carried, {"motion": REJECTED}, None),
+        (swaying, {"motion": REJECTED}, None),
+        (speeding_up, {"motion": REJECTED}, None),
+        (spiky, {"spikes": REJECTED}, None),
+        (calmed, {"motion": REJECTED}, None),
         (interleaved, {"alternating rows": REJECTED}, None),
         (doubled, {"repeated rows": KEPT}, (0, ROWS)),
         (copied, {"equal axes": REJECTED}, None),

@@ -53,9 +53,22 @@ class Blocks:
         return self.rates.mean(axis=-1)
 
     @cached_property
+    def _squares(self) -> NDArray[np.float64]:
+        """(axis, block, sample), (deg/s)^2: of the distance from the mean of the block."""
+        apart = self.rates - self.means[..., None]
+        return np.square(apart, out=apart)
+
+    @cached_property
     def variances(self) -> NDArray[np.float64]:
         """(axis, block), (deg/s)^2: of the samples about the mean of their block."""
-        return self.rates.var(axis=-1, ddof=1)
+        return self._squares.sum(axis=-1) / (self.size - 1)
+
+    def kurtosis(self, calm: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """(axis,): of the samples of calm blocks about their means; 3 in Gaussian noise."""
+        fourth = np.einsum("abs,abs->ab", self._squares, self._squares)[:, calm].mean(axis=1)
+        second = self.variances[:, calm].mean(axis=1) * (self.size - 1) / self.size
+        gaussian = np.full_like(second, 3.0)  # what an axis without noise passes for
+        return np.divide(fourth / self.size, second**2, out=gaussian, where=second > 0)
 
     @cached_property
     def noise(self) -> NDArray[np.float64]:
@@ -64,14 +77,21 @@ class Blocks:
         median_of_one = special.chdtri(freedom, 0.5) / freedom  # of the variance of white noise
         return np.sqrt(np.median(self.variances, axis=-1) / median_of_one)
 
-    def noisier_than(self, factor: float) -> NDArray[np.bool_]:
-        """Blocks whose noise, as the root mean square over axes, exceeds the recording's: (block,).
-
-        An axis without noise counts as steady.
-        """
+    @cached_property
+    def relative_variances(self) -> NDArray[np.float64]:
+        """(block,): over that of the recording, mean of the axes; one without noise is steady."""
         own = self.noise[:, None] ** 2
         relative = np.divide(self.variances, own, out=np.ones_like(self.variances), where=own > 0)
-        return relative.mean(axis=0) > factor**2
+        return relative.mean(axis=0)
+
+    def noise_range(self, calm: NDArray[np.bool_], count: int) -> float:
+        """Largest over smallest noise of so many neighbouring blocks, all of them calm."""
+        if count > calm.size:
+            return 1.0
+        ones = np.ones(count)
+        all_calm = np.convolve(calm, ones, "valid") > count - 0.5
+        sums = np.convolve(self.relative_variances, ones, "valid")[all_calm]
+        return float(np.sqrt(sums.max() / sums.min())) if sums.size and sums.min() > 0 else 1.0
 
     def apart_from(self, bursts: NDArray[np.integer]) -> NDArray[np.bool_]:
         """Blocks at least a block away from all (first, last) rows, (bursts, 2): (block,)."""
@@ -151,6 +171,11 @@ class Means:
         duration = blocks.starts[-1] + blocks.size
         return cls(blocks.means, calm, (blocks.starts + blocks.size / 2) / duration, noise)
 
+    @property
+    def spread(self) -> NDArray[np.float64]:
+        """(axis,), deg/s: standard deviation of the calm ones."""
+        return self.rates[:, self.calm].std(axis=1) if self.calm.any() else 0 * self.noise
+
     def without(self, rates: NDArray[np.float64]) -> "Means":
         """The same less rates, (axis, block), deg/s."""
         return replace(self, rates=self.rates - rates)
@@ -168,8 +193,8 @@ def changes(means: Means, lags: Sequence[int], false_alarm: float) -> NDArray[np
     rates against three on a straight line is, twice its logarithm, the sum over axes of
     (m[1] - 2 m[2] + m[3])^2 / (6 s^2), chi-squared with a degree of freedom per axis at rest, where
     s is the standard deviation of the mean m of a stretch. It is that of a block over the root of
-    L, or what most of the stretches show if that is more, as flicker noise makes it. At least half
-    of a stretch is calm; its mean is that of its calm blocks.
+    L, as in white noise, or what most stretches show, up to that of a block, as in flicker noise.
+    At least half of a stretch is calm; its mean is that of its calm blocks.
 
     Args:
         means: Of the blocks of a recording.
@@ -196,7 +221,8 @@ def changes(means: Means, lags: Sequence[int], false_alarm: float) -> NDArray[np
         variance = 1 / a[usable] + 4 / b[usable] + 1 / c[usable]
         bends = np.abs(left - 2 * middle + right)[:, usable] / np.sqrt(variance)
         most = np.partition(bends, bends.shape[1] // 2, axis=1)[:, bends.shape[1] // 2]
-        noise = np.maximum(means.noise, most / special.ndtri(0.75))
+        usual = most / special.ndtri(0.75)
+        noise = np.clip(usual, means.noise, means.noise * np.sqrt(lag))
         ratio = ((bends / noise[:, None]) ** 2).sum(axis=0)
         found[lag + lag // 2 + np.flatnonzero(usable)[ratio > limit]] = True
     return found

@@ -14,6 +14,7 @@
 | repeated rows | rows are there twice or more: written so, or read faster than measured | kept |
 | equal axes | two axes have the same values: one column taken twice | rejected |
 | alternating rows | every other row is at another level: two sensors in one file | rejected |
+| spikes | values far out in most blocks, where these are the noise | rejected |
 | motion | the rate, or the noise, changes as neither noise nor a drift does | rejected |
 | shocks | a rate beyond the noise for an instant | repaired |
 | warm-up drift | the bias settles after power-on | kept |
@@ -49,6 +50,17 @@ _NOISE_RISE = 2
 """Of a block over the recording, for motion. At rest it is below 1.4 on the public files, whose
 noise is partly coloured; in white noise 2 has a probability of 4e-6 per recording even at 7 samples
 per block, and far less with more."""
+
+_NOISE_RANGE = 1.7
+"""The same of a few seconds over that of others, which is known better. At rest it is below 1.2 on
+the public files, and below 1.5 behind a low-pass filter of 5 Hz."""
+
+_WANDER = 5
+"""Scatter of block means about a warm-up, over their noise from one to the next. Flicker noise has
+at most 3, however strong it is."""
+
+_KURTOSIS = 6
+"""Of Gaussian noise it is 3, and so it is on the public files; of rare large values far more."""
 
 _SWAY = 1
 """Scatter of block means over that of samples within a block, for motion throughout. At rest it is
@@ -200,6 +212,7 @@ def _check_rest(
     rows = stationarity.excursions(blocks, quality.false_alarm)
     bursts = stationarity.bursts(rows, blocks.size)
     means = stationarity.Means.of(blocks, blocks.apart_from(bursts))
+    findings += _check_tails(blocks, means)
     moved = _movements(blocks, means, bursts, first_row, rate_hz, quality)
     if moved:
         return at_rest, [*findings, Finding("motion", REJECTED, "; ".join(moved))]
@@ -275,6 +288,20 @@ def _check_copies(rates: NDArray[np.float64]) -> list[Finding]:
     return [Finding("repeated rows", KEPT, detail)]
 
 
+def _check_tails(blocks: stationarity.Blocks, means: stationarity.Means) -> list[Finding]:
+    """Values so often far out that they pass for the noise."""
+    if not means.calm.any():
+        return []
+    kurtosis = blocks.kurtosis(means.calm)
+    axis = int(np.argmax(kurtosis))
+    if kurtosis[axis] <= _KURTOSIS:
+        return []
+    detail = (
+        f"the noise of axis {AXES[axis]} has a kurtosis of {kurtosis[axis]:.2g}; Gaussian has 3"
+    )
+    return [Finding("spikes", REJECTED, detail)]
+
+
 def _movements(  # noqa: PLR0917 - a stretch, what was found in it, and where it is
     blocks: stationarity.Blocks,
     means: stationarity.Means,
@@ -294,17 +321,26 @@ def _movements(  # noqa: PLR0917 - a stretch, what was found in it, and where it
         found.append(f"means scatter {scatter[axis]:.2g} times the noise, axis {AXES[axis]}")
     lags = [max(round(lag_s / quality.block_s), 1) for lag_s in quality.lags_s]
     changed = stationarity.changes(means, lags, quality.false_alarm)
-    if changed.any():  # a quick warm-up does so as well
+    wanders = means.spread > _WANDER * means.noise
+    if changed.any() or wanders.any():  # a warm-up does so as well
         settled = means.without(stationarity.settling(means))
         changed = stationarity.changes(settled, lags, quality.false_alarm)
+        wanders = settled.spread > _WANDER * means.noise
     if changed.any():
         spread = np.ptp(means.rates[:, means.calm], axis=1)
         axis = int(np.argmax(spread / means.noise))
         about = _span(first_row + blocks.span(changed), rate_hz)
         found.append(f"the rate changes by {spread[axis]:.2g} deg/s, axis {AXES[axis]}, {about}")
-    noisy = means.calm & blocks.noisier_than(_NOISE_RISE)
+    elif wanders.any():
+        size = np.ptp(means.rates[:, means.calm], axis=1)
+        axis = int(np.argmax(wanders * size / means.noise))
+        found.append(f"the rate wanders by {size[axis]:.2g} deg/s, axis {AXES[axis]}")
+    noisy = means.calm & (blocks.relative_variances > _NOISE_RISE**2)
+    noise_range = blocks.noise_range(means.calm, max(lags))
     if noisy.any():
         found.append(f"the noise rises {_span(first_row + blocks.span(noisy), rate_hz)}")
+    elif noise_range > _NOISE_RANGE:
+        found.append(f"the noise changes {noise_range:.2g}-fold")
     return found
 
 
