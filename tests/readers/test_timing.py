@@ -270,6 +270,51 @@ def test_the_last_stamp_may_be_late(seed):
     assert not len(timing.gap_rows)
 
 
+@pytest.mark.parametrize(
+    ("rate", "unit_s", "scale"), [(100, 1.0, 0.01), (100, 1e-6, 1e4), (40, 1e-3, 25)]
+)
+@pytest.mark.parametrize("doubled", [1, 100])
+def test_doubled_rows_of_a_round_clock_are_said_and_do_not_change_the_rate(
+    rate, unit_s, scale, doubled
+):
+    again = rng().choice(10 * N, doubled, replace=False)
+    timing = from_stamps(np.sort(np.r_[np.arange(10 * N), again]) * scale, unit_s)
+    assert timing.rate_hz == pytest.approx(rate, rel=1e-9 if doubled > 1 else 2e-4)
+    assert not len(timing.gap_rows)
+    assert "a timestamp repeats" in timing.findings[-1].detail
+
+
+@pytest.mark.parametrize(
+    "lost",
+    [np.arange(511, 10 * N, 512), np.arange(99, 10 * N, 100), np.arange(5000, 5200, 2)],
+)
+def test_samples_lost_at_regular_intervals_of_a_fine_clock_are_gaps(lost):
+    micros = np.round(np.arange(10 * N) * 1e4 + rng().normal(0, 20, 10 * N))
+    timing = from_stamps(np.delete(micros, lost), 1e-6)
+    np.testing.assert_array_equal(timing.gap_rows, lost - np.arange(len(lost)))
+    assert timing.rate_hz == pytest.approx(100, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        np.r_[np.arange(8000) / 100, 80 + np.arange(2000) / 92],
+        np.r_[np.arange(3000) / 100, 30 + np.arange(7000) / 50],
+        np.cumsum(1 / np.linspace(100, 95, 10_000)),
+        np.floor(np.cumsum(1 / np.linspace(120, 110, 10_000)) * 1000) / 1000,
+    ],
+)
+def test_a_rate_that_changes_is_rejected(stamps):
+    finding = from_stamps(stamps, 1.0).findings[-1]
+    assert (finding.check, finding.outcome) == ("sample rate", REJECTED)
+    assert "along the recording: split the file" in finding.detail
+
+
+def test_what_rounding_of_floats_takes_back_is_no_step_back():
+    stamps = 1.7e9 + np.repeat(np.arange(N), 2) / 100 + np.tile([0, -2e-7], N)
+    assert "time order" not in checks(from_stamps(stamps, 1.0))
+
+
 def test_a_stray_packet_number_is_ignored():
     counts = np.arange(N, dtype=float)
     counts[300] = 60_000

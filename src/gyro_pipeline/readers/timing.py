@@ -56,6 +56,9 @@ _ROUNDS = 4
 _LEAST, _LARGEST = 1e-100, 1e100
 """No clock's step, and no clock's time: garbage bytes may be read as such."""
 
+_STEADY, _PARTS = 0.02, 5
+"""A rate that differs by more from part to part of a recording is no rate; and so many parts."""
+
 _JITTER = 0.1
 """Scatter of the steps, relative to their mean, that is worth a word."""
 
@@ -93,7 +96,8 @@ class _Steps:
     def between(cls, stamps: Floats, unit_s: float | None) -> "_Steps":
         rows = np.flatnonzero(np.isfinite(stamps))
         steps, wraps = _unwrapped(np.diff(stamps[rows]), unit_s)
-        steps[np.abs(steps) < _LEAST] = 0.0
+        rounded = 4 * np.spacing(np.abs(stamps[rows]).max(initial=0.0))
+        steps[np.abs(steps) <= max(rounded, _LEAST)] = 0.0
         return cls(rows[1:], np.diff(rows), steps, wraps)
 
     def per_row(self, where: Mask) -> float:
@@ -126,8 +130,7 @@ class _Steps:
         """
         late = np.where(self.steps < 0, 0.0, self.steps - step * self.counts)
         total = np.cumsum(late)
-        least = minimum_filter1d(total, _AHEAD, mode="nearest", origin=-(_AHEAD // 2))  # ahead only
-        return least - (total - late)
+        return _least_ahead(total) - (total - late)
 
 
 def from_stamps(stamps: Floats, unit_s: float | None) -> Timing:
@@ -147,7 +150,9 @@ def from_stamps(stamps: Floats, unit_s: float | None) -> Timing:
     stamps, strays = _without_strays(np.where(np.abs(stamps) < _LARGEST, stamps, np.nan))
     every = np.diff(stamps)
     if len(every) and every.min() > _LEAST and np.ptp(every) <= _JITTER * every.mean():
-        return Timing(_rate(every.mean(), unit_s))  # as most are: there is nothing to find
+        # as most are: there is no more to find
+        uneven = _uneven(np.arange(len(stamps)), stamps, _STEADY * every.mean())
+        return Timing(_rate(every.mean(), unit_s), findings=tuple(uneven))
     found = _Steps.between(stamps, unit_s)
     steps, back = found.steps, found.steps < 0
     findings = [
@@ -164,6 +169,10 @@ def from_stamps(stamps: Floats, unit_s: float | None) -> Timing:
     what = f"samples are missing, about {missing}"
     findings += _at("gaps", found.rows[gaps], what, REPAIRED)
     findings += _irregular(found, step, clock, gaps | back)
+    late = np.where(gaps | back, 0.0, steps - step * found.counts)
+    passed = np.cumsum(found.counts)
+    allowed = _STEADY * step + 2 * _PARTS * clock.coarseness / passed[-1]
+    findings += _uneven(passed, _least_ahead(np.cumsum(late)) + step * passed, allowed)
     return Timing(_rate(step, unit_s), found.rows[back | gaps], tuple(findings))
 
 
@@ -197,8 +206,14 @@ class _Clock:
         coarse = resolution >= median / 2
         double = long & (steps < 2.01 * usual)
         rows = found.rows[double & (found.delays(median) > median / 2)]
-        regular = len(rows) >= (_FEW if coarse else _MANY) and _at_regular_intervals(rows)
-        if coarse and len(rows) >= _FEW and not regular:
+        whole = np.abs(steps - median * np.rint(steps / max(median, _LEAST)))
+        ticks = coarse or bool((whole <= resolution + _ROUNDED * np.abs(steps)).all())
+        regular = ticks and _all_along(rows, _FEW if coarse else _MANY, found.rows)
+        repeats = found.rows[(steps == 0) & (median > 0)]
+        late = (long & (found.delays(median) <= median / 2)).any()
+        losses = len(rows) >= _FEW and not regular
+        doubled = len(repeats) >= _FEW and not late and not _all_along(repeats, _FEW, found.rows)
+        if coarse and (losses or doubled):
             resolution, coarse = 0.0, False  # of an exact clock, whose step it is
 
         size, time = found.by_block(found.counts), found.by_block(forward)
@@ -240,8 +255,11 @@ def _gaps(found: _Steps, clock: _Clock) -> tuple[float, Mask, int]:
     return step, gaps, max(round(delays[gaps].sum() / step), 1)
 
 
-def _at_regular_intervals(rows: Rows) -> bool:
-    intervals = np.diff(rows)
+def _all_along(some: Rows, least: int, rows: Rows) -> bool:
+    """Whether some rows are at regular intervals and over most of the recording."""
+    if len(some) < least or 2 * np.ptp(some) < np.ptp(rows):
+        return False
+    intervals = np.diff(some)
     median = np.median(intervals)
     return bool((np.abs(intervals - median) <= 1 + _REGULAR * median).mean() >= _MOST)
 
@@ -255,7 +273,12 @@ def _irregular(found: _Steps, step: float, clock: _Clock, apart: Mask) -> list[F
     if clock.coarseness > step / 2:
         longer = ~apart & (steps > (np.median(steps) + clock.coarseness / 2) * found.counts)
         text = "a step is longer, for a lost sample or the rounding of timestamps"
-        return _at("timestamps", rows[longer], text)
+        repeats = rows[steps == 0]
+        doubled = repeats if len(repeats) < _FEW else rows[:0]
+        return [
+            *_at("timestamps", rows[longer], text),
+            *_at("duplicated timestamps", doubled, "a timestamp repeats"),
+        ]
     findings = _at("duplicated timestamps", rows[steps == 0], "a timestamp repeats")
     even = steps[(steps > 0) & ~apart & (found.counts == 1)]
     scatter = np.std(even) / step if len(even) else 0.0
@@ -263,6 +286,26 @@ def _irregular(found: _Steps, step: float, clock: _Clock, apart: Mask) -> list[F
         text = f"steps scatter by {scatter:.0%} of their mean"
         findings.append(Finding("jitter", KEPT, text))
     return findings
+
+
+def _uneven(rows: Rows, times: Floats, allowed: float) -> list[Finding]:
+    """Whether the step from row to row changes along a recording, by more than allowed."""
+    ends = np.linspace(0, len(rows) - 1, _PARTS + 1).astype(np.intp)
+    if len(set(ends)) <= _PARTS:
+        return []
+    slopes = np.diff(times[ends]) / np.diff(rows[ends])
+    if np.ptp(slopes) <= allowed:
+        return []
+    change = np.ptp(slopes) / slopes.mean()
+    text = (
+        f"the step between timestamps changes by {change:.0%} along the recording: split the file"
+    )
+    return [Finding("sample rate", REJECTED, text)]
+
+
+def _least_ahead(values: Floats) -> Floats:
+    """Least of each value and those behind it in which a late stamp is made up for."""
+    return minimum_filter1d(values, _AHEAD, mode="nearest", origin=-(_AHEAD // 2))
 
 
 def _rate(step: float, unit_s: float | None) -> float | None:
