@@ -62,6 +62,7 @@ def refusal(logs):
         ("dot_{imu}.csv", {"dot_4.csv": (4, 1), "dot_05.csv": (5, 1)}),
         ("run{recording}.csv", {"run7.csv": (1, 7)}),
         ("only.csv", {"only.csv": (1, 1)}),
+        ("{imu:name}.csv", {"1.csv": (1, 1), "1²2.csv": (2, 1)}),
         # in the order of their names, 2 before 10
         ("{imu}_*.csv", {"1_b2.csv": (1, 1), "1_b10.csv": (1, 2), "2_a.csv": (2, 1)}),
         ("*/log*.csv", {"1/log2.csv": (1, 1), "1/log10.csv": (1, 2), "2/log1.csv": (1, 3)}),

@@ -311,7 +311,7 @@ CASES = {
         lambda t: t.split("\n", 1)[0] + "\n",
         Refused("got none in the first 1"),
     ),
-    "one row": (ANGLES, lines(lambda t: t[:2]), Refused("there is one only")),
+    "one row": (ANGLES, lines(lambda t: t[:2]), Refused("got one only")),
     "half a row": (ANGLES, lambda t: t[:90], Refused("as many columns as the rows, 9, got 11")),
     "one row and no line end": (
         GENERAL,

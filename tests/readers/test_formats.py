@@ -341,7 +341,7 @@ def test_a_format_whose_first_lines_say_another_unit_is_refused(line, good, rate
     np.testing.assert_allclose(log.samples, np.degrees(rates), rtol=1e-14)
     assert not log.findings
     (said,) = read(f"{line}\n{table}", units="deg/s").findings
-    assert said.detail == "deg/s, by units of the options; lines above the rows say rad/s"
+    assert said.detail == "deg/s, but lines above the header say rad/s"
     assert not read(f"{line.replace('rad', 'deg')}\n{table}").findings
 
 
@@ -375,7 +375,7 @@ def test_units_in_attributes_of_columns_count(suffix, rates, read):
         if suffix == ".h5":
             with h5py.File(path, "w") as file:
                 file["gyro"] = rates
-                file["gyro"].attrs["units"] = "rad/s"
+                file["gyro"].attrs["Units"] = np.array([b"rad/s"])
             return
         fields = [pa.field(f"gyro.{n}", pa.float64(), metadata={"unit": "rad/s"}) for n in "xyz"]
         pq.write_table(pa.table(list(rates.T), schema=pa.schema(fields)), path)
@@ -385,6 +385,116 @@ def test_units_in_attributes_of_columns_count(suffix, rates, read):
         np.testing.assert_allclose(log.samples, np.degrees(rates))
     with pytest.raises(InputError, match="the header says rad/s"):
         read(save, name=f"log{suffix}", units="deg/s")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "time,gx_dps,gy_dps,gz_dps\ns,rad/s,rad/s,rad/s\n",
+        "gx_dps (rad/s),gy_dps (rad/s),gz_dps (rad/s),t\n",
+    ],
+)
+def test_two_units_in_a_header_are_refused(text, read):
+    with pytest.raises(InputError, match="expected one unit of all rates"):
+        read(text + "".join(f"{k},1.5,2.{k},3.5\n" for k in range(60)))
+
+
+@pytest.mark.parametrize(
+    ("header", "options", "words"),
+    [
+        ("gx (rad/s) low,gy (rad/s) low,gz (rad/s) low", {"units": "deg/s"}, "header says rad/s"),
+        ("gx (0.01 dps/LSB),gy (0.01 dps/LSB),gz (0.01 dps/LSB)", {"units": "deg/s"}, "says raw"),
+        ("gx (0.01 dps/LSB),gy (0.01 dps/LSB),gz (0.01 dps/LSB)", {}, "raw counts: give units"),
+    ],
+)
+def test_units_within_a_header_count(header, options, words, read):
+    with pytest.raises(InputError, match=words):
+        read(header + "\n" + "1,2,3\n" * 60, **{"columns": (0, 1, 2)} | options)
+
+
+def test_a_logger_of_counts_is_not_read_by_the_unit_of_its_format(good, read):
+    table = good["movella_dot"][good["movella_dot"].index("PacketCounter") :]
+    with pytest.raises(InputError, match="lines above the header say raw; give units"):
+        read(f"Gyroscope: LSB\n{table}")
+
+
+def test_another_column_with_a_unit_says_nothing_of_the_rates(good, rates, read):
+    text = good["movella_dot"].replace("Acc_X", "omega_norm (rad/s)")
+    np.testing.assert_array_equal(read(text).samples, rates)
+
+
+def test_a_header_may_overrule_the_lines_above_it_which_is_said(good, read):
+    (said,) = read("Gyroscope unit: rad/s\n" + good["ngimu"]).findings
+    assert said.detail == "deg/s, but lines above the header say rad/s"
+
+
+def test_the_rates_of_an_axis_each_are_told_from_their_norm(rates, read):
+    names = [f"Gyroscope {axis} (rad/s)" for axis in "xyz"]
+    table = pd.DataFrame(np.radians(rates), columns=names)
+    table["Absolute (rad/s)"] = 5.0
+    log = read(lambda path: table.to_csv(path, index_label="Time (s)"), time_units="s")
+    np.testing.assert_allclose(log.samples, rates)
+    table[[name.replace("Gyro", "Other gyro") for name in names]] = 1.0
+    with pytest.raises(InputError, match="give columns"):
+        read(lambda path: table.to_csv(path, index_label="Time (s)"))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "Elapsed (s)",
+        "Timestamps (s)",
+        "time_stamp (s)",
+        "Time/s",
+        "t/s",
+        "seconds",
+        "ts_s",
+        "t [s]",
+    ],
+)
+@pytest.mark.parametrize("before", ["T", "T (degC)", "Time"])
+def test_a_column_of_times_is_found_and_no_temperature_is_one(name, before, rates, read):
+    names = f"{before},{name},gx (dps),gy (dps),gz (dps)"
+    rows = "".join(
+        f"25.{k % 7},{k / 50},{x},{y},{z}\n" for k, (x, y, z) in enumerate(rates.tolist())
+    )
+    log = read(f"{names}\n{rows}", 50)
+    assert log.rate_hz == pytest.approx(50)
+    assert not [one for one in log.findings if one.check != "temperature"]
+
+
+@pytest.mark.parametrize("time", ["07/31/2022 12:00:00.1{}", "12:00:00,1{}", "no {}"])
+def test_times_that_are_not_read_cost_the_rate_and_not_the_file(time, rates, read):
+    rows = "".join(f"{time.format(k)};{x};{y};{z}\n" for k, (x, y, z) in enumerate(rates.tolist()))
+    text = f"Time;gx (dps);gy (dps);gz (dps)\n{rows}"
+    log = read(text)
+    np.testing.assert_array_equal(log.samples, rates)
+    assert log.rate_hz is None
+    assert log.findings[0].detail.startswith("'Time' left out: ")
+    with pytest.raises(InputError, match="Time: expected a number"):
+        read(text, time_column="Time", time_units="s")
+
+
+def test_a_temperature_of_its_own_rate_is_left_out(rates, read):
+    arrays = {"gyro_dps": rates, "t": np.arange(60) / 50, "temperature": np.full(3, 25.0)}
+    log = read(lambda path: np.savez(path, **arrays), 50, name="log.npz", time_units="s")
+    assert (log.temperature_c, log.rate_hz) == (None, pytest.approx(50))
+    assert "'temperature' left out: " in log.findings[0].detail
+
+
+def test_comments_among_the_rows_are_no_rows(good, rates, read):
+    lines = good["ngimu"].splitlines()
+    text = "\n".join([*lines[:20], "# a marker", *lines[20:40], "// and another", *lines[40:]])
+    log = read(text + "\n", 400)
+    np.testing.assert_array_equal(log.samples, rates)
+    assert checks(log) == [("comments", "kept")]
+
+
+@pytest.mark.parametrize("note", ["ok, fine", "Sun, 31 Jul", "[1,2]"])
+def test_commas_in_texts_say_nothing_of_decimals(note, good, rates, read):
+    lines = good["general"].splitlines()
+    text = "\n".join([f"{lines[0]};note", *(f"{line};{note}" for line in lines[1:])])
+    np.testing.assert_allclose(read(text + "\n").samples, rates, atol=1e-7)
 
 
 def test_the_header_wins_over_the_format(good, rates, read):

@@ -275,7 +275,7 @@ def _numbers(
 def _natural(path: str) -> list[tuple[int, int | str]]:
     """Sorts 2 before 10."""
     return [
-        (0, int(text)) if text.isdigit() else (1, text) for text in re.findall(r"\d+|\D+", path)
+        (0, int(text)) if text.isdecimal() else (1, text) for text in re.findall(r"\d+|\D+", path)
     ]
 
 

@@ -1,10 +1,15 @@
+from collections.abc import Sequence
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gyro_pipeline.logs import Log
+from gyro_pipeline.conventions import InputError
+from gyro_pipeline.logs import KEPT, Finding, Log
 from gyro_pipeline.parameters import ReaderOptions
 from gyro_pipeline.readers.formats import READERS, Reader, check_format, reader_of
+from gyro_pipeline.readers.headers import listed
 from gyro_pipeline.readers.tables import Table, open_table
 from gyro_pipeline.readers.timing import Timing, check_rate, from_counter, from_stamps
 
@@ -31,16 +36,24 @@ def read_log(path: Path, options: ReaderOptions, expected_rate_hz: float | None 
     """
     table = open_table(path)
     layout = reader_of(table, options, path).layout(table, options, str(path))
-    extra = [n for n in (layout.time, layout.temperature, layout.counter) if n is not None]
-    columns = [*layout.rates, *(n for n in dict.fromkeys(extra) if n not in layout.rates)]
-    values, damage = table.read(columns, lenient=layout.temperature)
-    column = dict(zip(columns, values, strict=True))
-    stamps = Timing() if layout.time is None else from_stamps(column[layout.time], layout.time_s)
+    found_only = [
+        number
+        for number, given in (
+            (layout.time, options.time_column),
+            (layout.temperature, options.temperature_column),
+        )
+        if number is not None and given is None
+    ]
+    columns = [*layout.rates, layout.time, layout.temperature, layout.counter]
+    column, damage = _read(table, columns, layout.temperature, found_only)
+    stamps = Timing()
+    if layout.time in column:
+        stamps = from_stamps(column[layout.time], layout.time_s)
     counts = Timing()
     if layout.counter is not None:
         counts = from_counter(column[layout.counter], layout.counter_bits)
     temperature_c = None
-    if layout.temperature is not None and np.isfinite(column[layout.temperature]).any():
+    if layout.temperature in column and np.isfinite(column[layout.temperature]).any():
         a, b = layout.celsius
         temperature_c = a * column[layout.temperature] + b
     rate: tuple = ()
@@ -53,3 +66,27 @@ def read_log(path: Path, options: ReaderOptions, expected_rate_hz: float | None 
         temperature_c=temperature_c,
         findings=(*damage, *layout.findings, *stamps.findings, *counts.findings, *rate),
     )
+
+
+def _read(
+    table: Table, columns: Sequence[int | None], lenient: int | None, found_only: Sequence[int]
+) -> tuple[dict[int | None, NDArray[np.float64]], tuple[Finding, ...]]:
+    """Columns by number, without those that nobody asked for if they are the trouble."""
+    wanted = list(dict.fromkeys(number for number in columns if number is not None))
+    try:
+        values, damage = table.read(wanted, lenient)
+    except InputError as error:
+        if error.__cause__ is not None:  # the file is the trouble
+            raise
+        for count in range(1, len(found_only) + 1):
+            for without in combinations(found_only, count):
+                others = [number for number in wanted if number not in without]
+                try:
+                    values, damage = table.read(others, lenient)
+                except InputError:
+                    continue
+                text = f"{listed([table.names[n] for n in without])} left out: {error}"
+                finding = Finding("columns", KEPT, text)
+                return dict(zip(others, values, strict=True)), (*damage, finding)
+        raise
+    return dict(zip(wanted, values, strict=True)), damage

@@ -3,6 +3,7 @@
 A new format is a subclass of :class:`Reader` that says so, and an entry in :data:`READERS`.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -124,24 +125,23 @@ class Reader:
     ) -> tuple[float, tuple[Finding, ...]]:
         """deg/s in one unit of the rates; a finding if the header does not say which."""
         headers = [table.names[number] for number in rates]
-        said = {split_unit(header, UNITS)[1] for header in headers}
         found = {rate_unit(header) for header in headers}
+        found |= {unit for header in headers if (unit := rate_unit(split_unit(header, UNITS)[0]))}
         if len(found) > 1:
             raise InputError(
                 f"{where}: expected one unit of all rates, got {listed(headers)}; correct the "
                 "header"
             )
-        unit: str | None = found.pop()
-        if unit and options.units and unit != options.units:
+        by_header = found.pop()
+        if by_header and options.units and by_header != options.units:
             raise InputError(
-                f"{where}: the header says {unit}, {listed(headers)}, and units of the options "
-                f"{options.units}; correct the one that is wrong"
+                f"{where}: the header says {by_header}, {listed(headers)}, and units of the "
+                f"options {options.units}; correct the one that is wrong"
             )
-        findings: tuple[Finding, ...] = ()
-        if unit is None:
-            # where they differ they are the axes: gyro[x]
-            unknown = said.pop() if len(said) == 1 else None
-            unit, findings = self._unit_without(unknown, table.preamble, options.units, where)
+        # where they differ they are the axes: gyro[x]
+        others = {split_unit(header, UNITS)[1] for header in headers}
+        unknown = others.pop() if by_header is None and len(others) == 1 else None
+        unit = by_header or options.units or (None if unknown else self.units)
         if unit == "raw" and options.scale_dps is None:
             raise InputError(f"{where}: raw counts: give units: raw and scale_dps, deg/s a count")
         if unit is None:
@@ -149,29 +149,23 @@ class Reader:
                 f"{where}: expected a unit of the rates, got {listed(headers)}; give units: "
                 f"{', '.join(DEG_PER_S)} or raw (with scale_dps)"
             )
-        return options.scale_dps or DEG_PER_S[unit], findings
-
-    def _unit_without(
-        self, unknown: str | None, preamble: str, by_options: str | None, where: str
-    ) -> tuple[str | None, tuple[Finding, ...]]:
-        """What options or else the format say, beside an unknown unit and lines above the rows."""
-        above = rate_units_in(preamble)
-        if by_options:
-            but = f"the header says {unknown}, which is not known" if unknown else ""
-            if others := above - {by_options}:
-                but = f"lines above the rows say {', '.join(sorted(others))}"
-            text = f"{by_options}, by units of the options; {but}"
-            return by_options, (Finding("unit", KEPT, text),) if but else ()
-        if unknown or self.units is None or above == {self.units}:
-            return None if unknown else self.units, ()
-        if above:
+        by_format = not (by_header or options.units)
+        above = rate_units_in(table.preamble)
+        listed_above = ", ".join(sorted(above - {unit}))
+        if listed_above and by_format:
             raise InputError(
-                f"{where}: the unit of this format is {self.units}, but lines above the rows say "
-                f"{', '.join(sorted(above))}; give units"
+                f"{where}: the unit of this format is {unit}, but lines above the header say "
+                f"{listed_above}; give units"
             )
-        return self.units, (
-            Finding("unit", KEPT, f"{self.units}, by the format; the file does not say"),
-        )
+        note = None
+        if listed_above:
+            note = f"{unit}, but lines above the header say {listed_above}"
+        elif unknown:
+            note = f"{unit}, by the options; the header says {unknown}, which is not known"
+        elif by_format and not above:
+            note = f"{unit}, by the format; the file does not say"
+        findings = (Finding("unit", KEPT, note),) if note else ()
+        return options.scale_dps or DEG_PER_S[unit], findings
 
     @staticmethod
     def _temperature(
@@ -206,7 +200,8 @@ class Reader:
     ) -> tuple[float | None, tuple[Finding, ...]]:
         """Seconds in one unit of the timestamps; a finding if that cannot be said."""
         if time is None:
-            return None, (Finding("timestamps", KEPT, "no time column: the rate is not checked"),)
+            text = "no time column was found; give time_column to have the rate checked"
+            return None, (Finding("timestamps", KEPT, text),)
         if time in table.in_seconds:
             return 1.0, ()
         header = table.names[time]
@@ -298,8 +293,8 @@ class General(Reader):
         rates = [n for n, name in enumerate(table.names) if rate_unit(name) not in (None, "raw")]
         if not rates and len(table.names) == len(AXES):
             return range(len(AXES))
-        stems = [split_unit(table.names[n], UNITS)[0] for n in rates]
-        if len(rates) != len(AXES) or (order := axes(stems)) is None:
+        order = axes([split_unit(table.names[n], UNITS)[0] for n in rates])
+        if order is None:
             raise InputError(
                 f"{where}: expected columns of angular rate about x, y, z with their unit, got "
                 f"{listed(table.names)}; give columns"
@@ -307,9 +302,33 @@ class General(Reader):
         return [rates[number] for number in order]
 
     def time_column(self, table: Table) -> Column | None:
-        """The first column that is named time or timestamp, be it in a structure."""
-        stems = [split_unit(name, UNITS)[0].lower().split(".")[-1] for name in table.names]
-        return next((n for n, stem in enumerate(stems) if stem in ("time", "timestamp", "t")), None)
+        """The first column that is named a time, one with a unit of time before others."""
+        found = [n for n, name in enumerate(table.names) if _is_time(name)]
+        told = [n for n in found if n in table.in_seconds or split_unit(table.names[n], UNITS)[1]]
+        return next(iter(told or found), None)
+
+
+_TIME_NAMES = (
+    "time",
+    "timestamp",
+    "timestamps",
+    "t",
+    "ts",
+    "elapsed",
+    "elapsedtime",
+    "datetime",
+    "",
+)
+
+
+def _is_time(header: str) -> bool:
+    """Whether it names a time, or nothing but a unit of time; T may be a temperature."""
+    name, unit = split_unit(header, UNITS)
+    stem = split_unit(name, UNITS)[0].split(".")[-1]
+    word = re.sub(r"[^a-z]", "", stem.lower())
+    if unit in TIME_UNITS:
+        return word in (*_TIME_NAMES, "")
+    return word in _TIME_NAMES and stem != "T" and unit not in CELSIUS
 
 
 _DEGREES_C = ("degc", "°c", "celsius")

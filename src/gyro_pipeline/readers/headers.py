@@ -47,9 +47,9 @@ CELSIUS = {
 }
 """By the spelling of a unit of temperature: degrees Celsius are a times a value, plus b."""
 
-_BRACKETED = re.compile(r"\s*[(\[]([^()\[\]]*)[)\]]\s*$")
+_BRACKETED = re.compile(r"\s*[(\[]([^()\[\]]*)[)\]]")
 _AXIS = re.compile(r"\.[xyz]$")  # of an array of three columns
-_SEPARATOR = re.compile(r"[ _.]+")
+_SEPARATOR = re.compile(r"[ _./]+")
 _TIMES = re.compile(r"[\s^*·⋅.]")
 _EACH = re.compile(r"(?<=.)(?:per(s|sec|second|h|hr|hour)|(s|sec|h|hr)-1)$")
 _WORDS = re.compile(r"[\s,;:=()\[\]\"'#%]+")
@@ -61,18 +61,20 @@ def split_unit(header: str, spellings: tuple[str, ...]) -> tuple[str, str | None
     """Part a header into its name and its unit as written.
 
     Args:
-        header: Such as ``Gyroscope X (deg/s)``, ``w_x [rad s^-1]``, ``gx_dps`` or ``w_x``.
+        header: Such as ``Gyroscope X (deg/s)``, ``w_x [rad s^-1]``, ``t/s``, ``gx_dps`` or ``w_x``.
         spellings: Units to look for where there are no brackets.
 
     Returns:
-        The name, and what is in brackets at the end, else a spelling behind a space, dot or
-        underscore, or all of it, in lower case, without spaces and with a slash; None if there is
-        none.
+        The name, and what is in brackets at the end, else a spelling in brackets, or behind a
+        space, dot, underscore or slash, or all of it, in lower case, without spaces and with a
+        slash; None if there is none.
     """
     axis = match[0] if (match := _AXIS.search(header)) else ""
     text = header.removesuffix(axis)
-    if found := _BRACKETED.search(text):
-        return text[: found.start()] + axis, _written(found[1])
+    for found in reversed(list(_BRACKETED.finditer(text))):
+        unit, behind = _written(found[1]), text[found.end() :]
+        if not behind.strip() or unit in spellings:
+            return text[: found.start()] + behind.rstrip() + axis, unit
     for name, start in [(0, 0), *(one.span() for one in _SEPARATOR.finditer(text))]:
         if (unit := _written(text[start:])) in spellings:
             return text[:name] + axis, unit
@@ -86,19 +88,21 @@ def _written(unit: str) -> str:
 
 
 def rate_units_in(text: str) -> set[str]:
-    """Units of angular rate, but raw counts, that a text names."""
+    """Units of angular rate that a text names; of raw counts LSB, for others are common words."""
     words = _WORDS.split(text)
     parts = (
         _written(" ".join(words[at : at + count]))
         for count in range(1, _LONGEST + 1)
         for at in range(len(words) - count + 1)
     )
-    return {RATE_UNITS[part] for part in parts if part in RATE_UNITS} - {"raw"}
+    found = {part for part in parts if part in RATE_UNITS}
+    return {RATE_UNITS[part] for part in found if RATE_UNITS[part] != "raw" or part == "lsb"}
 
 
 def rate_unit(header: str) -> str | None:
     """Unit of an angular rate as its header has it; None if it says none or an unknown one."""
-    return RATE_UNITS.get(split_unit(header, UNITS)[1] or "")
+    said = split_unit(header, UNITS)[1] or ""
+    return "raw" if said.endswith("/lsb") else RATE_UNITS.get(said)
 
 
 def find(names: Sequence[str], column: Column, where: str) -> int:
@@ -138,15 +142,16 @@ def matching(names: Sequence[str], column: str) -> list[int]:
 
 
 def axes(names: Sequence[str]) -> list[int] | None:
-    """Numbers of three columns whose names differ only in the letters x, y, z, in that order."""
+    """Numbers of the only three columns whose names differ but in the letters x, y, z, in order."""
+    found = []
     for order in permutations(range(len(names)), len(AXES)):
         stems = [
             {name[:at] + name[at + 1 :] for at, letter in enumerate(name.lower()) if letter == axis}
             for name, axis in zip([names[number] for number in order], AXES, strict=True)
         ]
         if set.intersection(*stems):
-            return list(order)
-    return None
+            found.append(list(order))
+    return found[0] if len({frozenset(order) for order in found}) == 1 else None
 
 
 def listed(names: Sequence[str]) -> str:

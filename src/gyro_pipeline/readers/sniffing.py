@@ -53,12 +53,13 @@ def open_text(path: Path) -> TextTable:
     lines = _first_lines(data)
     rows = _find_rows(path, lines)
     above = _above(lines, rows)
+    header = _header(above, rows)
     start = above[-1].end if above else 0
     head = data[start : start + _HEAD].decode("latin-1")
     return TextTable(
         path=path,
-        names=_names(path, above, rows),
-        preamble="\n".join(line.text for line in lines[: rows.at]),
+        names=_names(path, header, rows),
+        preamble="\n".join(line.text for line in above if line not in header),
         data=data,
         start=start,
         header_lines=above[-1].number if above else 0,
@@ -151,30 +152,36 @@ def _above(lines: list[_Line], rows: _Rows) -> list[_Line]:
     return above
 
 
-def _header(above: list[_Line], rows: _Rows) -> _Line | None:
-    """The line next to the rows, or the nearest as wide as they are if that has too few fields."""
+def _header(above: list[_Line], rows: _Rows) -> list[_Line]:
+    """The line next to the rows, or the nearest as wide as they are if that has too few fields.
+
+    Two lines where the last one has units only and the one before it has names.
+    """
     widths = [len(split(line.text, rows.delimiter)) for line in above]
-    if widths and widths[-1] >= len(AXES):
-        return above[-1]
     wide = [n for n, width in enumerate(widths) if abs(width - len(rows.fields)) <= 1]
-    return above[wide[-1]] if wide else None
+    if widths and widths[-1] >= len(AXES):
+        last = len(above) - 1
+    elif wide:
+        last = wide[-1]
+    else:
+        return []
+    names = [split(line.text.lstrip(_COMMENT), rows.delimiter) for line in above[: last + 1][-2:]]
+    if [_are_units(one) for one in names] == [False, True] and len(names[0]) == len(names[1]):
+        return above[last - 1 : last + 1]
+    return [above[last]]
 
 
-def _names(path: Path, above: list[_Line], rows: _Rows) -> tuple[str, ...]:
+def _names(path: Path, header: list[_Line], rows: _Rows) -> tuple[str, ...]:
     """The header, as long as the rows; a delimiter at the end of one alone does not count.
 
-    It may be two lines, of names and of their units. A header with a delimiter too many or too few
-    elsewhere would shift the names: it is refused.
+    A header with a delimiter too many or too few elsewhere would shift the names: it is refused.
     """
     width = len(rows.fields)
-    header = _header(above, rows)
-    if header is None:
+    if not header:
         return ("",) * width
-    names = split(header.text.lstrip(_COMMENT), rows.delimiter)
-    if _are_units(names) and len(above) > 1:
-        over = split(above[above.index(header) - 1].text.lstrip(_COMMENT), rows.delimiter)
-        if len(over) == len(names) and not _are_units(over):
-            names = [_with_unit(*both) for both in zip(over, names, strict=True)]
+    names, *units = [split(line.text.lstrip(_COMMENT), rows.delimiter) for line in header]
+    if units:
+        names = [_with_unit(*both) for both in zip(names, units[0], strict=True)]
     ends = bool(names[-1]), bool(rows.fields[-1])
     if ends == (False, True) and len(names) == width + 1:
         return tuple(names[:-1])
@@ -182,7 +189,7 @@ def _names(path: Path, above: list[_Line], rows: _Rows) -> tuple[str, ...]:
         return (*names, "")
     if len(names) != width or (ends[0] != ends[1] and "" in names):
         raise InputError(
-            f"{path} line {header.number}: expected a header of as many columns as "
+            f"{path} line {header[0].number}: expected a header of as many columns as "
             f"the rows, {width}, got {len(names)}, {listed(names)}; which is which cannot be told: "
             "correct it"
         )
@@ -207,6 +214,8 @@ def _decimal_point(path: Path, head: str, delimiter: str) -> str:
     commas = _WITH_COMMA.findall(head)
     if _WITH_BOTH.search(head):
         problem = "numbers with both commas and points"
+    elif not commas:  # but in texts
+        return "."
     elif all(len(after) == 3 and before.strip("0") for before, after in commas):  # noqa: PLR2004
         problem = "a comma before three digits each time, which may separate thousands"
     else:

@@ -125,6 +125,7 @@ class _Parquet:
         return cls(path, tuple(names), tuple(field.name for field in fields), frozenset(times))
 
     def read(self, columns: Sequence[int], lenient: int | None = None) -> Values:
+        del lenient  # a column is of one type: all can be read or none
         names = [self.fields[number] for number in columns]
         if twice := {name for name in names if self.fields.count(name) > 1}:
             raise InputError(f"{self.path}: expected one column each, got twice {listed([*twice])}")
@@ -132,33 +133,28 @@ class _Parquet:
         def read(path: Path) -> list[NDArray[np.float64]]:
             with pq.ParquetFile(path) as file:
                 table = file.read(columns=sorted({*names}), use_threads=False)
-            return [
-                self._numbers(name, table[name], number == lenient)
-                for number, name in zip(columns, names, strict=True)
-            ]
+            return [self._numbers(name, table[name]) for name in names]
 
         return _guarded(self.path, read), ()
 
-    def _numbers(self, name: str, column: Any, lenient: bool) -> NDArray[np.float64]:
+    def _numbers(self, name: str, column: Any) -> NDArray[np.float64]:
         kind = column.type
         if to := _microseconds(kind):
             micros = np.array(column.cast(to, safe=False).cast(pa.int64()).to_numpy(), np.float64)
             known = micros[np.isfinite(micros)]
             return (micros - known[:1] if len(known) else micros) * 1e-6
         if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
-            if lenient:
-                return np.full(len(column), np.nan)
             raise InputError(f"{self.path}: expected numbers in column {name!r}, got {kind}")
         return np.array(column.cast(pa.float64(), safe=False).to_numpy())
 
 
 def _with_unit(name: str, attributes: Mapping[Any, Any]) -> str:
     """A name, and the unit that attributes of its column give, in brackets."""
-    for key in ("unit", "units"):
-        said = attributes.get(key, attributes.get(key.encode(), b""))
-        text = said.decode("utf-8", "replace") if isinstance(said, bytes) else said
-        if isinstance(text, str) and text:
-            return f"{name} [{text}]"
+    for key, value in attributes.items():
+        if (key.decode() if isinstance(key, bytes) else key).lower() in ("unit", "units"):
+            said = np.asarray(value).reshape(-1)
+            text = said[0].decode() if said.dtype.kind == "S" else str(said[0]) if said.size else ""
+            return f"{name} [{text}]" if text else name
     return name
 
 

@@ -5,7 +5,7 @@ A file that Arrow cannot read as numbers is read once more as text, and looked a
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ import pyarrow.csv
 from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.logs import REPAIRED, Finding
+from gyro_pipeline.logs import KEPT, REPAIRED, Finding
 from gyro_pipeline.readers.fields import DELIMITERS, is_header, split
 
 _BAD_SHARE, _BAD_ROWS = 0.01, 3
@@ -26,6 +26,7 @@ _BAD_SHARE, _BAD_ROWS = 0.01, 3
 
 _NUMBER = r"^[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|(?i:inf|infinity|nan))$"
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}([,' .]\d{3})+([.,]\d+)?")
+_COMMENTS = re.compile(rb"(?m)^[ \t]*(?:#|%|//)[^\r\n]*")
 _NULLS = ["", "NaN", "nan", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
 
 Values = tuple[list[NDArray[np.float64]], tuple[Finding, ...]]
@@ -80,6 +81,10 @@ class TextTable:
             values, unreadable = self._converted(table, columns, lenient)
             kept = np.setdiff1d(np.arange(table.num_rows + len(odd)), list(odd))
             unreadable = {int(kept[row]): what for row, what in unreadable.items()}
+        if any(_is_comment(self._lines[row][1]) for row in odd):
+            values, more = replace(self, data=_COMMENTS.sub(b"", self.data)).read(columns, lenient)
+            text = "lines of comment among the rows were left out"
+            return values, (*more, Finding("comments", KEPT, text))
         rows = table.num_rows + len(odd)
         self._check(odd | unreadable, rows)
         if odd or unreadable:
@@ -215,11 +220,13 @@ class TextTable:
                     f"{self.path} line {line} (row {row}): expected numbers, got a second header, "
                     f"{text[:80]!r}: two recordings in one file? Split it"
                 )
+        if rows - len(bad) < 2 and not bad:  # noqa: PLR2004
+            raise InputError(f"{self.path}: expected rows of numbers, got one only")
         if rows - len(bad) < 2 or len(bad) > max(_BAD_ROWS, _BAD_SHARE * rows):  # noqa: PLR2004
             raise InputError(
                 f"{self.path}: expected rows of {len(self.names)} columns of numbers, "
                 f"{DELIMITERS[self.delimiter]}-separated, got {len(bad)} of {rows} that are not: "
-                f"{self._shown(bad) or 'there is one only'}; correct or export the file anew"
+                f"{self._shown(bad)}; correct or export the file anew"
             )
 
     def _finding(self, bad: Odd, rows: int) -> Finding:
@@ -230,6 +237,10 @@ class TextTable:
         first = sorted(bad)[:3]
         texts = [f"row {row} (line {self._lines[row][0]}): {bad[row]}" for row in first]
         return "; ".join(texts) + ("; …" if len(bad) > len(first) else "")
+
+
+def _is_comment(line: str) -> bool:
+    return _COMMENTS.match(line.encode()) is not None
 
 
 def _numbers(column: Any) -> NDArray[np.float64]:
