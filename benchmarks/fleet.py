@@ -128,7 +128,8 @@ def pipeline(folder: Path, scratch: Path, processes: int) -> Callable[[], Any]:
 
     quality = Quality(**yaml.safe_load((CONF / "parameters" / "stages.yml").read_text())["quality"])
     sensor = yaml.safe_load((CONF / "globals.yml").read_text())["sensors"]["dot"]
-    sensors = {"dot": sensor | {"samples": ROWS, "recording_s": ROWS / RATE_HZ}}
+    imus = sum(1 for _ in folder.iterdir())
+    sensors = {"dot": sensor | {"imus": imus, "samples": ROWS, "recording_s": ROWS / RATE_HZ}}
     source = FileLogs(
         *("dot", sensors, "fleet", str(folder), "imu{imu}/{recording}.csv"),
         cache={"path": str(scratch / "read")},
