@@ -148,6 +148,7 @@ class Quality(Parameter):
     largest_step: float = Field(gt=0, description="the same, of a mean that can be trusted")
     drift_mdps: float = Field(ge=0, description="least warm-up drift that is reported, mdps")
     largest_noise_dps: float = Field(gt=0, description="of a sample at rest, deg/s")
+    largest_drift_dps: float = Field(gt=0, description="of a recording at rest, deg/s")
     length_s: float | None = Field(
         None,
         gt=0,

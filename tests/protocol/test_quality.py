@@ -73,7 +73,7 @@ def carried(rates):
 
 
 def warming(rates):
-    rates[:, 1] += warm_up(0.5, 20, ROWS, RATE_HZ)
+    rates[:, 1] += warm_up(0.2, 20, ROWS, RATE_HZ)
 
 
 def interleaved(rates):
@@ -98,6 +98,20 @@ def swaying(rates):
 
 def speeding_up(rates):
     rates[:, 0] += 5 * np.exp((np.arange(ROWS) / RATE_HZ - 60) / 15)
+
+
+def spinning_down(rates):
+    rates[:, 0] += 20 * np.exp(-np.arange(ROWS) / RATE_HZ / 20)
+
+
+def shivering(rates):
+    sections = signal.butter(2, 1.0, fs=RATE_HZ, output="sos")
+    sway = signal.sosfilt(sections, np.random.default_rng(3).normal(size=ROWS))
+    rates[:, 2] += 2 * SIGMA * sway / sway.std()
+
+
+def drifting(rates):
+    rates[:, 1] += 0.3 * np.linspace(0, 1, ROWS) ** 2
 
 
 def spiky(rates):
@@ -135,6 +149,9 @@ def test_a_sound_recording_is_kept_whole_without_a_finding(samples, quality):
         (carried, {"motion": REJECTED}, None),
         (swaying, {"motion": REJECTED}, None),
         (speeding_up, {"motion": REJECTED}, None),
+        (spinning_down, {"motion": REJECTED}, None),
+        (shivering, {"motion": REJECTED}, None),
+        (drifting, {"warm-up drift": KEPT}, (0, ROWS)),
         (spiky, {"spikes": REJECTED}, None),
         (calmed, {"motion": REJECTED}, None),
         (interleaved, {"alternating rows": REJECTED}, None),

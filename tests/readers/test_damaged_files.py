@@ -445,7 +445,11 @@ CASES = {
         headers("w_y", "wy"),
         Refused("expected a column 'w_y', got 'Time', ", {"format": ANGLES}),
     ),
-    "no unit": (GENERAL, replaced((" [rad/s]", "")), Refused("expected columns of angular rate")),
+    "no unit": (
+        GENERAL,
+        replaced((" [rad/s]", "")),
+        Refused("expected three columns of angular rate"),
+    ),
     "no unit, columns named": (
         GENERAL,
         replaced((" [rad/s]", "")),

@@ -61,7 +61,14 @@ def test_a_temperature_column_is_kept(good, read):
 
 @pytest.mark.parametrize(
     ("header", "first_c"),
-    [("temperature (°F)", -3.8888889), ("T_temp [K]", -248.15), ("imu_degC", 25), ("temp_c", 25)],
+    [
+        ("temperature (°F)", -3.8888889),
+        ("T_temp [K]", -248.15),
+        ("imu_degC", 25),
+        ("temp_c", 25),
+        ("T(℃)", 25),
+        ("gyro temp (˚C)", 25),
+    ],
 )
 def test_temperatures_become_degrees_celsius(header, first_c, good, read):
     text = good["general"].replace("temperature (°C)", header)
@@ -119,7 +126,7 @@ def test_dot_exports_of_ten_and_thirteen_columns(columns, separator, end, rates,
 
 def test_the_names_of_mt_manager_which_writes_rad_per_s_are_not_taken_for_a_dot(good, read):
     table = good["movella_dot"][good["movella_dot"].index("PacketCounter") :]
-    with pytest.raises(InputError, match="expected columns of angular rate"):
+    with pytest.raises(InputError, match="expected three columns of angular rate"):
         read(f"// General information:\n//  MT Manager version: 2022.2.0\n{table}")
 
 
@@ -412,6 +419,33 @@ def test_units_within_a_header_count(header, options, words, read):
         read(header + "\n" + "1,2,3\n" * 60, **{"columns": (0, 1, 2)} | options)
 
 
+@pytest.mark.parametrize(
+    "name",
+    ["gx [LSB/(deg/s)]", "gx [0.1*(deg/s)]", "gx (1/131 (deg/s))", "gx [deg/s]/32.8",
+     "gx (deg/s)*100", "gx (deg/s) x100", "gx [(rad/s)/s]", "gx [(rad/s)^2]"],
+)  # fmt: skip
+def test_what_only_contains_a_unit_has_none(name, read):
+    names = [name.replace("x", axis, 1) for axis in "xyz"]
+    with pytest.raises(InputError, match="give columns|expected a unit of the rates"):
+        read(",".join(["k", *names]) + "\n" + "0,1,2,3\n" * 60)
+
+
+@pytest.mark.parametrize(
+    "others", ["p (deg/s),bias_x,bias_y", "gyro_x,gyro_y,gyro_z", "rate (deg/s),a,b"]
+)
+def test_the_only_triple_is_not_taken_beside_other_rates(others, read):
+    names = f"cov_x (deg/s),cov_y (deg/s),cov_z (deg/s),{others}"
+    with pytest.raises(InputError, match="give columns"):
+        read(names + "\n" + "1,2,3,4,5,6\n" * 60)
+
+
+def test_a_triple_is_found_among_many_columns(rates, read):
+    table = pd.DataFrame({f"c{n} (norm dps)": 0.5 for n in range(300)}, index=range(60))
+    table[[f"g{axis} norm (dps)" for axis in "xyz"]] = rates
+    log = read(lambda path: table.to_csv(path, index=False))
+    np.testing.assert_array_equal(log.samples, rates)
+
+
 def test_a_logger_of_counts_is_not_read_by_the_unit_of_its_format(good, read):
     table = good["movella_dot"][good["movella_dot"].index("PacketCounter") :]
     with pytest.raises(InputError, match="lines above the header say raw; give units"):
@@ -447,12 +481,11 @@ def test_the_rates_of_an_axis_each_are_told_from_their_norm(rates, read):
         "time_stamp (s)",
         "Time/s",
         "t/s",
-        "seconds",
         "ts_s",
         "t [s]",
     ],
 )
-@pytest.mark.parametrize("before", ["T", "T (degC)", "Time"])
+@pytest.mark.parametrize("before", ["T", "T_1", "T (degC)", "Time", "", "time (UTC)"])
 def test_a_column_of_times_is_found_and_no_temperature_is_one(name, before, rates, read):
     names = f"{before},{name},gx (dps),gy (dps),gz (dps)"
     rows = "".join(
@@ -461,6 +494,22 @@ def test_a_column_of_times_is_found_and_no_temperature_is_one(name, before, rate
     log = read(f"{names}\n{rows}", 50)
     assert log.rate_hz == pytest.approx(50)
     assert not [one for one in log.findings if one.check != "temperature"]
+
+
+@pytest.mark.parametrize(
+    "name", ["time_boot_s", "time since boot (s)", "seconds", "Unix time CAL [s]", "sysTime_s"]
+)
+def test_a_column_with_a_unit_of_time_is_a_time(name, rates, read):
+    rows = "".join(f"{k / 50},{x},{y},{z}\n" for k, (x, y, z) in enumerate(rates.tolist()))
+    assert read(f"{name},gx (dps),gy (dps),gz (dps)\n{rows}").rate_hz == pytest.approx(50)
+
+
+@pytest.mark.parametrize(
+    "name", ["temp_valid", "temp_raw", "temp_lsb", "temp_mC", "attempt", "x_tempcomp", "temp_f"]
+)
+def test_what_only_sounds_like_a_temperature_is_none(name, good, read):
+    log = read(good["general"].replace("temperature (°C)", name))
+    assert (log.temperature_c, log.findings) == (None, ())
 
 
 @pytest.mark.parametrize("time", ["07/31/2022 12:00:00.1{}", "12:00:00,1{}", "no {}"])
@@ -484,10 +533,12 @@ def test_a_temperature_of_its_own_rate_is_left_out(rates, read):
 
 def test_comments_among_the_rows_are_no_rows(good, rates, read):
     lines = good["ngimu"].splitlines()
-    text = "\n".join([*lines[:20], "# a marker", *lines[20:40], "// and another", *lines[40:]])
-    log = read(text + "\n", 400)
-    np.testing.assert_array_equal(log.samples, rates)
-    assert checks(log) == [("comments", "kept")]
+    with_commas = "# so,1,2,3,4,5,6,7,8,9,10"
+    for head in ([], [f"# {'setting ' * 10}"] * 60):
+        marked = [*lines[:20], "# a marker", *lines[20:40], "// and another", with_commas]
+        log = read("\n".join([*head, *marked, *lines[40:]]) + "\n", 400)
+        np.testing.assert_array_equal(log.samples, rates)
+        assert checks(log) == [("comments", "kept")]
 
 
 @pytest.mark.parametrize("note", ["ok, fine", "Sun, 31 Jul", "[1,2]"])

@@ -284,6 +284,14 @@ def test_doubled_rows_of_a_round_clock_are_said_and_do_not_change_the_rate(
     assert "a timestamp repeats" in timing.findings[-1].detail
 
 
+@pytest.mark.parametrize("rate", [100, 119])
+def test_many_doubled_rows_are_no_change_of_the_rate(rate):
+    stamps = np.repeat(np.arange(6 * N) / rate, 1 + (rng().random(6 * N) < 0.05))
+    timing = from_stamps(stamps, 1.0)
+    assert timing.rate_hz == pytest.approx(rate, rel=1e-9)
+    assert checks(timing) == ["duplicated timestamps"]
+
+
 @pytest.mark.parametrize(
     "lost",
     [np.arange(511, 10 * N, 512), np.arange(99, 9900, 100), np.arange(5000, 5200, 2)],

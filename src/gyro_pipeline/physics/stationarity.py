@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, special
 
-_TIME_CONSTANTS = (1 / 128, 1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1)
+_TIME_CONSTANTS = (1 / 512, 1 / 256, 1 / 128, 1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1)
 """Tried for a warm-up, in durations of the recording; the fit hardly differs between neighbours."""
 
 
@@ -229,7 +229,7 @@ def changes(means: Means, lags: Sequence[int], false_alarm: float) -> NDArray[np
 
 
 def settling(means: Means) -> NDArray[np.float64]:
-    """The warm-up of each axis, as a sum of exponentials of one sign that begin with the recording.
+    """The drift of each axis: a line, and exponentials of one sign that begin with the recording.
 
     Args:
         means: Of the blocks of a recording, two of them calm at least.
@@ -238,7 +238,7 @@ def settling(means: Means) -> NDArray[np.float64]:
         (axis, block), deg/s, of least squares, but for a constant.
     """
     calm = means.calm
-    shapes = means.decays.T
+    shapes = np.vstack([means.decays, means.times, -means.times]).T
     shapes -= shapes[calm].mean(axis=0)
     rates = means.rates - means.rates[:, calm].mean(axis=-1, keepdims=True)
     fits = []

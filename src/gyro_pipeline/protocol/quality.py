@@ -28,7 +28,7 @@ the Earth's rate falls differently on the axes. What cannot be seen at all is a 
 steady as a bias, from the first sample to the last.
 
 Thresholds are multiples of the recording's own noise, so neither a bias nor a scale factor changes
-how it ends. The exceptions are zeros, and the largest noise of a sensor at rest.
+how it ends. The exceptions are zeros, and the largest noise and drift of a sensor at rest.
 """
 
 from dataclasses import dataclass
@@ -55,9 +55,9 @@ _NOISE_RANGE = 1.7
 """The same of a few seconds over that of others, which is known better. At rest it is below 1.2 on
 the public files, and below 1.5 behind a low-pass filter of 5 Hz."""
 
-_WANDER = 5
-"""Scatter of block means about a warm-up, over their noise from one to the next. Flicker noise has
-at most 3, however strong it is."""
+_WANDER, _SMOOTH = 5, 0.05
+"""Scatter of block means about a drift, over their noise from one to the next; flicker noise has at
+most 3, however strong it is. And over the largest drift: smooth ones need not be exponentials."""
 
 _KURTOSIS = 6
 """Of Gaussian noise it is 3, and so it is on the public files; of rare large values far more."""
@@ -66,6 +66,11 @@ _SWAY = 1
 """Scatter of block means over that of samples within a block, for motion throughout. At rest it is
 at most 0.2 on the public files, and 0.7 behind a low-pass filter of 5 Hz; of a sensor that is
 carried about (benchmarks/quality.py), 1.4 to 2.1."""
+
+_COLOUR, _FILTERED = 8, 0.5
+"""The same over what white noise has, of samples that scatter from one to the next by more than the
+second factor of white noise: behind a low-pass filter they do not. At rest it is 0.7 to 1.2 on the
+public files; of a sensor that is carried about, 13 to 29."""
 
 _LEAST_BLOCK = 5
 """Samples. The noise of shorter blocks is known too badly for a median of them."""
@@ -316,16 +321,18 @@ def _movements(  # noqa: PLR0917 - a stretch, what was found in it, and where it
     if len(long):
         found.append(f"the rate is beyond the noise {_span(first_row + long[0], rate_hz)}")
     scatter = means.noise / blocks.noise
-    if scatter.max() > _SWAY:
+    if scatter.max() > _SWAY or _sways(blocks, scatter * np.sqrt(blocks.size)):
         axis = int(np.argmax(scatter))
         found.append(f"means scatter {scatter[axis]:.2g} times the noise, axis {AXES[axis]}")
     lags = [max(round(lag_s / quality.block_s), 1) for lag_s in quality.lags_s]
     changed = stationarity.changes(means, lags, quality.false_alarm)
-    wanders = means.spread > _WANDER * means.noise
+    least = np.maximum(_WANDER * means.noise, _SMOOTH * quality.largest_drift_dps)
+    wanders = means.spread > least
     if changed.any() or wanders.any():  # a warm-up does so as well
-        settled = means.without(stationarity.settling(means))
+        drift = stationarity.settling(means)
+        settled = means.without(drift)
         changed = stationarity.changes(settled, lags, quality.false_alarm)
-        wanders = settled.spread > _WANDER * means.noise
+        wanders = (settled.spread > least) | (np.ptp(drift, axis=1) > quality.largest_drift_dps)
     if changed.any():
         spread = np.ptp(means.rates[:, means.calm], axis=1)
         axis = int(np.argmax(spread / means.noise))
@@ -342,6 +349,15 @@ def _movements(  # noqa: PLR0917 - a stretch, what was found in it, and where it
     elif noise_range > _NOISE_RANGE:
         found.append(f"the noise changes {noise_range:.2g}-fold")
     return found
+
+
+def _sways(blocks: stationarity.Blocks, scatter: NDArray[np.float64]) -> bool:
+    """Whether means scatter far more than those of noise that is white from sample to sample."""
+    suspect = scatter > _COLOUR
+    if not suspect.any():
+        return False
+    apart = np.median(np.diff(blocks.rates[suspect], axis=-1).std(axis=-1), axis=-1) / np.sqrt(2)
+    return bool((apart > _FILTERED * blocks.noise[suspect]).any())
 
 
 def _shocks(

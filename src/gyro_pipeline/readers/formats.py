@@ -176,7 +176,7 @@ class Reader:
         if options.temperature_column is not None:
             number = find(table.names, options.temperature_column, where)
             header = table.names[number]
-            unit = split_unit(header, tuple(CELSIUS))[1]
+            unit = split_unit(header, _UNBRACKETED)[1]
             if unit and unit not in CELSIUS:
                 raise InputError(
                     f"{where}: expected a temperature in degC, degF or K, got {header!r}; correct "
@@ -294,53 +294,56 @@ class General(Reader):
         if not rates and len(table.names) == len(AXES):
             return range(len(AXES))
         order = axes([split_unit(table.names[n], UNITS)[0] for n in rates])
-        if order is None:
+        others = [table.names[n] for n in rates if n not in {rates[k] for k in order or ()}]
+        others += [name for name in table.names if _GYRO.match(name) and not rate_unit(name)]
+        if order is None or not all(_NORM.search(name) for name in others):
             raise InputError(
-                f"{where}: expected columns of angular rate about x, y, z with their unit, got "
-                f"{listed(table.names)}; give columns"
+                f"{where}: expected three columns of angular rate about x, y, z with their unit, "
+                f"got {listed(table.names)}; give columns"
             )
         return [rates[number] for number in order]
 
     def time_column(self, table: Table) -> Column | None:
-        """The first column that is named a time, one with a unit of time before others."""
-        found = [n for n, name in enumerate(table.names) if _is_time(name)]
-        told = [n for n in found if n in table.in_seconds or split_unit(table.names[n], UNITS)[1]]
-        return next(iter(told or found), None)
+        """The column that is most plainly a time, the first of equals."""
+        found = [(how, n) for n, name in enumerate(table.names) if (how := _is_time(name))]
+        plain = [(0, n) for _, n in found if n in table.in_seconds]
+        return min([*plain, *found])[1] if found else None
 
 
-_TIME_NAMES = (
-    "time",
-    "timestamp",
-    "timestamps",
-    "t",
-    "ts",
-    "elapsed",
-    "elapsedtime",
-    "datetime",
-    "",
-)
+_NORM = re.compile(r"norm|abs|mag|total", re.IGNORECASE)
+_GYRO = re.compile(r"(gyro?|gyr|omega|w)[ _.]?[xyz]$", re.IGNORECASE)
+_TIME_NAMES = ("time", "timestamp", "timestamps", "t", "ts", "elapsed", "elapsedtime", "datetime")
 
 
-def _is_time(header: str) -> bool:
-    """Whether it names a time, or nothing but a unit of time; T may be a temperature."""
+def _is_time(header: str) -> int:
+    """How plainly it names a time: 1 with a unit of time, 2 without, 3 and more by its unit; 0."""
     name, unit = split_unit(header, UNITS)
     stem = split_unit(name, UNITS)[0].split(".")[-1]
     word = re.sub(r"[^a-z]", "", stem.lower())
+    named = word in _TIME_NAMES and (word != "t" or stem == "t" or unit in TIME_UNITS)
     if unit in TIME_UNITS:
-        return word in (*_TIME_NAMES, "")
-    return word in _TIME_NAMES and stem != "T" and unit not in CELSIUS
+        return 1 if named else 3 if "time" in word else 4 if not word else 0
+    if unit is None:
+        return 2 if named else 0
+    return 5 if named and unit not in CELSIUS else 0
 
 
 _DEGREES_C = ("degc", "°c", "celsius")
+_UNBRACKETED = tuple(set(CELSIUS) - {"f", "k"})
+_OF_WHAT = {"gyro", "imu", "sensor", "board", "chip", "die", "mcu", "cpu", "ambient", "case"}
 
 
 def _temperatures(names: Sequence[str]) -> dict[int, str | None]:
     """Columns with a unit of temperature, or named one and without a unit, and their unit."""
     found: dict[int, str | None] = {}
     for number, name in enumerate(names):
-        named = "temp" in name.lower()
-        unit = split_unit(name, tuple(CELSIUS) if named else _DEGREES_C)[1]
-        if unit in _DEGREES_C or (named and (unit is None or unit in CELSIUS)):
+        stem, unit = split_unit(name, _UNBRACKETED)
+        words = [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", stem)]
+        while words and words[-1] in _OF_WHAT:
+            words.pop()
+        named = bool(words) and words[-1] in ("temp", "temperature", "t")
+        told = unit in CELSIUS and (named or unit in _DEGREES_C)
+        if told or (unit is None and named and words[-1] != "t"):
             found[number] = unit
     if any(found.values()):
         return {number: unit for number, unit in found.items() if unit}

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 from functools import lru_cache
-from itertools import permutations
+from itertools import product
 from math import pi
 
 from gyro_pipeline.conventions import AXES, MDPS, InputError
@@ -31,8 +31,8 @@ _SPELLINGS = {  # as `_written` has them
     "deg/h": "deg/h dph °/h deg/hr deg/hour degree/hour degrees/h degrees/hour deg_h",
     "raw": "raw lsb count counts",
     "s": "s sec secs second seconds",
-    "ms": "ms msec millisecond milliseconds",
-    "us": "us µs μs usec microsecond microseconds",  # two different signs for micro
+    "ms": "ms msec millis millisecond milliseconds",
+    "us": "us µs μs usec micros microsecond microseconds",  # two different signs for micro
     "ns": "ns nsec nanosecond nanoseconds",
 }
 RATE_UNITS = {text: unit for unit in (*DEG_PER_S, "raw") for text in _SPELLINGS[unit].split()}
@@ -48,10 +48,12 @@ CELSIUS = {
 """By the spelling of a unit of temperature: degrees Celsius are a times a value, plus b."""
 
 _BRACKETED = re.compile(r"\s*[(\[]([^()\[\]]*)[)\]]")
+_BEHIND = re.compile(r"[ _][a-zA-Z_ ]+")  # not the *1000 of t (s) *1000
 _AXIS = re.compile(r"\.[xyz]$")  # of an array of three columns
 _SEPARATOR = re.compile(r"[ _./]+")
 _TIMES = re.compile(r"[\s^*·⋅.]")
 _EACH = re.compile(r"(?<=.)(?:per(s|sec|second|h|hr|hour)|(s|sec|h|hr)-1)$")
+_SIGNS = str.maketrans({"º": "°", "˚": "°", "℃": "°c", "℉": "°f"})
 _WORDS = re.compile(r"[\s,;:=()\[\]\"'#%]+")
 _LONGEST = 3  # words of a unit, such as "rad per s"
 
@@ -72,9 +74,14 @@ def split_unit(header: str, spellings: tuple[str, ...]) -> tuple[str, str | None
     axis = match[0] if (match := _AXIS.search(header)) else ""
     text = header.removesuffix(axis)
     for found in reversed(list(_BRACKETED.finditer(text))):
-        unit, behind = _written(found[1]), text[found.end() :]
-        if not behind.strip() or unit in spellings:
-            return text[: found.start()] + behind.rstrip() + axis, unit
+        unit, before, behind = (
+            _written(found[1]),
+            text[: found.start()],
+            text[found.end() :].rstrip(),
+        )
+        within = sum(map(before.count, "([")) > sum(map(before.count, ")]"))  # gx [LSB/(deg/s)]
+        if not within and (not behind or (unit in spellings and _BEHIND.fullmatch(behind))):
+            return before + behind + axis, unit
     for name, start in [(0, 0), *(one.span() for one in _SEPARATOR.finditer(text))]:
         if (unit := _written(text[start:])) in spellings:
             return text[:name] + axis, unit
@@ -83,7 +90,7 @@ def split_unit(header: str, spellings: tuple[str, ...]) -> tuple[str, str | None
 
 def _written(unit: str) -> str:
     """A unit as it is spelled here: ``deg/s`` of ``deg·s⁻¹``, ``Deg. per s`` or ``deg s^-1``."""
-    text = unit.lower().replace("⁻¹", "-1").replace("º", "°")
+    text = unit.lower().translate(_SIGNS).replace("⁻¹", "-1")
     return _EACH.sub(r"/\1\2", _TIMES.sub("", text))
 
 
@@ -143,15 +150,19 @@ def matching(names: Sequence[str], column: str) -> list[int]:
 
 def axes(names: Sequence[str]) -> list[int] | None:
     """Numbers of the only three columns whose names differ but in the letters x, y, z, in order."""
-    found = []
-    for order in permutations(range(len(names)), len(AXES)):
-        stems = [
-            {name[:at] + name[at + 1 :] for at, letter in enumerate(name.lower()) if letter == axis}
-            for name, axis in zip([names[number] for number in order], AXES, strict=True)
-        ]
-        if set.intersection(*stems):
-            found.append(list(order))
-    return found[0] if len({frozenset(order) for order in found}) == 1 else None
+    alike: dict[tuple[str, str], dict[str, list[int]]] = {}
+    for number, name in enumerate(names):
+        for at, letter in enumerate(name.lower()):
+            if letter in AXES:
+                others = alike.setdefault((name[:at], name[at + 1 :]), {})
+                others.setdefault(letter, []).append(number)
+    found = {
+        triple
+        for one in alike.values()
+        if len(one) == len(AXES)
+        for triple in product(*(one[axis] for axis in AXES))
+    }
+    return list(found.pop()) if len(found) == 1 else None
 
 
 def listed(names: Sequence[str]) -> str:

@@ -81,8 +81,10 @@ class TextTable:
             values, unreadable = self._converted(table, columns, lenient)
             kept = np.setdiff1d(np.arange(table.num_rows + len(odd)), list(odd))
             unreadable = {int(kept[row]): what for row, what in unreadable.items()}
-        if any(_is_comment(self._lines[row][1]) for row in odd):
-            values, more = replace(self, data=_COMMENTS.sub(b"", self.data)).read(columns, lenient)
+        if any(_is_comment(self._lines[row][1]) for row in (*odd, *unreadable)):
+            rows_only = _COMMENTS.sub(b"", self.data[self.start :])  # blank lines are no rows
+            whole = replace(self, data=self.data[: self.start] + rows_only)
+            values, more = whole.read(columns, lenient)
             text = "lines of comment among the rows were left out"
             return values, (*more, Finding("comments", KEPT, text))
         rows = table.num_rows + len(odd)

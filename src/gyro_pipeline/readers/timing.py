@@ -165,14 +165,14 @@ def from_stamps(stamps: Floats, unit_s: float | None) -> Timing:
         findings.append(Finding("timestamps", KEPT, text))
         return Timing(gap_rows=found.rows[back], findings=tuple(findings))
     clock = _Clock.of(found, stamps[np.isfinite(stamps)])
-    step, gaps, missing = _gaps(found, clock)
+    step, gaps, counted, missing = _gaps(found, clock)
     what = f"samples are missing, about {missing}"
     findings += _at("gaps", found.rows[gaps], what, REPAIRED)
     findings += _irregular(found, step, clock, gaps | back)
-    late = np.where(gaps | back, 0.0, steps - step * found.counts)
-    passed = np.cumsum(found.counts)
-    allowed = _STEADY * step + 2 * _PARTS * clock.coarseness / passed[-1]
-    findings += _uneven(passed, _least_ahead(np.cumsum(late)) + step * passed, allowed)
+    late = np.cumsum((steps - step * found.counts)[counted])
+    passed = np.cumsum(found.counts[counted])
+    allowed = _STEADY * step + 2 * _PARTS * clock.coarseness / max(len(passed), 1)
+    findings += _uneven(passed, _least_ahead(late) + step * passed, allowed)
     return Timing(_rate(step, unit_s), found.rows[back | gaps], tuple(findings))
 
 
@@ -238,10 +238,13 @@ class _Clock:
         return cls(found.usual_per_row(ordinary, burst), burst, in_bursts, counted)
 
 
-def _gaps(found: _Steps, clock: _Clock) -> tuple[float, Mask, int]:
-    """The step from sample to sample, behind which steps samples are missing, and how many."""
+def _gaps(found: _Steps, clock: _Clock) -> tuple[float, Mask, Mask, int]:
+    """The step from sample to sample, behind which steps samples are missing, and how many.
+
+    In the third place, the steps whose mean it is.
+    """
     steps, step = found.steps, clock.step or found.per_row(found.steps > 0)
-    gaps, delays = steps < 0, steps
+    gaps, delays, counted = steps < 0, steps, steps > 0
     least_late = np.zeros(len(steps))
     least_late[-_LAST:] = _LATE * np.ptp(np.quantile(steps / found.counts, [0.2, 0.8]))
     for _ in range(_ROUNDS):
@@ -252,7 +255,7 @@ def _gaps(found: _Steps, clock: _Clock) -> tuple[float, Mask, int]:
             counted &= steps > 0  # nothing catches up: a row of a repeated stamp is one too many
         step = found.usual_per_row(counted, clock.coarseness) or step
     step = found.per_row(counted) or step
-    return step, gaps, max(round(delays[gaps].sum() / step), 1)
+    return step, gaps, counted, max(round(delays[gaps].sum() / step), 1)
 
 
 def _all_along(some: Rows, least: int, rows: Rows) -> bool:
