@@ -228,17 +228,19 @@ def changes(means: Means, lags: Sequence[int], false_alarm: float) -> NDArray[np
     return found
 
 
-def settling(means: Means) -> NDArray[np.float64]:
-    """The drift of each axis: a line, and exponentials of one sign that begin with the recording.
+def settling(means: Means, line: bool = False) -> NDArray[np.float64]:
+    """The drift of each axis, as exponentials of one sign that begin with the recording.
 
     Args:
         means: Of the blocks of a recording, two of them calm at least.
+        line: Add one; with it, other smooth curves are fitted as well.
 
     Returns:
         (axis, block), deg/s, of least squares, but for a constant.
     """
     calm = means.calm
-    shapes = np.vstack([means.decays, means.times, -means.times]).T
+    lines = [means.times, -means.times] if line else []
+    shapes = np.vstack([means.decays, *lines]).T
     shapes -= shapes[calm].mean(axis=0)
     rates = means.rates - means.rates[:, calm].mean(axis=-1, keepdims=True)
     fits = []

@@ -329,10 +329,11 @@ def _movements(  # noqa: PLR0917 - a stretch, what was found in it, and where it
     least = np.maximum(_WANDER * means.noise, _SMOOTH * quality.largest_drift_dps)
     wanders = means.spread > least
     if changed.any() or wanders.any():  # a warm-up does so as well
-        drift = stationarity.settling(means)
-        settled = means.without(drift)
+        settled = means.without(stationarity.settling(means))
         changed = stationarity.changes(settled, lags, quality.false_alarm)
-        wanders = (settled.spread > least) | (np.ptp(drift, axis=1) > quality.largest_drift_dps)
+        drift = stationarity.settling(means, line=True)
+        too_far = np.ptp(drift, axis=1) > quality.largest_drift_dps
+        wanders = (means.without(drift).spread > least) | too_far
     if changed.any():
         spread = np.ptp(means.rates[:, means.calm], axis=1)
         axis = int(np.argmax(spread / means.noise))
