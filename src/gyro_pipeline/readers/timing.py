@@ -195,47 +195,63 @@ class _Clock:
 
     @classmethod
     def of(cls, found: _Steps, stamps: Floats) -> "_Clock":
-        steps = found.steps
-        forward = np.maximum(steps, 0.0)
+        forward = np.maximum(found.steps, 0.0)
         median = float(np.quantile(forward / found.counts, 0.5, method="lower"))
-        usual = median * found.counts
-        long = steps > 1.5 * usual
+        resolution, regular = _rounding(found, stamps, median)
+        in_bursts = regular or _come_in_bursts(found, median, resolution)
+        if in_bursts or resolution >= median / 2:
+            return cls._of_blocks(found, in_bursts)
+        ordinary = (
+            np.abs(found.steps - median * found.counts) <= median * found.counts / 2 + resolution
+        )
+        ordinary &= found.steps >= 0
+        return cls(found.per_row(ordinary), resolution, False, ordinary | (found.counts == 1))
 
-        # steps that rounding makes one unit longer, or losses of single samples
-        resolution = _resolution(stamps, median)
-        coarse = resolution >= median / 2
-        double = long & (steps < 2.01 * usual)
-        rows = found.rows[double & (found.delays(median) > median / 2)]
-        whole = np.abs(steps - median * np.rint(steps / max(median, _LEAST)))
-        ticks = coarse or bool((whole <= resolution + _ROUNDED * np.abs(steps)).all())
-        regular = ticks and _all_along(rows, _FEW if coarse else _MANY, found.rows)
-        repeats = found.rows[(steps == 0) & (median > 0)]
-        late = (long & (found.delays(median) <= median / 2)).any()
-        losses = len(rows) >= _FEW and not regular
-        doubled = len(repeats) >= _FEW and not late and not _all_along(repeats, _FEW, found.rows)
-        if coarse and (losses or doubled):
-            resolution, coarse = 0.0, False  # of an exact clock, whose step it is
-
-        size, time = found.by_block(found.counts), found.by_block(forward)
-        short = found.by_block((steps >= 0) & (steps < usual / 2 - resolution)) / size
-        in_long = found.by_block(np.where(long, steps, 0.0)) / np.where(time > 0, time, np.inf)
-        many = median == 0 or long.mean() > _LONG
-        lasts = many and np.median(in_long) > _LONG_TIME
-        in_bursts = bool(regular or np.median(short) > _SHORT or lasts)
-        if not (in_bursts or coarse):
-            ordinary = (steps >= 0) & (np.abs(steps - usual) <= usual / 2 + resolution)
-            step = found.per_row(ordinary)
-            return cls(step, resolution, False, ordinary | (found.counts == 1))
-
-        # stamps do not tell steps from row to row, but those of whole blocks
-        between = forward >= found.usual_per_row(steps >= 0, 0.0) * (1 - _ROUNDED)
-        burst = float(np.quantile(steps[between], 0.95))
+    @classmethod
+    def _of_blocks(cls, found: _Steps, in_bursts: bool) -> "_Clock":
+        """Of stamps that do not tell steps from row to row, but those of whole blocks."""
+        steps, forward = found.steps, found.steps >= 0
+        between = steps >= found.usual_per_row(forward, 0.0) * (1 - _ROUNDED)
+        burst = float(np.quantile(steps[between & forward], 0.95))
         counted = np.ones(len(steps), bool)
         ends = np.flatnonzero(between)
         if in_bursts and len(ends) > 1:
             counted[: ends[0] + 1] = counted[ends[-1] + 1 :] = False
-        ordinary = counted & (steps >= 0) & (steps <= _HOLE * burst)
+        ordinary = counted & forward & (steps <= _HOLE * burst)
         return cls(found.usual_per_row(ordinary, burst), burst, in_bursts, counted)
+
+
+def _rounding(found: _Steps, stamps: Floats, median: float) -> tuple[float, bool]:
+    """Resolution of stamps, 0 of an exact clock; and whether rounding lengthens steps regularly.
+
+    A clock whose unit is the step from sample to sample is exact if some steps are of two units, or
+    of none, at random: these are losses, or doubled rows.
+    """
+    steps, usual = found.steps, median * found.counts
+    long, late = steps > 1.5 * usual, found.delays(median) > median / 2
+    resolution = _resolution(stamps, median)
+    coarse = resolution >= median / 2
+    double = found.rows[long & (steps < 2.01 * usual) & late]
+    off = np.abs(steps - median * np.rint(steps / max(median, _LEAST)))
+    ticks = coarse or bool((off <= resolution + _ROUNDED * np.abs(steps)).all())
+    regular = ticks and _all_along(double, _FEW if coarse else _MANY, found.rows)
+    none = found.rows[(steps == 0) & (median > 0)]
+    catches_up = (long & ~late).any()
+    doubled = len(none) >= _FEW and not catches_up and not _all_along(none, _FEW, found.rows)
+    exact = coarse and (doubled or (len(double) >= _FEW and not regular))
+    return 0.0 if exact else resolution, regular
+
+
+def _come_in_bursts(found: _Steps, median: float, resolution: float) -> bool:
+    """Whether most parts have many steps far below the median, or their time in long ones."""
+    steps, usual = found.steps, median * found.counts
+    long = steps > 1.5 * usual
+    time = found.by_block(np.maximum(steps, 0.0))
+    short = found.by_block((steps >= 0) & (steps < usual / 2 - resolution))
+    in_long = found.by_block(np.where(long, steps, 0.0)) / np.where(time > 0, time, np.inf)
+    many = median == 0 or long.mean() > _LONG
+    lasts = many and np.median(in_long) > _LONG_TIME
+    return bool(np.median(short / found.by_block(found.counts)) > _SHORT or lasts)
 
 
 def _gaps(found: _Steps, clock: _Clock) -> tuple[float, Mask, Mask, int]:
