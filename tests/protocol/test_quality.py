@@ -263,6 +263,18 @@ def test_a_sensor_behind_a_narrow_low_pass_filter_is_at_rest(quality, rate_hz):
         assert inspect(Log(rates), rate_hz, quality).outcome == KEPT
 
 
+@pytest.mark.parametrize("rate_hz", [100, 1000])
+def test_a_warm_up_with_a_knock_at_its_start_is_at_rest(quality, rate_hz):
+    seconds = np.arange(40 * rate_hz) / rate_hz
+    for seed in range(4):
+        rates = np.random.default_rng(seed).normal(0, 0.03, (len(seconds), 3))
+        rates += np.exp(-seconds / 10)[:, None] * [1, 0.5, -0.3]
+        if rate_hz == 100:
+            rates[30:50] += 5 * np.sin(np.arange(20))[:, None]
+        found = checks(inspect(Log(rates), rate_hz, quality))
+        assert found == {"warm-up drift": KEPT} | ({"shocks": REPAIRED} if rate_hz == 100 else {})
+
+
 @pytest.mark.parametrize("rate_hz", [0.1, 2.0])
 def test_a_rate_too_low_for_blocks_asks_for_rows(samples, quality, rate_hz):
     assert checks(inspect(Log(samples[:49]), rate_hz, quality)) == {"too short": REJECTED}

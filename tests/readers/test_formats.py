@@ -422,7 +422,8 @@ def test_units_within_a_header_count(header, options, words, read):
 @pytest.mark.parametrize(
     "name",
     ["gx [LSB/(deg/s)]", "gx [0.1*(deg/s)]", "gx (1/131 (deg/s))", "gx [deg/s]/32.8",
-     "gx (deg/s)*100", "gx (deg/s) x100", "gx [(rad/s)/s]", "gx [(rad/s)^2]"],
+     "gx (deg/s)*100", "gx (deg/s) x100", "gx (deg/s) per sqrt Hz",
+     "gx [(rad/s)/s]", "gx [(rad/s)^2]"],
 )  # fmt: skip
 def test_what_only_contains_a_unit_has_none(name, read):
     names = [name.replace("x", axis, 1) for axis in "xyz"]
@@ -539,6 +540,23 @@ def test_comments_among_the_rows_are_no_rows(good, rates, read):
         log = read("\n".join([*head, *marked, *lines[40:]]) + "\n", 400)
         np.testing.assert_array_equal(log.samples, rates)
         assert checks(log) == [("comments", "kept")]
+
+
+def test_comments_end_with_any_line_end(good, rates, read):
+    lines = good["ngimu"].splitlines()
+    marked = "\r".join([*lines[:20], "# a,b,c,1", *lines[20:]]) + "\r"
+    np.testing.assert_array_equal(read(marked).samples, rates)
+
+
+def test_a_named_temperature_may_be_in_fahrenheit(good, read):
+    text = good["general"].replace("temperature (°C)", "temp_f")
+    assert read(text, temperature_column="temp_f").temperature_c[0] == pytest.approx(-3.8888889)
+
+
+@pytest.mark.parametrize("name", ["loop time (us)", "delta_time [ms]", "exposure time (ms)"])
+def test_a_duration_is_no_timestamp(name, good, rates, read):
+    text = good["general"].replace("t_ms", name)
+    assert read(text).rate_hz is None
 
 
 @pytest.mark.parametrize("note", ["ok, fine", "Sun, 31 Jul", "[1,2]"])

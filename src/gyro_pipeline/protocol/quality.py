@@ -321,7 +321,7 @@ def _movements(  # noqa: PLR0917 - a stretch, what was found in it, and where it
     if len(long):
         found.append(f"the rate is beyond the noise {_span(first_row + long[0], rate_hz)}")
     scatter = means.noise / blocks.noise
-    if scatter.max() > _SWAY or _sways(blocks, scatter * np.sqrt(blocks.size)):
+    if scatter.max() > _SWAY or _sways(blocks):
         axis = int(np.argmax(scatter))
         found.append(f"means scatter {scatter[axis]:.2g} times the noise, axis {AXES[axis]}")
     lags = [max(round(lag_s / quality.block_s), 1) for lag_s in quality.lags_s]
@@ -332,7 +332,7 @@ def _movements(  # noqa: PLR0917 - a stretch, what was found in it, and where it
         settled = means.without(stationarity.settling(means))
         changed = stationarity.changes(settled, lags, quality.false_alarm)
         drift = stationarity.settling(means, line=True)
-        too_far = np.ptp(drift, axis=1) > quality.largest_drift_dps
+        too_far = np.ptp(drift[:, means.calm], axis=1) > quality.largest_drift_dps
         wanders = (means.without(drift).spread > least) | too_far
     if changed.any():
         spread = np.ptp(means.rates[:, means.calm], axis=1)
@@ -352,8 +352,13 @@ def _movements(  # noqa: PLR0917 - a stretch, what was found in it, and where it
     return found
 
 
-def _sways(blocks: stationarity.Blocks, scatter: NDArray[np.float64]) -> bool:
+def _sways(blocks: stationarity.Blocks) -> bool:
     """Whether means scatter far more than those of noise that is white from sample to sample."""
+    if len(blocks.starts) < LEAST_BLOCKS:
+        return False
+    # of second differences, which leave a drift out: their median is 0.6745 sqrt(6) s
+    bends = np.median(np.abs(np.diff(blocks.means, 2, axis=1)), axis=1)
+    scatter = bends / (special.ndtri(0.75) * np.sqrt(6)) / (blocks.noise / np.sqrt(blocks.size))
     suspect = scatter > _COLOUR
     if not suspect.any():
         return False

@@ -176,7 +176,7 @@ class Reader:
         if options.temperature_column is not None:
             number = find(table.names, options.temperature_column, where)
             header = table.names[number]
-            unit = split_unit(header, _UNBRACKETED)[1]
+            unit = split_unit(header, tuple(CELSIUS))[1]
             if unit and unit not in CELSIUS:
                 raise InputError(
                     f"{where}: expected a temperature in degC, degF or K, got {header!r}; correct "
@@ -310,6 +310,9 @@ class General(Reader):
         return min([*plain, *found])[1] if found else None
 
 
+_DURATION = re.compile(
+    r"loop|delta|diff|exposure|response|integration|latency|interval|duration|lag"
+)
 _NORM = re.compile(r"norm|abs|mag|total", re.IGNORECASE)
 _GYRO = re.compile(r"(gyro?|gyr|omega|w)[ _.]?[xyz]$", re.IGNORECASE)
 _TIME_NAMES = ("time", "timestamp", "timestamps", "t", "ts", "elapsed", "elapsedtime", "datetime")
@@ -322,7 +325,8 @@ def _is_time(header: str) -> int:
     word = re.sub(r"[^a-z]", "", stem.lower())
     named = word in _TIME_NAMES and (word != "t" or stem == "t" or unit in TIME_UNITS)
     if unit in TIME_UNITS:
-        return 1 if named else 3 if "time" in word else 4 if not word else 0
+        a_time = "time" in word and not _DURATION.search(word)
+        return 1 if named else 3 if a_time else 4 if not word else 0
     if unit is None:
         return 2 if named else 0
     return 5 if named and unit not in CELSIUS else 0
@@ -330,7 +334,20 @@ def _is_time(header: str) -> int:
 
 _DEGREES_C = ("degc", "°c", "celsius")
 _UNBRACKETED = tuple(set(CELSIUS) - {"f", "k"})
-_OF_WHAT = {"gyro", "imu", "sensor", "board", "chip", "die", "mcu", "cpu", "ambient", "case"}
+_OF_WHAT = {
+    "gyro",
+    "imu",
+    "sensor",
+    "board",
+    "chip",
+    "die",
+    "mcu",
+    "cpu",
+    "ambient",
+    "case",
+    "out",
+    "c",
+}
 
 
 def _temperatures(names: Sequence[str]) -> dict[int, str | None]:
@@ -338,7 +355,7 @@ def _temperatures(names: Sequence[str]) -> dict[int, str | None]:
     found: dict[int, str | None] = {}
     for number, name in enumerate(names):
         stem, unit = split_unit(name, _UNBRACKETED)
-        words = [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", stem)]
+        words = [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", stem)]
         while words and words[-1] in _OF_WHAT:
             words.pop()
         named = bool(words) and words[-1] in ("temp", "temperature", "t")

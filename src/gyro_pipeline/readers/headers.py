@@ -48,7 +48,8 @@ CELSIUS = {
 """By the spelling of a unit of temperature: degrees Celsius are a times a value, plus b."""
 
 _BRACKETED = re.compile(r"\s*[(\[]([^()\[\]]*)[)\]]")
-_BEHIND = re.compile(r"[ _][a-zA-Z_ ]+")  # not the *1000 of t (s) *1000
+# neither t (s) *1000 nor gx (deg/s) per sqrt Hz
+_BEHIND = re.compile(r"[ _](?!.*\b(?:per|times|in|over|sqrt|integrated|squared)\b)[a-zA-Z_ ]+")
 _AXIS = re.compile(r"\.[xyz]$")  # of an array of three columns
 _SEPARATOR = re.compile(r"[ _./]+")
 _TIMES = re.compile(r"[\s^*·⋅.]")

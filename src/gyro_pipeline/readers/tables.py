@@ -152,10 +152,20 @@ def _with_unit(name: str, attributes: Mapping[Any, Any]) -> str:
     """A name, and the unit that attributes of its column give, in brackets."""
     for key, value in attributes.items():
         if (key.decode() if isinstance(key, bytes) else key).lower() in ("unit", "units"):
-            said = np.asarray(value).reshape(-1)
-            text = said[0].decode() if said.dtype.kind == "S" else str(said[0]) if said.size else ""
-            return f"{name} [{text}]" if text else name
+            said = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+            texts = {_text(one) for one in (said if isinstance(said, list) else [said])} - {""}
+            return f"{name} [{', '.join(sorted(texts))}]" if texts else name
     return name
+
+
+def _text(said: Any) -> str:
+    """A text of bytes, in UTF-8 or Latin 1; nothing of anything else."""
+    if not isinstance(said, bytes):
+        return said if isinstance(said, str) else ""
+    try:
+        return said.decode()
+    except UnicodeDecodeError:
+        return said.decode("latin-1")
 
 
 def _microseconds(kind: Any) -> Any:

@@ -26,7 +26,7 @@ _BAD_SHARE, _BAD_ROWS = 0.01, 3
 
 _NUMBER = r"^[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|(?i:inf|infinity|nan))$"
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}([,' .]\d{3})+([.,]\d+)?")
-_COMMENTS = re.compile(rb"(?m)^[ \t]*(?:#|%|//)[^\r\n]*")
+_COMMENTS = re.compile(rb"(?:\A|(?<=[\r\n]))[ \t]*(?:#|%|//)[^\r\n]*")
 _NULLS = ["", "NaN", "nan", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
 
 Values = tuple[list[NDArray[np.float64]], tuple[Finding, ...]]
@@ -83,10 +83,11 @@ class TextTable:
             unreadable = {int(kept[row]): what for row, what in unreadable.items()}
         if any(_is_comment(self._lines[row][1]) for row in (*odd, *unreadable)):
             rows_only = _COMMENTS.sub(b"", self.data[self.start :])  # blank lines are no rows
-            whole = replace(self, data=self.data[: self.start] + rows_only)
-            values, more = whole.read(columns, lenient)
-            text = "lines of comment among the rows were left out"
-            return values, (*more, Finding("comments", KEPT, text))
+            if len(rows_only) < len(self.data) - self.start:
+                whole = replace(self, data=self.data[: self.start] + rows_only)
+                values, more = whole.read(columns, lenient)
+                text = "lines of comment among the rows were left out"
+                return values, (*more, Finding("comments", KEPT, text))
         rows = table.num_rows + len(odd)
         self._check(odd | unreadable, rows)
         if odd or unreadable:
