@@ -334,15 +334,14 @@ def _movements(  # noqa: PLR0917 - a stretch, what was found in it, and where it
         drift = stationarity.settling(means, line=True)
         too_far = np.ptp(drift[:, means.calm], axis=1) > quality.largest_drift_dps
         wanders = (means.without(drift).spread > least) | too_far
+        sizes = np.ptp(means.rates[:, means.calm], axis=1)
     if changed.any():
-        spread = np.ptp(means.rates[:, means.calm], axis=1)
-        axis = int(np.argmax(spread / means.noise))
+        axis = int(np.argmax(sizes / means.noise))
         about = _span(first_row + blocks.span(changed), rate_hz)
-        found.append(f"the rate changes by {spread[axis]:.2g} deg/s, axis {AXES[axis]}, {about}")
+        found.append(f"the rate changes by {sizes[axis]:.2g} deg/s, axis {AXES[axis]}, {about}")
     elif wanders.any():
-        size = np.ptp(means.rates[:, means.calm], axis=1)
-        axis = int(np.argmax(wanders * size / means.noise))
-        found.append(f"the rate wanders by {size[axis]:.2g} deg/s, axis {AXES[axis]}")
+        axis = int(np.argmax(wanders * sizes / means.noise))
+        found.append(f"the rate wanders by {sizes[axis]:.2g} deg/s, axis {AXES[axis]}")
     noisy = means.calm & (blocks.relative_variances > _NOISE_RISE**2)
     noise_range = blocks.noise_range(means.calm, max(lags))
     if noisy.any():

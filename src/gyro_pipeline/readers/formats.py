@@ -314,7 +314,7 @@ _DURATION = re.compile(
     r"loop|delta|diff|exposure|response|integration|latency|interval|duration|lag"
 )
 _NORM = re.compile(r"norm|abs|mag|total", re.IGNORECASE)
-_GYRO = re.compile(r"(gyro?|gyr|omega|w)[ _.]?[xyz]$", re.IGNORECASE)
+_GYRO = re.compile(r"(gyro?|omega|w)[ _.]?[xyz]$", re.IGNORECASE)
 _TIME_NAMES = ("time", "timestamp", "timestamps", "t", "ts", "elapsed", "elapsedtime", "datetime")
 
 
@@ -334,20 +334,7 @@ def _is_time(header: str) -> int:
 
 _DEGREES_C = ("degc", "°c", "celsius")
 _UNBRACKETED = tuple(set(CELSIUS) - {"f", "k"})
-_OF_WHAT = {
-    "gyro",
-    "imu",
-    "sensor",
-    "board",
-    "chip",
-    "die",
-    "mcu",
-    "cpu",
-    "ambient",
-    "case",
-    "out",
-    "c",
-}
+_OF_WHAT = "gyro imu sensor board chip die mcu cpu ambient case out c".split()
 
 
 def _temperatures(names: Sequence[str]) -> dict[int, str | None]:

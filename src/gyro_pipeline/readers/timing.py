@@ -19,7 +19,6 @@ _SHORT = 0.1
 _LONG, _LONG_TIME = 0.005, 0.5
 """The same, if a larger share is far above it, and makes up more of the time than this."""
 
-
 _REGULAR, _MOST = 0.25, 0.75
 """Rounding lengthens steps at intervals of which most differ by less than this; losses come at
 random ones."""
