@@ -45,6 +45,9 @@ class Log:
         gap_rows: Rows before which samples are missing or out of order, increasing; a stretch
             between two of them is gap-free. Findings say why.
         temperature_c: (n,), degrees Celsius; None where the file has none.
+        acceleration_g: (n, 3), g; None where the file has none.
+        rows: (n,), the row of the file that each sample is from, increasing; None where every row
+            is a sample.
         findings: Of the reading.
     """
 
@@ -52,6 +55,8 @@ class Log:
     rate_hz: float | None = None
     gap_rows: NDArray[np.integer] = field(default_factory=lambda: np.empty(0, np.intp))
     temperature_c: NDArray[np.float64] | None = None
+    acceleration_g: NDArray[np.float64] | None = None
+    rows: NDArray[np.integer] | None = None
     findings: tuple[Finding, ...] = ()
 
 
