@@ -95,6 +95,13 @@ class ReaderOptions(Parameter):
     format: str = Field(
         "auto", description="name in gyro_pipeline.readers.READERS; auto: told by the header"
     )
+    encoding: str | None = Field(None, description="of a text; null: UTF-8 or UTF-16")
+    delimiter: str | None = Field(
+        None, min_length=1, max_length=1, description="of a text; a blank: runs of them; null: told"
+    )
+    row: str | None = Field(
+        None, description="expression with named groups; each line that it matches is a row"
+    )
     columns: tuple[Column, Column, Column] | None = Field(
         None, description="of the angular rates about x, y, z"
     )

@@ -1,253 +1,224 @@
-"""Rows of delimited text, read by Arrow as fast as it parses.
-
-A file that Arrow cannot read as numbers is read once more as text, and looked at row by row.
-"""
+"""Delimited text as a table: Arrow parses it, once; only damaged rows are looked at again."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.csv
 from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.logs import KEPT, REPAIRED, Finding
-from gyro_pipeline.readers.fields import DELIMITERS, is_header, split
+from gyro_pipeline.parameters import ReaderOptions
+from gyro_pipeline.readers.layout import DELIMITERS, Layout, is_header, layout_of, split
+from gyro_pipeline.readers.lines import advice, read_lines, unreadable
+from gyro_pipeline.readers.table import IN_READER, Table, column, few
 
-_BAD_SHARE, _BAD_ROWS = 0.01, 3
-"""Rows that cannot be read become NaN up to this share of them, and always up to this number."""
-
-_NUMBER = r"^[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|(?i:inf|infinity|nan))$"
-_THOUSANDS = re.compile(r"[+-]?\d{1,3}([,' .]\d{3})+([.,]\d+)?")
+_HEAD, _ZEROS = 1 << 14, 0.1  # bytes in which a larger share of zeros is none of a text
+_UTF16, _UTF8 = (b"\xff\xfe", b"\xfe\xff"), b"\xef\xbb\xbf"
 _COMMENTS = re.compile(rb"(?:\A|(?<=[\r\n]))[ \t]*(?:#|%|//)[^\r\n]*")
-_NULLS = ["", "NaN", "nan", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
+_NULLS = ["", " ", "NaN", "nan", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
 
-Values = tuple[list[NDArray[np.float64]], tuple[Finding, ...]]
-Odd = dict[int, str]
-"""What is wrong, by row."""
+
+def read_text(path: Path, options: ReaderOptions) -> Table:
+    """Read a text of rows, or of lines if the options say what a row is.
+
+    Raises:
+        InputError: It is not a text, or not one of rows that are told apart safely.
+    """
+    where = str(path)
+    data, hint = _decoded(path, options.encoding)
+    if options.row is not None:
+        return read_lines(where, data, options.row)
+    layout = layout_of(where, data, options.delimiter)
+    body, findings = _body(data, layout)
+    rows = _parse(where, body, layout)
+    cells = [column(values, layout.decimal_point) for values in rows.columns]
+    bad = {*rows.odd, *(row for _, unread in cells for row in unread)}
+    _refuse_second_header(where, rows, bad, layout)
+    findings += _odd_rows(where, rows, layout)
+    findings += tuple(
+        unreadable(
+            layout.names[number] or f"column {number}",
+            unread,
+            rows.count,
+            [f"row {row} (line {rows.line_of()[row]})" for row in unread[:3]],
+        )
+        for number, (_, unread) in enumerate(cells)
+        if unread
+    )
+    columns = tuple(values for values, _ in cells)
+    return Table(where, layout.names, columns, layout.preamble, findings, rows.line_of, hint)
+
+
+def _decoded(path: Path, encoding: str | None) -> tuple[bytes, str]:
+    """The text in UTF-8, without byte order mark, and what to say of its names if they look odd."""
+    data = path.read_bytes()
+    if encoding is not None or data.startswith(_UTF16):
+        try:
+            data = data.decode(encoding or "utf-16", "replace").encode()
+        except LookupError as error:
+            raise InputError(f"{path}: `encoding` {IN_READER}: {error}") from error
+    data = data.removeprefix(_UTF8)
+    head = data[:_HEAD].rstrip(b"\0")
+    if head.count(0) > len(head) * _ZEROS:
+        raise InputError(
+            f"{path}: expected a text, got binary data, or UTF-16 without byte order mark; export "
+            f"the recording as CSV in UTF-8, or give `encoding: utf-16-le` {IN_READER}"
+        )
+    if data.isascii() or _is_utf8(data):
+        return data, ""
+    lines = data.splitlines(keepends=True)  # those with a damaged byte only are read otherwise
+    text = b"".join(
+        line if _is_utf8(line) else line.decode("cp1252", "replace").encode() for line in lines
+    )
+    return text, f"the text is not UTF-8: if names look odd, give `encoding`, as gbk, {IN_READER}"
+
+
+def _is_utf8(data: bytes) -> bool:
+    try:
+        data.decode()
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
+def _body(data: bytes, layout: Layout) -> tuple[memoryview, tuple[Finding, ...]]:
+    """The rows, without what an interrupted recording leaves behind them, and without comments."""
+    findings: tuple[Finding, ...] = ()
+    start, end = layout.start, len(data)
+    if data.endswith(b"\0"):
+        end = len(data.rstrip(b"\0"))
+        text = f"{len(data) - end} zero bytes at the end of the file were left out"
+        findings += (Finding("end of file", REPAIRED, text),)
+    line_end = b"\n" if b"\n" in data else b"\r"
+    last = max(start, 1 + data.rfind(line_end, start, end))
+    fields = split(data[last:end].decode("utf-8", "replace"), layout.delimiter)
+    if fields and len(fields) != len(layout.names):
+        text = f"the last line, of {end - last} bytes, is cut and was left out"
+        findings += (Finding("end of file", REPAIRED, text),)
+        end = last
+    body = memoryview(data)[start:end]  # not a copy
+    marks = [mark for mark in (b"#", b"%", b"/") if data.find(mark, start) >= 0]
+    if marks and (marks != [b"/"] or b"//" in data):  # each is faster than the next
+        rows, comments = _COMMENTS.subn(b"", body)  # blank lines are no rows
+        if comments:
+            body = memoryview(rows)
+            text = f"{comments} lines of comment among the rows were left out"
+            findings += (Finding("comments", KEPT, text),)
+    if layout.delimiter == " ":
+        body = memoryview(b"\n".join(b" ".join(line.split()) for line in bytes(body).splitlines()))
+    return body, findings
 
 
 @dataclass(frozen=True)
-class TextTable:
-    """Rows of numbers in a text, whose header is known (see ``readers.tables.Table``).
+class _Parsed:
+    columns: list[Any]  # Arrow's values, null in odd rows
+    count: int  # rows
+    odd: dict[int, str]  # what is wrong with rows of another number of fields
+    lines: Callable[[], list[tuple[int, str]]]  # number and text of the line of each row
 
-    Attributes:
-        path: Of the file.
-        names: The header, without quotes; all empty where there is none.
-        preamble: Lines before it.
-        data: Bytes of the file, in ASCII or a superset of it.
-        start: Where its rows begin in them.
-        header_lines: Lines before the rows.
-        delimiter: Between fields.
-        quoted: Whether fields are in quotes; if not, a stray quote is one more damaged field.
-        decimal_point: A point or a comma.
-        times: Arrow's type of the columns of times of day and of dates with times.
-    """
+    def line_of(self) -> Sequence[int]:
+        return [number for number, _ in self.lines()]
 
-    path: Path
-    names: tuple[str, ...]
-    preamble: str
-    data: bytes
-    start: int
-    header_lines: int
-    delimiter: str
-    quoted: bool
-    decimal_point: str
-    times: Mapping[int, Any]
+    def shown(self, rows: Sequence[int]) -> str:
+        first = [f"row {row} (line {self.line_of()[row]}): {self.odd[row]}" for row in rows[:3]]
+        return "; ".join(first) + ("; …" if len(rows) > len(first) else "")
 
-    @property
-    def in_seconds(self) -> frozenset[int]:
-        """Columns that are read as seconds, whatever the header says."""
-        return frozenset(self.times)
 
-    def read(self, columns: Sequence[int], lenient: int | None = None) -> Values:
-        """Read columns (see ``readers.tables.Table``)."""
-        end, findings = self._end(columns)
-        body = memoryview(self.data)[self.start : end]  # not a copy
-        if not self.data.isascii():  # Arrow would drop odd rows that are not UTF-8 without a word
-            body = memoryview(bytes(body).decode("utf-8", "replace").encode())
-        try:
-            table, odd = self._parse(body, {n: self.times.get(n, pa.float64()) for n in columns})
-            values, unreadable = [_numbers(table[str(n)]) for n in columns], {}
-        except pa.ArrowInvalid:
-            table, odd = self._parse(body, dict.fromkeys(columns, pa.string()))
-            values, unreadable = self._converted(table, columns, lenient)
-            kept = np.setdiff1d(np.arange(table.num_rows + len(odd)), list(odd))
-            unreadable = {int(kept[row]): what for row, what in unreadable.items()}
-        if any(_is_comment(self._lines[row][1]) for row in (*odd, *unreadable)):
-            rows_only = _COMMENTS.sub(b"", self.data[self.start :])  # blank lines are no rows
-            if len(rows_only) < len(self.data) - self.start:
-                whole = replace(self, data=self.data[: self.start] + rows_only)
-                values, more = whole.read(columns, lenient)
-                text = "lines of comment among the rows were left out"
-                return values, (*more, Finding("comments", KEPT, text))
-        rows = table.num_rows + len(odd)
-        self._check(odd | unreadable, rows)
-        if odd or unreadable:
-            at = np.array(sorted(odd), int) - np.arange(len(odd))  # as np.insert counts
-            values = [np.insert(column, at, np.nan) for column in values]
-            findings += (self._finding(odd | unreadable, rows),)
-        return values, findings
+def _parse(where: str, body: memoryview, layout: Layout) -> _Parsed:
+    skipped: list[Any] = []
 
-    def _end(self, columns: Sequence[int]) -> tuple[int, tuple[Finding, ...]]:
-        """Where the rows end but for what an interrupted recording leaves behind them."""
-        findings: tuple[Finding, ...] = ()
-        end = len(self.data.rstrip(b"\0"))
-        if zeros := len(self.data) - end:
-            text = f"{zeros} zero bytes at the end of the file were left out"
-            findings += (Finding("end of file", REPAIRED, text),)
-        line = 1 + max(self.data.rfind(one, self.start, end) for one in (b"\n", b"\r"))
-        line = max(line, self.start)
-        last = split(self.data[line:end].decode("utf-8", "replace"), self.delimiter)
-        if last and (len(last) != len(self.names) or len(last) - 1 in columns):
-            text = f"the last line, of {end - line} bytes, has no line end and may be cut; it was "
-            findings += (Finding("end of file", REPAIRED, f"{text}left out"),)
-            end = line
-        if end <= self.start:
-            raise InputError(f"{self.path}: expected rows of numbers, got none but a cut one")
-        return end, findings
+    def skip(row: Any) -> str:
+        skipped.append(row)
+        return "skip"
 
-    def _parse(self, body: memoryview, kinds: dict[int, Any]) -> tuple[Any, Odd]:
-        """Let Arrow parse; rows of another number of fields are left out of the table."""
-        odd: Odd = {}
-
-        def skip(row: Any) -> str:
-            text = f"expected {row.expected_columns} fields, got {row.actual_columns}"
-            odd[row.number - 1] = text
-            return "skip"
-
-        table = pyarrow.csv.read_csv(
-            pa.BufferReader(pa.py_buffer(body)),
-            pyarrow.csv.ReadOptions(
-                use_threads=False,
-                block_size=min(len(body) + 1, 2**31 - 1),  # so that no line is too long
-                column_names=[str(number) for number in range(len(self.names))],
-            ),
-            pyarrow.csv.ParseOptions(
-                delimiter=self.delimiter,
-                quote_char='"' if self.quoted else False,
-                invalid_row_handler=skip,
-            ),
-            self._conversion(kinds),
-        )
-        if self.quoted:
-            self._refuse_rows_over_lines(table.num_rows + len(odd), body)
-        return table, odd
-
-    def _conversion(self, kinds: dict[int, Any]) -> Any:
-        return pyarrow.csv.ConvertOptions(
-            include_columns=[str(number) for number in kinds],
-            column_types={str(number): kind for number, kind in kinds.items()},
+    numbers = [str(number) for number in range(len(layout.names))]
+    table = pyarrow.csv.read_csv(
+        pa.BufferReader(pa.py_buffer(body)),
+        pyarrow.csv.ReadOptions(
+            use_threads=False,
+            block_size=min(len(body) + 1, 2**31 - 1),  # so that no line is too long
+            column_names=numbers,
+        ),
+        pyarrow.csv.ParseOptions(
+            delimiter=layout.delimiter,
+            quote_char='"' if layout.quoted else False,
+            invalid_row_handler=skip,
+        ),
+        pyarrow.csv.ConvertOptions(
+            column_types={str(number): pa.string() for number in layout.texts},
             null_values=_NULLS,
+            true_values=[],
+            false_values=[],
             strings_can_be_null=True,
-            decimal_point=self.decimal_point,
-        )
+            decimal_point=layout.decimal_point,
+        ),
+    )
 
-    def _converted(self, table: Any, columns: Sequence[int], lenient: int | None) -> Any:
-        """Turn text into numbers where it is one; say in which rows it is not."""
-        values: list[NDArray[np.float64]] = []
-        unreadable: Odd = {}
-        for number in columns:
-            texts = pc.utf8_trim_whitespace(table[str(number)])
-            column = self._seconds(texts, number) if number in self.times else self._number(texts)
-            values.append(column)
-            rows = np.flatnonzero(np.isnan(column) & ~texts.is_null().to_numpy())
-            found = zip(rows.tolist(), texts.take(pa.array(rows)).to_pylist(), strict=True)
-            wrong = {row: text for row, text in found if text.lower().lstrip("+-") != "nan"}
-            what = self.names[number] or f"column {number}"
-            self._refuse_thousands(wrong.values(), what)
-            if number != lenient:
-                unreadable |= {
-                    row: f"{what}: expected a number, got {text[:40]!r}"
-                    for row, text in wrong.items()
-                }
-        return values, unreadable
-
-    def _number(self, texts: Any) -> NDArray[np.float64]:
-        """Numbers; NaN where there is none. Where commas are decimal, a point is no part of one."""
-        points = pc.replace_substring(texts, self.decimal_point, ".")
-        good = pc.match_substring_regex(points, _NUMBER)
-        if self.decimal_point != ".":
-            good = pc.and_(good, pc.invert(pc.match_substring(texts, ".")))
-        return _numbers(pc.if_else(good, points, None).cast(pa.float64()))
-
-    def _seconds(self, texts: Any, number: int) -> NDArray[np.float64]:
-        """Seconds since midnight, or since the first date; NaN where there is neither."""
-        series = pd.Series(texts.to_pylist(), dtype="object")
-        if pa.types.is_time(self.times[number]):
-            since = pd.to_timedelta(series, errors="coerce")
-        else:
-            times = pd.to_datetime(series, errors="coerce", format="ISO8601", utc=True)
-            since = times - times.min()
-        return np.asarray(since.dt.total_seconds(), np.float64)
-
-    def _refuse_rows_over_lines(self, rows: int, body: memoryview) -> None:
-        lines = sum(map(bool, bytes(body).splitlines()))
-        if rows != lines:
-            raise InputError(
-                f"{self.path}: expected a row on each line, got {rows} rows on {lines} lines: a "
-                "quoted field does not end on its line; correct it"
-            )
-
-    def _refuse_thousands(self, texts: Iterable[str], what: str) -> None:
-        for text in texts:
-            if _THOUSANDS.fullmatch(text):
-                raise InputError(
-                    f"{self.path}: {what}: expected numbers without thousands separators, got "
-                    f"{text!r}; export them without"
-                )
-
-    @cached_property
-    def _lines(self) -> list[tuple[int, str]]:
-        """Number in the file, from 1, and text of each line that Arrow sees as a row."""
-        lines = self.data[self.start :].rstrip(b"\0").splitlines()
+    @cache
+    def lines() -> list[tuple[int, str]]:
+        texts = bytes(body).splitlines()
         return [
-            (self.header_lines + 1 + number, line.decode("utf-8", "replace"))
-            for number, line in enumerate(lines)
-            if line
+            (number, line.decode("utf-8", "replace"))
+            for number, line in enumerate(texts, layout.line)
+            if line.strip()
         ]
 
-    def _check(self, bad: Odd, rows: int) -> None:
-        """Refuse a file of which too much cannot be read, or with a second header."""
-        for row in sorted(bad)[:100]:
-            line, text = self._lines[row]
-            if is_header(split(text, self.delimiter)):
-                raise InputError(
-                    f"{self.path} line {line} (row {row}): expected numbers, got a second header, "
-                    f"{text[:80]!r}: two recordings in one file? Split it"
-                )
-        if rows - len(bad) < 2 and not bad:  # noqa: PLR2004
-            raise InputError(f"{self.path}: expected rows of numbers, got one only")
-        if rows - len(bad) < 2 or len(bad) > max(_BAD_ROWS, _BAD_SHARE * rows):  # noqa: PLR2004
+    blank = [row.number - 1 for row in skipped if not row.text.strip()]
+    odd = {
+        row.number - 1 - int(np.searchsorted(blank, row.number)): (
+            f"expected {row.expected_columns} fields, got {row.actual_columns}"
+        )
+        for row in skipped
+        if row.text.strip()
+    }
+    count = table.num_rows + len(odd)
+    if layout.quoted and count != len(lines()):
+        raise InputError(
+            f"{where}: expected a row on each line, got {count} rows on {len(lines())} lines: a "
+            "quoted field does not end on its line; correct it"
+        )
+    columns = table.columns
+    if odd:
+        taken = np.insert(
+            np.arange(table.num_rows, dtype=float),
+            np.array(list(odd)) - np.arange(len(odd)),
+            np.nan,
+        )
+        places = pa.array(taken, pa.int64(), from_pandas=True)
+        columns = [values.take(places) for values in columns]
+    return _Parsed(columns, count, odd, lines)
+
+
+def _refuse_second_header(where: str, rows: _Parsed, bad: set[int], layout: Layout) -> None:
+    for row in sorted(bad)[:100]:
+        line, text = rows.lines()[row]
+        if is_header(split(text, layout.delimiter)):
             raise InputError(
-                f"{self.path}: expected rows of {len(self.names)} columns of numbers, "
-                f"{DELIMITERS[self.delimiter]}-separated, got {len(bad)} of {rows} that are not: "
-                f"{self._shown(bad)}; correct or export the file anew"
+                f"{where} line {line} (row {row}): expected numbers, got a second header, "
+                f"{text[:80]!r}: two recordings in one file? Split it"
             )
 
-    def _finding(self, bad: Odd, rows: int) -> Finding:
-        text = f"{len(bad)} of {rows} rows cannot be read and are NaN: {self._shown(bad)}"
-        return Finding("unreadable rows", REPAIRED, text)
 
-    def _shown(self, bad: Odd) -> str:
-        first = sorted(bad)[:3]
-        texts = [f"row {row} (line {self._lines[row][0]}): {bad[row]}" for row in first]
-        return "; ".join(texts) + ("; …" if len(bad) > len(first) else "")
-
-
-def _is_comment(line: str) -> bool:
-    return _COMMENTS.match(line.encode()) is not None
-
-
-def _numbers(column: Any) -> NDArray[np.float64]:
-    """Values of a column of numbers or times, the latter in seconds; null is NaN."""
-    if pa.types.is_floating(column.type):
-        return np.array(column.to_numpy())
-    return column.cast(pa.int64()).to_numpy() * 1e-6
+def _odd_rows(where: str, rows: _Parsed, layout: Layout) -> tuple[Finding, ...]:
+    """Say which rows have another number of fields, or refuse so many."""
+    odd = sorted(rows.odd)
+    good = rows.count - len(odd)
+    if good < 2 or not few(len(odd), rows.count):  # noqa: PLR2004
+        texts = [text for _, text in rows.lines()[:200]]
+        raise InputError(
+            f"{where}: expected rows of {len(layout.names)} columns, "
+            f"{DELIMITERS.get(layout.delimiter, repr(layout.delimiter))}-separated, got {len(odd)} "
+            f"of {rows.count} that are not: {rows.shown(odd)}; correct or export the file anew, or, "
+            f"if other lines stand between the rows, {advice(texts)}"
+        )
+    if not odd:
+        return ()
+    text = f"{len(odd)} of {rows.count} rows cannot be read and are NaN: {rows.shown(odd)}"
+    return (Finding("unreadable rows", REPAIRED, text),)

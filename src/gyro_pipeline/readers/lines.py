@@ -1,0 +1,130 @@
+"""Lines that are no table: the option ``row`` says what a row is, and a refusal makes one.
+
+Serial consoles, NMEA-like sentences and JSON lines have a row of numbers on a line, with words
+around them. An expression with named groups finds them; all other lines are skipped.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+
+import pyarrow as pa
+
+from gyro_pipeline.conventions import InputError
+from gyro_pipeline.logs import KEPT, Finding
+from gyro_pipeline.readers.table import IN_READER, Table, column
+
+_CHECKSUM = re.compile(r"\*[0-9A-Fa-f]{2}\s*$")
+_DATE, _CLOCK = r"\d{4}[-/.]\d\d[-/.]\d\d", r"\d{1,2}:\d\d(?::\d\d)?(?:[.,:]\d+)?"
+_TIME = rf"{_DATE}(?:[T ]{_CLOCK}(?:Z|[+-]\d\d:?\d\d)?)?|{_CLOCK}"
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_VALUE = re.compile(rf"(?<![\w.+:-])(?:(?P<time>{_TIME})|{_NUMBER})(?![\w.:])|(?<=:){_NUMBER}(?![\w.:])")
+_LABEL = re.compile(r"([A-Za-z]\w*)[\"']?\s*[:=]\s*$")
+_JSON = re.compile(r"\s*[\[{]\s*($|[\[{\"])")
+_LEAST, _MOST = 3, 100  # numbers in a line
+
+
+def is_sentence(line: str) -> bool:
+    """Whether a line is framed as NMEA 0183 has it, ``$…*68``: its last field has a checksum."""
+    return line.startswith(("$", "!")) and _CHECKSUM.search(line) is not None
+
+
+def read_lines(where: str, data: bytes, expression: str) -> Table:
+    """Read the lines of a text that an expression matches.
+
+    Args:
+        where: For messages.
+        data: The text, UTF-8.
+        expression: A regular expression, which is searched in each line; its named groups are the
+            columns.
+
+    Raises:
+        InputError: The expression is none, has no named groups, or matches fewer than two lines.
+    """
+    try:
+        pattern = re.compile(expression)
+    except re.error as error:
+        raise InputError(f"{where}: `row:` {IN_READER} is no expression: {error}") from error
+    names = tuple(pattern.groupindex)
+    lines = [line.decode("utf-8", "replace") for line in data.rstrip(b"\0").splitlines()]
+    filled = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
+    matches = [(number, match) for number, line in filled if (match := pattern.search(line))]
+    if not names or len(matches) < 2:  # noqa: PLR2004
+        raise InputError(
+            f"{where}: expected named groups, such as (?P<gx>…), in `row:` and two lines or more "
+            f"that it matches, got {len(names)} groups and {len(matches)} of {len(filled)} lines; "
+            f"{advice([line for _, line in filled[:200]])}"
+        )
+    numbers = [number for number, _ in matches]
+    cells = [column(pa.array([match[name] for _, match in matches], pa.string())) for name in names]
+    return Table(
+        where=where,
+        names=names,
+        columns=tuple(values for values, _ in cells),
+        preamble="\n".join(lines[: numbers[0] - 1]),
+        findings=_skipped(filled, set(numbers))
+        + tuple(
+            unreadable(name, rows, len(numbers), [f"row {r} (line {numbers[r]})" for r in rows[:3]])
+            for name, (_, rows) in zip(names, cells, strict=True)
+            if rows
+        ),
+        line_of=lambda: numbers,
+    )
+
+
+def _skipped(filled: list[tuple[int, str]], rows: set[int]) -> tuple[Finding, ...]:
+    skipped = [(number, line) for number, line in filled if number not in rows]
+    if not skipped:
+        return ()
+    number, line = skipped[0]
+    text = f"{len(skipped)} of {len(filled)} lines do not match `row` and were skipped, the first "
+    return (Finding("row", KEPT, f"{text}is line {number}: {line[:60]!r}"),)
+
+
+def unreadable(name: str, rows: list[int], count: int, places: list[str]) -> Finding:
+    """Say which cells of a column of numbers are none."""
+    text = f"{len(rows)} of {count} cells of {name!r} cannot be read and are NaN: "
+    return Finding("unreadable cells", KEPT, text + ", ".join(places) + ", …" * (len(rows) > 3))  # noqa: PLR2004
+
+
+def advice(lines: Sequence[str]) -> str:
+    """Say how lines like these can be read: an expression to paste, if they hold numbers."""
+    made = Counter(filter(None, map(expression_of, lines))).most_common(1)
+    if not made and lines and _JSON.match(lines[0]):
+        return (
+            "a document of JSON: write an object a line, or CSV, such as by "
+            "`pandas.read_json(PATH).to_csv('log.csv', index=False)`"
+        )
+    if not made:
+        return "export the recording as CSV"
+    text = made[0][0].replace("'", "''")  # as YAML has it in quotes
+    return (
+        f"to read lines like these, write {IN_READER}: row: '{text}' – with the groups of the "
+        "angular rates named gx, gy, gz, that of the time t, and the units in `units`"
+    )
+
+
+def expression_of(line: str) -> str | None:
+    """An expression that matches lines like this one, each number a group; None of few numbers.
+
+    Groups are named by the label before them (``X: 1`` and ``"X": 1`` make X), else v1, v2, ….
+    """
+    line = _CHECKSUM.sub("*", line.rstrip())
+    expression, end, names = "^", 0, list[str]()
+    for value in _VALUE.finditer(line):
+        between = line[end : value.start()]
+        label = _LABEL.search(between)
+        name = "t" if value["time"] else label[1] if label else f"v{len(names) + 1}"
+        names.append(name + "_" * names.count(name))
+        cell = r"[-+:.,/TZ \d]+" if value["time"] else r"[-+.eE\d]+"
+        blanks = r"\s+" if between and not between.strip() else r"\s*"
+        expression += f"{_literal(between.rstrip())}{blanks}(?P<{names[-1]}>{cell})"
+        end = value.end()
+    if not _LEAST <= len(names) <= _MOST:
+        return None
+    return expression + (_literal(line[end:]) if end < len(line) else r"\s*$")
+
+
+def _literal(text: str) -> str:
+    """An expression for a text between numbers, whatever the number of blanks in it."""
+    return re.sub(r"\s+", r"\\s+", re.sub(r"([\\.^$*+?{}\[\]|()])", r"\\\1", text))
