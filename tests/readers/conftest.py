@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from gyro_pipeline.parameters import ReaderOptions
-from gyro_pipeline.readers import read_log
+from gyro_pipeline.readers.table import read_table
 
 ROWS = 60
 
@@ -74,17 +74,33 @@ def good(rates):
     return {name: "\n".join(text) + "\n" for name, text in texts.items()}
 
 
+def written(path, content):
+    """A file of bytes or text, or of what a function writes to it."""
+    if callable(content):
+        content(path)
+    else:
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
+
+
+@pytest.fixture
+def table(tmp_path):
+    """Read a table of bytes, text or whatever else can be written to a file."""
+
+    def table(content, name="log.csv", **options):
+        return read_table(written(tmp_path / name, content), ReaderOptions(**options))
+
+    return table
+
+
 @pytest.fixture
 def read(tmp_path):
     """Read bytes, text or whatever else can be written to a file, with options by name."""
 
+    from gyro_pipeline.readers import read_log  # noqa: PLC0415
+
     def read(content, rate_hz=None, name="log.csv", **options):
-        path = tmp_path / name
-        if callable(content):
-            content(path)
-        else:
-            path.write_bytes(content.encode() if isinstance(content, str) else content)
-        return read_log(path, ReaderOptions(**options), rate_hz)
+        return read_log(written(tmp_path / name, content), ReaderOptions(**options), rate_hz)
 
     return read
 

@@ -93,7 +93,7 @@ def layout_of(where: str, data: bytes, delimiter: str | None) -> Layout:
         line=above[-1].number + 1 if above else 1,
         delimiter=rows.delimiter,
         decimal_point=_decimal_point(where, text, rows.delimiter),
-        quoted=any('"' in line.text for line in lines[rows.at : rows.at + 20]),
+        quoted='"' in lines[rows.at].text,
         texts=frozenset(n for n, field in enumerate(first) if not is_number(field)),
     )
 
@@ -171,7 +171,7 @@ def _rows_by(delimiter: str, lines: list[Line]) -> _Rows | None:
         numbers = max(numbers, count)
         if width and at > start and numbers >= _LEAST:
             first = split(lines[start].text, delimiter)
-            while start and _row(lines[start - 1].text, delimiter)[1] >= _LEAST:
+            while start and _row(lines[start - 1].text, delimiter, start == 1)[1] >= _LEAST:
                 start -= 1  # damaged ones, of another width
             return _Rows(delimiter, start, first, numbers)
     return None
@@ -210,11 +210,15 @@ def _header(
             break
     else:
         return ("",) * width, []
-    names, top = _fields(above[at].text, delimiter, width), at
-    while top and widths[top - 1] == len(names) and _is_incomplete(names):
-        top -= 1
-        names = _joined(_fields(above[top].text, delimiter, width), names)
-    return _fitted(f"{where} line {above[at].number}", names, row), above[top : at + 1]
+    rows = [_fields(line.text, delimiter, width) for line in above[: at + 1]]
+    names, units = rows.pop(), [""] * widths[at]
+    # neighbours have the same unit but different axes: names repeated side by side are units
+    if rows and len(rows[-1]) == len(names) and any(a == b != "" for a, b in pairwise(names)):
+        names, units = rows.pop(), [unit.strip("[]() ") for unit in names]
+    while rows and len(rows[-1]) == len(names) and _is_incomplete(names):
+        names = _joined(rows.pop(), names)
+    names = [f"{n} [{u}]" if u else n for n, u in zip(names, units, strict=True)]
+    return _fitted(f"{where} line {above[at].number}", names, row), above[len(rows) : at + 1]
 
 
 def _fields(text: str, delimiter: str, width: int) -> list[str]:
@@ -234,15 +238,10 @@ def _is_incomplete(names: Sequence[str]) -> bool:
 
 
 def _joined(upper: Sequence[str], lower: Sequence[str]) -> list[str]:
-    """Two rows of a header as one.
+    """Two rows of a header as one: a name carries on over the empty fields beside it.
 
-    Neighbours have the same unit but different axes: where names are repeated side by side, the
-    lower row is of units. Else the upper row has names that carry on over empty fields, and their
-    units stay behind the axis: ``Gyro (rad/s)`` above ``X`` is ``Gyro X (rad/s)``.
+    Its unit stays behind the axis: ``Gyro (rad/s)`` above ``X`` is ``Gyro X (rad/s)``.
     """
-    if any(name and name == other for name, other in pairwise(lower)):
-        units = [unit.strip("[]() ") for unit in lower]
-        return [f"{n} [{u}]" if u else n for n, u in zip(upper, units, strict=True)]
     joined, span = [], ""
     for name, axis in zip(upper, lower, strict=True):
         span = name or (span if axis else "")
