@@ -1,0 +1,80 @@
+"""Lines that are no table: the refusal shows an expression, and pasted, it reads them."""
+
+import re
+
+import numpy as np
+import pytest
+import yaml
+
+from gyro_pipeline.conventions import InputError
+
+VALUES = np.random.default_rng(3).normal(0, 20, (40, 3)).round(3)
+LINES = {  # how a line is written, and the groups that the expression has
+    "VectorNav": ("$VNYMR,{t},{x:+08.3f},{y:+08.3f},{z:+08.3f}*{k:02X}", "v1 v2 v3 v4"),
+    "clock and arrow": ("12:00:{t:06.3f} -> {x},{y},{z}", "t v2 v3 v4"),
+    "date": ("[2024-03-01 12:00:{t:06.3f}] {x} {y} {z}", "t v2 v3 v4"),
+    "brackets": ("gyro=({x}, {y}, {z})", "v1 v2 v3"),
+    "labels": ("X: {x:8.3f}   Y: {y:8.3f}   Z: {z:8.3f}", "X Y Z"),
+    "labels without blanks": ("gx:{x},gy:{y},gz:{z}", "gx gy gz"),
+    "JSON lines": ('{{"t": {t}, "gx": {x}, "gy": {y}, "gz": {z}}}', "t gx gy gz"),
+    "JSON lines of arrays": ('{{"t":{t},"gyro":[{x},{y},{z}],"ok":true}}', "t v2 v3 v4"),
+    "an unlucky quote": ("it's {x} | {y} | {z} deg/s", "v1 v2 v3"),
+    "ESP32": ("I ({k}) imu: {x} {y} {z}", "v1 imu v3 v4"),
+}
+BOOT = ["ets Jun  8 2016 00:22:57", "rst:0x1 (POWERON_RESET)", "", "I2C ok"]
+
+
+def written(form):
+    rows = [form.format(k=k, t=k / 100, x=x, y=y, z=z) for k, (x, y, z) in enumerate(VALUES.tolist())]
+    return "\n".join([*BOOT, *rows[:20], "brown-out, 3 times", *rows[20:]]) + "\n"
+
+
+@pytest.mark.parametrize("name", LINES)
+def test_the_expression_of_a_refusal_reads_the_lines_when_pasted(name, table):
+    form, groups = LINES[name]
+    with pytest.raises(InputError) as refusal:
+        table(written(form))
+    pasted = re.search(r"`?reader:`? of the catalog entry in catalog.yml: (row: '.*') –", str(refusal.value))
+    log = table(written(form), **yaml.safe_load(pasted[1]))
+    assert log.names == tuple(groups.split())
+    read = np.stack([log.numbers(n) for n in range(len(log.names) - 3, len(log.names))], axis=1)
+    np.testing.assert_array_equal(read, VALUES)
+    (skipped,) = log.findings
+    assert skipped.detail.startswith("4 of 44 lines do not match `row` and were skipped, the first")
+    assert log.place(20) == "row 20 (line 26)"
+    assert log.preamble == "\n".join(BOOT)
+
+
+def test_a_signs_loss_is_not_suggested(table):
+    with pytest.raises(InputError, match="export the recording as CSV"):
+        table("x-1.5 y-2.5 z-3.5\n" * 9)
+
+
+def test_groups_may_be_renamed_missing_and_unreadable(table):
+    log = table(
+        "gyro 1,2,3\nboot\ngyro 1,2\ngyro 1,x,3\n" + "gyro 1,2,3\n" * 4,
+        row=r"^gyro (?P<gx>\d),(?P<gy>\w+)(?:,(?P<gz>\d))?$",
+    )
+    assert np.isnan(log.columns[1]).nonzero()[0].tolist() == [2]
+    assert np.isnan(log.columns[2]).nonzero()[0].tolist() == [1]
+    assert [finding.check for finding in log.findings] == ["row", "unreadable cells"]
+    assert "row 2 (line 4)" in log.findings[1].detail
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("(", "`row:` in `reader:` of the catalog entry in catalog.yml is no expression"),
+        (r"(\d), (\d)", "expected named groups.*got 0 groups.*row: '.gyro="),
+        (r"acc=(?P<x>\d)", "got 1 groups and 0 of 9 lines.*row: '.gyro="),
+    ],
+)
+def test_an_expression_that_reads_nothing_is_refused_with_one_that_does(row, message, table):
+    with pytest.raises(InputError, match=message):
+        table("gyro=(1, 2, 3)\n" * 9, row=row)
+
+
+def test_json_on_one_line_is_quoted_and_comes_with_advice(table):
+    objects = ",".join(f'{{"t": {k}, "x": 1, "y": 2, "z": 3}}' for k in range(2000))
+    with pytest.raises(InputError, match=r"begins '\[\{\"t\": 0, \"x\": 1.*pandas.read_json"):
+        table(f"[{objects}]")

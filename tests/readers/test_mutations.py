@@ -1,0 +1,119 @@
+"""Good files with bytes flipped, cut or inserted, and lines dropped or repeated.
+
+Whatever the damage, a file ends in a table or in a message, and no value moves to another column.
+"""
+
+import io
+
+import numpy as np
+import pytest
+import scipy.io
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from gyro_pipeline.conventions import InputError
+from gyro_pipeline.parameters import ReaderOptions
+from gyro_pipeline.readers.table import read_table
+
+LOGGERS = ["movella_dot", "movella_dot_angles", "openlog_artemis", "ngimu", "general"]
+PLACE = st.floats(0, 1, exclude_max=True)
+SEVERAL = settings(
+    max_examples=60,
+    deadline=None,
+    derandomize=True,  # the same files each time
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+BYTES = st.binary(min_size=1, max_size=8) | st.sampled_from(
+    [b",", b";", b"\t", b"\n", b"\r", b'"', b"\0", b".", b"-", b"e9", b"sep=;\n", b" "]
+)
+EDITS = st.lists(
+    st.tuples(
+        st.sampled_from(["flip", "cut", "end", "insert", "drop", "repeat", "replace"]),
+        PLACE,
+        BYTES,
+    ),
+    min_size=1,
+    max_size=3,
+)
+
+
+def mutated(data, edits):
+    """The bytes with edits, each of a kind, at a place from 0 to 1, with other bytes."""
+    for kind, place, new in edits:
+        if kind in ("drop", "repeat"):
+            lines = data.splitlines(keepends=True)
+            at = int(place * len(lines))
+            again = lines[at : at + 1] * (2 * (kind == "repeat"))
+            data = b"".join(lines[:at] + again + lines[at + 1 :])
+            continue
+        at = int(place * len(data))
+        data = {
+            "flip": data[:at] + bytes(byte ^ new[0] for byte in data[at : at + 1]) + data[at + 1 :],
+            "cut": data[:at] + data[at + 5 * len(new) :],
+            "end": data[:at],
+            "insert": data[:at] + new + data[at:],
+            "replace": data[:at] + new + data[at + len(new) :],
+        }[kind]
+    return data
+
+
+def read_or_refused(path, data):
+    path.write_bytes(data)
+    try:
+        return read_table(path, ReaderOptions())
+    except InputError as error:
+        assert path.name in str(error)
+        return None
+
+
+def strange(values, good):
+    """How many numbers of a column are none of the good one's."""
+    return (~np.isin(values[np.isfinite(values)], good)).sum() if values.dtype == float else 0
+
+
+@pytest.mark.filterwarnings("error")  # what Arrow cannot raise, it warns of
+@pytest.mark.parametrize("logger", LOGGERS)
+@SEVERAL
+@given(edits=EDITS)
+def test_a_mutated_text_gives_the_good_rows_or_a_message(logger, edits, good, tmp_path):
+    whole = read_or_refused(tmp_path / "log.csv", good[logger].encode())
+    columns = dict(zip(whole.names, whole.columns, strict=True))
+    damaged = read_or_refused(tmp_path / "log.csv", mutated(good[logger].encode(), edits))
+    for name, values in zip(*(damaged.names, damaged.columns) if damaged else ((), ()), strict=True):
+        assert len(values) <= 60 + 5 * len(edits)
+        if name and name in columns and columns[name].dtype == float:
+            assert strange(values, columns[name]) <= 2 * len(edits)
+
+
+@SEVERAL
+@given(edits=EDITS, kind=st.sampled_from(["npy", "npz", "parquet", "mat"]))
+def test_a_mutated_stored_file_gives_a_table_or_a_message(edits, kind, rates, frame, tmp_path):
+    buffer = io.BytesIO()
+    if kind == "npy":
+        np.save(buffer, rates)
+    elif kind == "npz":
+        np.savez(buffer, gyro_dps=rates)
+    elif kind == "mat":
+        scipy.io.savemat(buffer, {"log": {"gyro_dps": rates}, "t": rates[:, 0]})
+    else:
+        frame.to_parquet(buffer)
+    log = read_or_refused(tmp_path / f"log.{kind}", mutated(buffer.getvalue(), edits))
+    assert log is None or len(log.names) == len(log.columns)
+
+
+@pytest.mark.parametrize("logger", LOGGERS)
+def test_no_byte_lost_or_delimiter_added_in_a_header_moves_a_column(logger, good, tmp_path):
+    data = good[logger].encode()
+    whole = read_or_refused(tmp_path / "log.csv", data)
+    start = data.rindex(b"\n", 0, data.index(b"Gyr_X")) if logger == "movella_dot" else 0
+    delimiter = b";" if logger == "general" else b","
+    read = 0
+    for at in range(start + 1, data.index(b"\n", start + 1)):
+        for change in (data[:at] + data[at + 1 :], data[:at] + delimiter + data[at:]):
+            log = read_or_refused(tmp_path / "log.csv", change)
+            read += log is not None
+            for number, name in enumerate(log.names if log else ()):
+                if name and name in whole.names:
+                    assert whole.names.index(name) == number, change[start : start + 200]
+                    np.testing.assert_array_equal(log.columns[number], whole.columns[number])
+    assert read
