@@ -25,7 +25,9 @@ BOOT = ["ets Jun  8 2016 00:22:57", "rst:0x1 (POWERON_RESET)", "", "I2C ok"]
 
 
 def written(form):
-    rows = [form.format(k=k, t=k / 100, x=x, y=y, z=z) for k, (x, y, z) in enumerate(VALUES.tolist())]
+    rows = [
+        form.format(k=k, t=k / 100, x=x, y=y, z=z) for k, (x, y, z) in enumerate(VALUES.tolist())
+    ]
     return "\n".join([*BOOT, *rows[:20], "brown-out, 3 times", *rows[20:]]) + "\n"
 
 
@@ -34,7 +36,9 @@ def test_the_expression_of_a_refusal_reads_the_lines_when_pasted(name, table):
     form, groups = LINES[name]
     with pytest.raises(InputError) as refusal:
         table(written(form))
-    pasted = re.search(r"`?reader:`? of the catalog entry in catalog.yml: (row: '.*') –", str(refusal.value))
+    pasted = re.search(
+        r"`?reader:`? of the catalog entry in catalog.yml: (row: '.*') –", str(refusal.value)
+    )
     log = table(written(form), **yaml.safe_load(pasted[1]))
     assert log.names == tuple(groups.split())
     read = np.stack([log.numbers(n) for n in range(len(log.names) - 3, len(log.names))], axis=1)

@@ -79,7 +79,9 @@ def test_a_mutated_text_gives_the_good_rows_or_a_message(logger, edits, good, tm
     whole = read_or_refused(tmp_path / "log.csv", good[logger].encode())
     columns = dict(zip(whole.names, whole.columns, strict=True))
     damaged = read_or_refused(tmp_path / "log.csv", mutated(good[logger].encode(), edits))
-    for name, values in zip(*(damaged.names, damaged.columns) if damaged else ((), ()), strict=True):
+    for name, values in zip(
+        *(damaged.names, damaged.columns) if damaged else ((), ()), strict=True
+    ):
         assert len(values) <= 60 + 5 * len(edits)
         if name and name in columns and columns[name].dtype == float:
             assert strange(values, columns[name]) <= 2 * len(edits)

@@ -95,7 +95,8 @@ CASES = {
     "CR only": (ANGLES, replaced(("\n", "\r")), Read()),
     "blank lines": (ANGLES, replaced(("\n", "\n\n")), Read()),
     "lines of two blanks": (ANGLES, replaced(("\n", "\n  \n")), Read()),
-    "lines of two blanks and no line end": (ANGLES, lambda t: t.replace("\n", "\n  \n")[:-4], Read()),
+    "lines of two blanks and no line end": (
+        ANGLES, lambda t: t.replace("\n", "\n  \n")[:-4], Read()),
     "no line end after the last row": (GENERAL, lambda t: t[:-1], Read()),
     "quoted fields": (GENERAL, in_quotes, Read()),
     "tabs": (GENERAL, replaced((";", "\t")), Read()),
@@ -135,7 +136,8 @@ CASES = {
     "the last line cut between fields": (ANGLES, lambda t: t[:-20], Read(BUT_LAST, (), (CUT,))),
     "the last line cut, in quotes": (
         GENERAL, lambda t: in_quotes(t)[:-16], Read(BUT_LAST, (), (CUT,))),
-    "zeros of a card at the end": (ANGLES, lambda t: t.encode() + bytes(4096), Read((), (), (CUT,))),
+    "zeros of a card at the end": (
+        ANGLES, lambda t: t.encode() + bytes(4096), Read((), (), (CUT,))),
     "text in a number column": (ANGLES, cell(9, 8, "error"), Read(None, (9,), (CELLS,))),
     "an enormous field": (ANGLES, cell(9, 8, "x" * 200_000), Read(None, (9,), (CELLS,))),
     "a field too many in two rows": (
@@ -180,10 +182,10 @@ CASES = {
     ),
     "a header of fewer columns": (
         ANGLES, header("phi,theta,", ""), Refused("columns as the rows, 11, got 9")),
-    "two recordings": (ANGLES, lambda t: t + t, Refused("line 62 .row 60.*a second header")),
+    "two recordings": (ANGLES, lambda t: t + t, Refused("a second header in row 60 .line 62.")),
     "two loggers": (ANGLES, lambda t: t + t.replace("w_", ""), Refused("a second header")),
     "two recordings with sep lines": (
-        DOT, lambda t: t + t, Refused("line 66 .row 60.*a second header")),
+        DOT, lambda t: t + t, Refused("a second header in row 60 .line 66.")),
     "thousands and decimals": (
         GENERAL, replaced((";0.0", ";1,000.0")), Refused("with both commas and points")),
     "what may be thousands": (
@@ -279,7 +281,7 @@ def test_texts_are_columns_of_texts_and_what_is_no_number_says_where(table):
 
 
 def test_thousands_separators_are_named(table):
-    log = table('x,y,z\n' + '"1,234.5",2,3\n"2.5",2,3\n' * 9)
+    log = table("x,y,z\n" + '"1,234.5",2,3\n"2.5",2,3\n' * 9)
     with pytest.raises(InputError, match="without thousands separators in 'x', got '1,234.5'"):
         log.numbers(0)
 
@@ -307,7 +309,7 @@ def test_a_finding_says_which_row_and_line_and_why(good, table):
     for content, line in ((text, 11), (text.replace("\n", "\n\n"), 21)):
         (finding,) = table(content).findings
         assert finding.detail == (
-            f"1 of 60 cells of 'w_y' cannot be read and are NaN: row 9 (line {line})"
+            f"1 of 60 cells of 'w_y' are no numbers and are NaN: 'error' in row 9 (line {line})"
         )
 
 

@@ -19,16 +19,12 @@ DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab", " ": "blanks"}
 _HEAD = 1 << 15
 _LEAST = 3  # numbers in a row
 _SEPARATOR_LINE = re.compile(r'"?sep=(.)"?,*', re.IGNORECASE)
-_COMMENTS = ("#", "%", "//")
 _DIGITS = re.compile(r"[\d:.,/TZ +-]+")  # of numbers, times and dates
 _TOKEN = re.compile(r"[^\s(\[]\S*(?:\s+[(\[][^)\]]*[)\]])?|\S+")  # "gx (deg/s)" is one
-_WITH_COMMA = re.compile(r"(?:^|[;\t\n ])\s*\"?[+-]?(\d+),(\d+)(?=[eE;\t\r\n\" ]|$)")
 _WITH_BOTH = re.compile(r"\d,\d{3}\.\d|\d\.\d{3},\d")
 
 
-class Line(NamedTuple):
-    """A line that is not blank."""
-
+class _Line(NamedTuple):
     number: int  # in the file, from 1
     end: int  # offset of what follows
     text: str
@@ -77,7 +73,7 @@ def layout_of(where: str, data: bytes, delimiter: str | None) -> Layout:
     Raises:
         InputError: There are no rows, or they cannot be told safely.
     """
-    lines = head_lines(data)
+    lines = _head_lines(data)
     rows = _find_rows(where, lines, delimiter, data)
     above = lines[: rows.at]
     head = [split(line.text, rows.delimiter) for line in lines[rows.at : rows.at + 20]]
@@ -98,7 +94,7 @@ def layout_of(where: str, data: bytes, delimiter: str | None) -> Layout:
     )
 
 
-def head_lines(data: bytes) -> list[Line]:
+def _head_lines(data: bytes) -> list[_Line]:
     """The lines in the head of a text that are not blank, and whole if others follow them."""
     lines, end = [], 0
     for number, line in enumerate(data[:_HEAD].splitlines(keepends=True), 1):
@@ -106,7 +102,7 @@ def head_lines(data: bytes) -> list[Line]:
         if end == _HEAD < len(data) and not line.endswith((b"\n", b"\r")):
             break
         if line.strip():
-            lines.append(Line(number, end, line.decode("utf-8", "replace").strip("\r\n")))
+            lines.append(_Line(number, end, line.decode("utf-8", "replace").strip("\r\n")))
     return lines
 
 
@@ -138,21 +134,19 @@ def is_header(fields: Sequence[str]) -> bool:
     return len(words) > max(1, len(filled) // 2)
 
 
-def is_comment(line: str) -> bool:
-    """Whether a line is no row and, right above the rows, may be a header."""
-    return line.lstrip().startswith(_COMMENTS)
+def _is_comment(line: str) -> bool:
+    return line.lstrip().startswith(("#", "%", "//"))
 
 
-def _find_rows(where: str, lines: list[Line], delimiter: str | None, data: bytes) -> _Rows:
+def _find_rows(where: str, lines: list[_Line], delimiter: str | None, data: bytes) -> _Rows:
     """Find rows by each delimiter: that which makes most numbers is taken, blanks come last."""
     said = _SEPARATOR_LINE.fullmatch(lines[0].text) if lines else None
     asked = delimiter or (said[1] if said else None)
     tried = (asked,) if asked else tuple(DELIMITERS)
-    candidates = [rows for each in tried if each != " " and (rows := _rows_by(each, lines))]
-    if not candidates and " " in tried:
-        candidates = [rows for rows in (_rows_by(" ", lines),) if rows]
+    visible = [rows for each in tried if each != " " and (rows := _rows_by(each, lines))]
+    candidates = visible or [rows for rows in [" " in tried and _rows_by(" ", lines)] if rows]
     if not candidates:
-        shown = lines or [Line(1, 0, data[:_HEAD].decode("utf-8", "replace"))]
+        shown = lines or [_Line(1, 0, data[:_HEAD].decode("utf-8", "replace"))]
         raise InputError(
             f"{where}: expected two rows or more of three numbers or more, separated by "
             f"{' or '.join(DELIMITERS.get(each, repr(each)) for each in tried)}, got none in the "
@@ -162,7 +156,7 @@ def _find_rows(where: str, lines: list[Line], delimiter: str | None, data: bytes
     return max(candidates, key=lambda rows: rows.numbers)
 
 
-def _rows_by(delimiter: str, lines: list[Line]) -> _Rows | None:
+def _rows_by(delimiter: str, lines: list[_Line]) -> _Rows | None:
     start, width, numbers = 0, 0, 0
     for at, line in enumerate(lines):
         fields, count = _row(line.text, delimiter, at == 0)
@@ -179,7 +173,7 @@ def _rows_by(delimiter: str, lines: list[Line]) -> _Rows | None:
 
 def _row(text: str, delimiter: str, first: bool = False) -> tuple[Sequence[str], int]:
     """Fields of a line and how many of them are numbers; no fields of a line that is no row."""
-    if delimiter not in text or is_comment(text) or is_sentence(text):
+    if delimiter not in text or _is_comment(text) or is_sentence(text):
         return (), 0
     fields = split(text, delimiter)
     filled = [field for field in fields if field]
@@ -195,8 +189,8 @@ def _row(text: str, delimiter: str, first: bool = False) -> tuple[Sequence[str],
 
 
 def _header(
-    where: str, above: list[Line], row: Sequence[str], delimiter: str
-) -> tuple[tuple[str, ...], list[Line]]:
+    where: str, above: list[_Line], row: Sequence[str], delimiter: str
+) -> tuple[tuple[str, ...], list[_Line]]:
     """The names, and the lines they are from: the line next to the rows, or one as wide as they.
 
     A row of units, and a row of names that span columns, belong to it.
@@ -204,8 +198,8 @@ def _header(
     width = len(row)
     widths = [len(_fields(line.text, delimiter, width)) for line in above]
     for at in reversed(range(len(above))):
-        by_width = abs(widths[at] - width) <= (not is_comment(above[at].text))
-        nearest = at == len(above) - 1 and not is_comment(above[at].text)
+        by_width = abs(widths[at] - width) <= (not _is_comment(above[at].text))
+        nearest = at == len(above) - 1 and not _is_comment(above[at].text)
         if by_width or (nearest and widths[at] >= _LEAST):
             break
     else:
@@ -223,7 +217,7 @@ def _header(
 
 def _fields(text: str, delimiter: str, width: int) -> list[str]:
     """Names in a header; NumPy and others write it as a comment, and by a delimiter of its own."""
-    text = text.lstrip("#%/ ") if is_comment(text) else text
+    text = text.lstrip("#%/ ") if _is_comment(text) else text
     if delimiter in text and delimiter != " ":
         return split(text, delimiter)
     ways = [split(text, other) for other in (",", ";", "\t")]
@@ -273,7 +267,8 @@ def _decimal_point(where: str, head: str, delimiter: str) -> str:
     """A comma where numbers have one that cannot separate thousands."""
     if delimiter == "," or "," not in head:
         return "."
-    commas = _WITH_COMMA.findall(head)
+    field_start = rf'(?:^|[\n{re.escape(delimiter)}])\s*"?'
+    commas = re.findall(rf'{field_start}[+-]?(\d+),(\d+)(?=[eE\s"{re.escape(delimiter)}]|$)', head)
     if _WITH_BOTH.search(head):
         problem = "numbers with both commas and points"
     elif not commas:  # but in texts

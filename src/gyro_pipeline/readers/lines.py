@@ -12,13 +12,15 @@ import pyarrow as pa
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.logs import KEPT, Finding
-from gyro_pipeline.readers.table import IN_READER, Table, column
+from gyro_pipeline.readers.table import IN_READER, Table, columns_of
 
 _CHECKSUM = re.compile(r"\*[0-9A-Fa-f]{2}\s*$")
 _DATE, _CLOCK = r"\d{4}[-/.]\d\d[-/.]\d\d", r"\d{1,2}:\d\d(?::\d\d)?(?:[.,:]\d+)?"
 _TIME = rf"{_DATE}(?:[T ]{_CLOCK}(?:Z|[+-]\d\d:?\d\d)?)?|{_CLOCK}"
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_VALUE = re.compile(rf"(?<![\w.+:-])(?:(?P<time>{_TIME})|{_NUMBER})(?![\w.:])|(?<=:){_NUMBER}(?![\w.:])")
+_VALUE = re.compile(
+    rf"(?<![\w.+:-])(?:(?P<time>{_TIME})|{_NUMBER})(?![\w.:])|(?<=:){_NUMBER}(?![\w.:])"
+)
 _LABEL = re.compile(r"([A-Za-z]\w*)[\"']?\s*[:=]\s*$")
 _JSON = re.compile(r"\s*[\[{]\s*($|[\[{\"])")
 _LEAST, _MOST = 3, 100  # numbers in a line
@@ -56,20 +58,14 @@ def read_lines(where: str, data: bytes, expression: str) -> Table:
             f"{advice([line for _, line in filled[:200]])}"
         )
     numbers = [number for number, _ in matches]
-    cells = [column(pa.array([match[name] for _, match in matches], pa.string())) for name in names]
-    return Table(
-        where=where,
-        names=names,
-        columns=tuple(values for values, _ in cells),
-        preamble="\n".join(lines[: numbers[0] - 1]),
-        findings=_skipped(filled, set(numbers))
-        + tuple(
-            unreadable(name, rows, len(numbers), [f"row {r} (line {numbers[r]})" for r in rows[:3]])
-            for name, (_, rows) in zip(names, cells, strict=True)
-            if rows
-        ),
-        line_of=lambda: numbers,
-    )
+    arrays = [pa.array([match[name] for _, match in matches], pa.string()) for name in names]
+
+    def place(row: int) -> str:
+        return f"row {row} (line {numbers[row]})"
+
+    columns, unread, _ = columns_of(names, arrays, place, ".")
+    findings = _skipped(filled, {*numbers}) + unread
+    return Table(where, names, columns, "\n".join(lines[: numbers[0] - 1]), findings, place)
 
 
 def _skipped(filled: list[tuple[int, str]], rows: set[int]) -> tuple[Finding, ...]:
@@ -79,12 +75,6 @@ def _skipped(filled: list[tuple[int, str]], rows: set[int]) -> tuple[Finding, ..
     number, line = skipped[0]
     text = f"{len(skipped)} of {len(filled)} lines do not match `row` and were skipped, the first "
     return (Finding("row", KEPT, f"{text}is line {number}: {line[:60]!r}"),)
-
-
-def unreadable(name: str, rows: list[int], count: int, places: list[str]) -> Finding:
-    """Say which cells of a column of numbers are none."""
-    text = f"{len(rows)} of {count} cells of {name!r} cannot be read and are NaN: "
-    return Finding("unreadable cells", KEPT, text + ", ".join(places) + ", …" * (len(rows) > 3))  # noqa: PLR2004
 
 
 def advice(lines: Sequence[str]) -> str:

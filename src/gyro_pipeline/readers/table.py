@@ -14,14 +14,13 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.logs import Finding
+from gyro_pipeline.logs import KEPT, Finding
 from gyro_pipeline.parameters import ReaderOptions
 
 IN_READER = "in `reader:` of the catalog entry in catalog.yml"
 
 _NUMBER = r"^[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|(?i:inf|infinity))$"
 _THOUSANDS = r"^[+-]?\d{1,3}([,' .]\d{3})+([.,]\d+)?$"
-_NAN = r"^[+-]?(?i:nan)$"
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ class Table:
             stored arrays are as long as their arrays, which can differ.
         preamble: Lines above the header.
         findings: Of the reading.
-        line_of: The line, from 1, of each row of a text; None of a stored table.
+        place: Where a row is, for messages: ``row 5 (line 12)``, the row from 0.
         hint: What may be wrong with the names, for messages that show them.
     """
 
@@ -46,12 +45,8 @@ class Table:
     columns: tuple[NDArray[Any], ...]
     preamble: str = ""
     findings: tuple[Finding, ...] = ()
-    line_of: Callable[[], Sequence[int]] | None = None
+    place: Callable[[int], str] = "row {}".format
     hint: str = ""
-
-    def place(self, row: int) -> str:
-        """Where a row is, for messages: ``row 5 (line 12)``, the row from 0."""
-        return f"row {row}" + (f" (line {self.line_of()[row]})" if self.line_of else "")
 
     def listed(self) -> str:
         """The names for a message, the first thirty, and what may be wrong with them."""
@@ -73,9 +68,7 @@ class Table:
         if values.dtype != object:
             raise InputError(f"{self.where}: expected numbers in {name}, got {values.dtype}")
         texts = pa.array(values, pa.string())
-        bad = np.flatnonzero(np.isnan(numbers(texts)) & ~texts.is_null().to_numpy(zero_copy_only=False))
-        if not len(bad):
-            raise InputError(f"{self.where}: expected numbers in {name}, got empty cells only")
+        bad = np.flatnonzero(np.isnan(numbers(texts)) & (values != None))  # noqa: E711
         thousands = pc.any(pc.match_substring_regex(texts, _THOUSANDS)).as_py()
         raise InputError(
             f"{self.where}: expected numbers{' without thousands separators' * bool(thousands)} in "
@@ -96,34 +89,51 @@ def numbers(texts: Any, decimal_point: str = ".") -> NDArray[np.float64]:
     if decimal_point != ".":
         points = pc.replace_substring(pc.replace_substring(texts, ".", "?"), decimal_point, ".")
     good = pc.match_substring_regex(points, _NUMBER)
-    return np.asarray(pc.if_else(good, points, None).cast(pa.float64()).to_numpy(zero_copy_only=False))
+    return np.asarray(
+        pc.if_else(good, points, None).cast(pa.float64()).to_numpy(zero_copy_only=False)
+    )
 
 
-def column(values: Any, decimal_point: str = ".") -> tuple[NDArray[Any], list[int]]:
+def column(values: Any, decimal_point: str = ".") -> tuple[NDArray[Any], dict[int, str]]:
     """Arrow's values as a column of a table.
 
-    Texts of which all but a few are numbers are numbers: but one in a hundred, or three.
+    Texts of which all but a few are numbers are numbers.
 
     Returns:
-        The column, and the rows of texts in a column of numbers, which are NaN.
+        The column, and the texts in a column of numbers, by row, which are NaN in it.
     """
-    if not (pa.types.is_string(values.type) or pa.types.is_large_string(values.type)):
-        return _typed(values), []
+    if not pa.types.is_string(values.type):
+        return _typed(values), {}
     texts = pc.utf8_trim_whitespace(values)
     texts = pc.if_else(pc.equal(texts, ""), None, texts)
-    found = numbers(texts, decimal_point)
-    filled = ~texts.is_null().to_numpy(zero_copy_only=False)
-    unread = filled & np.isnan(found)
-    if unread.any():
-        unread &= ~pc.fill_null(pc.match_substring_regex(texts, _NAN), False).to_numpy(zero_copy_only=False)
-    share = unread.sum() / max(filled.sum(), 1)
-    if not unread.any() or (share < 1 / 2 and few(int(unread.sum()), len(filled))):
-        return found, np.flatnonzero(unread).tolist()
-    return np.array(texts.to_pylist(), object), []
+    result = numbers(texts, decimal_point)
+    filled = texts.is_valid().to_numpy(zero_copy_only=False)
+    bad = np.flatnonzero(filled & np.isnan(result))
+    shown = zip(bad.tolist(), texts.take(pa.array(bad)).to_pylist(), strict=True)
+    unread = {row: text for row, text in shown if text.lower().lstrip("+-") != "nan"}
+    if not few(len(unread), len(result)) or (unread and 2 * len(unread) >= filled.sum()):
+        return np.array(texts.to_pylist(), object), {}
+    return result, unread
+
+
+def columns_of(
+    names: Sequence[str], arrays: Sequence[Any], place: Callable[[int], str], decimal_point: str
+) -> tuple[tuple[NDArray[Any], ...], tuple[Finding, ...], set[int]]:
+    """Columns of a text, what is unreadable in those of numbers, and in which rows."""
+    cells = [column(values, decimal_point) for values in arrays]
+    findings = []
+    for number, (name, (values, unread)) in enumerate(zip(names, cells, strict=True)):
+        if unread:
+            first = [f"{text[:40]!r} in {place(row)}" for row, text in [*unread.items()][:3]]
+            text = f"{len(unread)} of {len(values)} cells of {name or f'column {number}'!r} are no "
+            text += f"numbers and are NaN: {', '.join(first)}{', …' * (len(unread) > len(first))}"
+            findings.append(Finding("unreadable cells", KEPT, text))
+    rows = {row for _, unread in cells for row in unread}
+    return tuple(values for values, _ in cells), tuple(findings), rows
 
 
 def few(bad: int, rows: int) -> bool:
-    """Whether so few of the rows are damaged that the others can be trusted."""
+    """Whether so few rows are damaged, one in a hundred or three, that the others are trusted."""
     return bad <= max(3, 0.01 * rows)
 
 
@@ -141,6 +151,7 @@ def _typed(values: Any) -> NDArray[Any]:
     return np.array([None if value is None else str(value) for value in values.to_pylist()], object)
 
 
+_PAGE = "a web page; download the file itself (on GitHub: `Download raw file`)"
 _ADVICE = {
     b"BZh": "a bzip2 archive; unpack it",
     b"\xfd7zXZ": "an xz archive; unpack it",
@@ -150,8 +161,8 @@ _ADVICE = {
     b"\x1f\x8b": "a gzip archive; unpack it with gunzip",
     b"\xd0\xcf\x11\xe0": "an Excel workbook (.xls), whatever its name; save it as CSV",
     b"%PDF": "a PDF document; export the recording as CSV",
-    b"<!DOCTYPE": "a web page; download the file itself (on GitHub: `Download raw file`)",
-    b"<html": "a web page; download the file itself (on GitHub: `Download raw file`)",
+    b"<!DOCTYPE": _PAGE,
+    b"<html": _PAGE,
     b"version https://git-lfs": "a git LFS pointer to a file; fetch the file by `git lfs pull`",
 }
 _R = "data of R; save its table in R by `write.csv(TABLE, 'log.csv', row.names = FALSE)`"
@@ -167,19 +178,13 @@ def read_table(path: Path, options: ReaderOptions) -> Table:
         InputError: It cannot be read, is damaged or empty, is no table, or is of a kind that is
             not read; says what to do.
     """
-    # imported here: they make tables, and vehicles' libraries are optional
-    from gyro_pipeline.readers import stored, text  # noqa: PLC0415
+    from gyro_pipeline.readers import stored, text  # noqa: PLC0415 - they make tables
 
-    try:
-        if path.is_dir() and (path / "metadata.yaml").exists():
-            return _of_vehicle(path, options)
-        with path.open("rb") as file:
-            head = file.read(_USER_BLOCK + len(_HDF5))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    _refuse(path, head)
-    if head.startswith(_VEHICLES):
-        return _of_vehicle(path, options)
+    head = _head(path)
+    if head is None or head.startswith(_VEHICLES):
+        from gyro_pipeline.readers import vehicles  # noqa: PLC0415 - its libraries are optional
+
+        return vehicles.read(path, options)
     for recognised, read in (
         (head.startswith(b"PAR1"), stored.read_parquet),
         (head.startswith(b"\x93NUMPY"), stored.read_npy),
@@ -192,13 +197,15 @@ def read_table(path: Path, options: ReaderOptions) -> Table:
     return text.read_text(path, options)
 
 
-def _of_vehicle(path: Path, options: ReaderOptions) -> Table:
-    from gyro_pipeline.readers import vehicles  # noqa: PLC0415
-
-    return vehicles.read(path, options)
-
-
-def _refuse(path: Path, head: bytes) -> None:
+def _head(path: Path) -> bytes | None:
+    """The first bytes of a file; None of the folder of a ROS 2 bag."""
+    try:
+        if (path / "metadata.yaml").exists():
+            return None
+        with path.open("rb") as file:
+            head = file.read(_USER_BLOCK + len(_HDF5))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     if not head:
         raise InputError(f"{path}: expected a recording, got an empty file; copy it anew")
     if path.suffix.lower() in (".rda", ".rdata", ".rds") or head.startswith((b"RDX", b"RDA")):
@@ -206,3 +213,4 @@ def _refuse(path: Path, head: bytes) -> None:
     for magic, advice in _ADVICE.items():
         if head.startswith(magic):
             raise InputError(f"{path}: expected a recording, got {advice}")
+    return head

@@ -1,23 +1,21 @@
 """Delimited text as a table: Arrow parses it, once; only damaged rows are looked at again."""
 
 import re
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv
-from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.logs import KEPT, REPAIRED, Finding
 from gyro_pipeline.parameters import ReaderOptions
 from gyro_pipeline.readers.layout import DELIMITERS, Layout, is_header, layout_of, split
-from gyro_pipeline.readers.lines import advice, read_lines, unreadable
-from gyro_pipeline.readers.table import IN_READER, Table, column, few
+from gyro_pipeline.readers.lines import advice, read_lines
+from gyro_pipeline.readers.table import IN_READER, Table, columns_of, few
 
 _HEAD, _ZEROS = 1 << 14, 0.1  # bytes in which a larger share of zeros is none of a text
 _UTF16, _UTF8 = (b"\xff\xfe", b"\xfe\xff"), b"\xef\xbb\xbf"
@@ -37,23 +35,13 @@ def read_text(path: Path, options: ReaderOptions) -> Table:
         return read_lines(where, data, options.row)
     layout = layout_of(where, data, options.delimiter)
     body, findings = _body(data, layout)
-    rows = _parse(where, body, layout)
-    cells = [column(values, layout.decimal_point) for values in rows.columns]
-    bad = {*rows.odd, *(row for _, unread in cells for row in unread)}
-    _refuse_second_header(where, rows, bad, layout)
-    findings += _odd_rows(where, rows, layout)
-    findings += tuple(
-        unreadable(
-            layout.names[number] or f"column {number}",
-            unread,
-            rows.count,
-            [f"row {row} (line {rows.line_of()[row]})" for row in unread[:3]],
-        )
-        for number, (_, unread) in enumerate(cells)
-        if unread
-    )
-    columns = tuple(values for values, _ in cells)
-    return Table(where, layout.names, columns, layout.preamble, findings, rows.line_of, hint)
+    rows = _Rows(where, body, layout)
+    arrays, odd = _parse(body, layout)
+    rows.refuse_quotes_over_lines(len(arrays[0]))
+    columns, unread, damaged = columns_of(layout.names, arrays, rows.place, layout.decimal_point)
+    rows.refuse_second_header(damaged | {*odd})
+    findings += rows.check_odd(odd, len(arrays[0])) + unread
+    return Table(where, layout.names, columns, layout.preamble, findings, rows.place, hint)
 
 
 def _decoded(path: Path, encoding: str | None) -> tuple[bytes, str]:
@@ -117,34 +105,73 @@ def _body(data: bytes, layout: Layout) -> tuple[memoryview, tuple[Finding, ...]]
 
 
 @dataclass(frozen=True)
-class _Parsed:
-    columns: list[Any]  # Arrow's values, null in odd rows
-    count: int  # rows
-    odd: dict[int, str]  # what is wrong with rows of another number of fields
-    lines: Callable[[], list[tuple[int, str]]]  # number and text of the line of each row
+class _Rows:
+    """The rows as lines, which are looked at only where some are damaged."""
 
-    def line_of(self) -> Sequence[int]:
-        return [number for number, _ in self.lines()]
+    where: str
+    body: memoryview
+    layout: Layout
 
-    def shown(self, rows: Sequence[int]) -> str:
-        first = [f"row {row} (line {self.line_of()[row]}): {self.odd[row]}" for row in rows[:3]]
-        return "; ".join(first) + ("; …" if len(rows) > len(first) else "")
+    @cached_property
+    def lines(self) -> list[tuple[int, str]]:
+        """Number in the file and text of the line of each row."""
+        text = bytes(self.body).decode().replace("\r\n", "\n").replace("\r", "\n")
+        numbered = enumerate(text.split("\n"), self.layout.line)
+        return [(number, line) for number, line in numbered if line.strip()]
+
+    def place(self, row: int) -> str:
+        return f"row {row} (line {self.lines[row][0]})"
+
+    def refuse_quotes_over_lines(self, count: int) -> None:
+        if self.layout.quoted and count != len(self.lines):
+            raise InputError(
+                f"{self.where}: expected a row on each line, got {count} rows on {len(self.lines)} "
+                "lines: a quoted field does not end on its line; correct it"
+            )
+
+    def refuse_second_header(self, damaged: set[int]) -> None:
+        for row in sorted(damaged)[:100]:
+            text = self.lines[row][1]
+            if is_header(split(text, self.layout.delimiter)):
+                raise InputError(
+                    f"{self.where}: expected numbers, got a second header in {self.place(row)}, "
+                    f"{text[:80]!r}: two recordings in one file? Split it"
+                )
+
+    def check_odd(self, odd: dict[int, str], count: int) -> tuple[Finding, ...]:
+        """Say which rows have another number of fields, or refuse so many."""
+        shown = "; ".join(f"{self.place(row)}: {text}" for row, text in [*odd.items()][:3])
+        if count - len(odd) < 2 or not few(len(odd), count):  # noqa: PLR2004
+            name = DELIMITERS.get(self.layout.delimiter, repr(self.layout.delimiter))
+            raise InputError(
+                f"{self.where}: expected rows of {len(self.layout.names)} columns, separated by "
+                f"{name}, got {len(odd)} of {count} that are not: {shown}; correct or export the "
+                "file anew, or, if other lines stand between the rows, "
+                f"{advice([text for _, text in self.lines[:200]])}"
+            )
+        text = f"{len(odd)} of {count} rows cannot be read and are NaN: {shown}"
+        return (Finding("unreadable rows", REPAIRED, text),) if odd else ()
 
 
-def _parse(where: str, body: memoryview, layout: Layout) -> _Parsed:
+def _parse(body: memoryview, layout: Layout) -> tuple[list[Any], dict[int, str]]:
+    """Let Arrow parse, and tell numbers from texts.
+
+    Returns:
+        Arrow's columns, and what is wrong with rows of another number of fields, by row, which are
+        null in them.
+    """
     skipped: list[Any] = []
 
     def skip(row: Any) -> str:
         skipped.append(row)
         return "skip"
 
-    numbers = [str(number) for number in range(len(layout.names))]
     table = pyarrow.csv.read_csv(
         pa.BufferReader(pa.py_buffer(body)),
         pyarrow.csv.ReadOptions(
             use_threads=False,
             block_size=min(len(body) + 1, 2**31 - 1),  # so that no line is too long
-            column_names=numbers,
+            column_names=[str(number) for number in range(len(layout.names))],
         ),
         pyarrow.csv.ParseOptions(
             delimiter=layout.delimiter,
@@ -160,65 +187,20 @@ def _parse(where: str, body: memoryview, layout: Layout) -> _Parsed:
             decimal_point=layout.decimal_point,
         ),
     )
-
-    @cache
-    def lines() -> list[tuple[int, str]]:
-        texts = bytes(body).splitlines()
-        return [
-            (number, line.decode("utf-8", "replace"))
-            for number, line in enumerate(texts, layout.line)
-            if line.strip()
-        ]
-
-    blank = [row.number - 1 for row in skipped if not row.text.strip()]
-    odd = {
-        row.number - 1 - int(np.searchsorted(blank, row.number)): (
-            f"expected {row.expected_columns} fields, got {row.actual_columns}"
-        )
-        for row in skipped
-        if row.text.strip()
-    }
-    count = table.num_rows + len(odd)
-    if layout.quoted and count != len(lines()):
-        raise InputError(
-            f"{where}: expected a row on each line, got {count} rows on {len(lines())} lines: a "
-            "quoted field does not end on its line; correct it"
-        )
-    columns = table.columns
-    if odd:
-        taken = np.insert(
-            np.arange(table.num_rows, dtype=float),
-            np.array(list(odd)) - np.arange(len(odd)),
-            np.nan,
-        )
-        places = pa.array(taken, pa.int64(), from_pandas=True)
-        columns = [values.take(places) for values in columns]
-    return _Parsed(columns, count, odd, lines)
+    return _with_odd_rows(table, skipped)
 
 
-def _refuse_second_header(where: str, rows: _Parsed, bad: set[int], layout: Layout) -> None:
-    for row in sorted(bad)[:100]:
-        line, text = rows.lines()[row]
-        if is_header(split(text, layout.delimiter)):
-            raise InputError(
-                f"{where} line {line} (row {row}): expected numbers, got a second header, "
-                f"{text[:80]!r}: two recordings in one file? Split it"
-            )
-
-
-def _odd_rows(where: str, rows: _Parsed, layout: Layout) -> tuple[Finding, ...]:
-    """Say which rows have another number of fields, or refuse so many."""
-    odd = sorted(rows.odd)
-    good = rows.count - len(odd)
-    if good < 2 or not few(len(odd), rows.count):  # noqa: PLR2004
-        texts = [text for _, text in rows.lines()[:200]]
-        raise InputError(
-            f"{where}: expected rows of {len(layout.names)} columns, "
-            f"{DELIMITERS.get(layout.delimiter, repr(layout.delimiter))}-separated, got {len(odd)} "
-            f"of {rows.count} that are not: {rows.shown(odd)}; correct or export the file anew, or, "
-            f"if other lines stand between the rows, {advice(texts)}"
-        )
+def _with_odd_rows(table: Any, skipped: list[Any]) -> tuple[list[Any], dict[int, str]]:
+    odd: dict[int, str] = {}
+    blank = 0  # lines of blanks are no rows
+    for row in skipped:
+        if row.text.strip():
+            text = f"expected {row.expected_columns} fields, got {row.actual_columns}"
+            odd[row.number - 1 - blank] = text
+        else:
+            blank += 1
     if not odd:
-        return ()
-    text = f"{len(odd)} of {rows.count} rows cannot be read and are NaN: {rows.shown(odd)}"
-    return (Finding("unreadable rows", REPAIRED, text),)
+        return table.columns, {}
+    taken = np.arange(table.num_rows + 0.0)
+    taken = np.insert(taken, np.array([*odd]) - np.arange(len(odd)), np.nan)
+    return table.take(pa.array(taken, pa.int64(), from_pandas=True)).columns, odd
