@@ -19,7 +19,7 @@ from gyro_pipeline.parameters import ReaderOptions
 
 IN_READER = "in `reader:` of the catalog entry in catalog.yml"
 
-_NUMBER = r"^[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|(?i:inf|infinity))$"
+_NUMBER = r"^[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|(?i:inf|infinity|nan))$"
 _THOUSANDS = r"^[+-]?\d{1,3}([,' .]\d{3})+([.,]\d+)?$"
 
 
@@ -68,7 +68,8 @@ class Table:
         if values.dtype != object:
             raise InputError(f"{self.where}: expected numbers in {name}, got {values.dtype}")
         texts = pa.array(values, pa.string())
-        bad = np.flatnonzero(np.isnan(numbers(texts)) & (values != None))  # noqa: E711
+        bad = np.flatnonzero(numbers(texts)[1])  # none: points where commas are decimal
+        bad = bad if len(bad) else np.flatnonzero(texts.is_valid())
         thousands = pc.any(pc.match_substring_regex(texts, _THOUSANDS)).as_py()
         raise InputError(
             f"{self.where}: expected numbers{' without thousands separators' * bool(thousands)} in "
@@ -78,20 +79,22 @@ class Table:
         )
 
 
-def numbers(texts: Any, decimal_point: str = ".") -> NDArray[np.float64]:
-    """Texts without outer blanks as numbers; NaN of what is none, also of numbers with separators.
+def numbers(texts: Any, decimal_point: str = ".") -> tuple[NDArray[np.float64], NDArray[np.bool]]:
+    """Texts without outer blanks as numbers; none of those with separators of thousands.
 
     Args:
         texts: Arrow strings, (n,).
         decimal_point: A point or a comma; where it is a comma, a point is no part of a number.
+
+    Returns:
+        The numbers, (n,), NaN for what is none; and which texts are none, (n,).
     """
     points = texts
     if decimal_point != ".":
         points = pc.replace_substring(pc.replace_substring(texts, ".", "?"), decimal_point, ".")
     good = pc.match_substring_regex(points, _NUMBER)
-    return np.asarray(
-        pc.if_else(good, points, None).cast(pa.float64()).to_numpy(zero_copy_only=False)
-    )
+    values = pc.if_else(good, points, None).cast(pa.float64()).to_numpy(zero_copy_only=False)
+    return values, ~pc.fill_null(good, True).to_numpy(zero_copy_only=False)
 
 
 def column(values: Any, decimal_point: str = ".") -> tuple[NDArray[Any], dict[int, str]]:
@@ -106,14 +109,13 @@ def column(values: Any, decimal_point: str = ".") -> tuple[NDArray[Any], dict[in
         return _typed(values), {}
     texts = pc.utf8_trim_whitespace(values)
     texts = pc.if_else(pc.equal(texts, ""), None, texts)
-    result = numbers(texts, decimal_point)
-    filled = texts.is_valid().to_numpy(zero_copy_only=False)
-    bad = np.flatnonzero(filled & np.isnan(result))
-    shown = zip(bad.tolist(), texts.take(pa.array(bad)).to_pylist(), strict=True)
-    unread = {row: text for row, text in shown if text.lower().lstrip("+-") != "nan"}
-    if not few(len(unread), len(result)) or (unread and 2 * len(unread) >= filled.sum()):
-        return np.array(texts.to_pylist(), object), {}
-    return result, unread
+    result, unread = numbers(texts, decimal_point)
+    rows = np.flatnonzero(unread)
+    if len(rows) and (
+        2 * len(rows) >= len(texts) - texts.null_count or not few(len(rows), len(texts))
+    ):
+        return texts.to_numpy(zero_copy_only=False), {}
+    return result, dict(zip(rows.tolist(), texts.take(pa.array(rows)).to_pylist(), strict=True))
 
 
 def columns_of(
