@@ -19,6 +19,8 @@ LINES = {  # how a line is written, and the groups that the expression has
     "JSON lines": ('{{"t": {t}, "gx": {x}, "gy": {y}, "gz": {z}}}', "t gx gy gz"),
     "JSON lines of arrays": ('{{"t":{t},"gyro":[{x},{y},{z}],"ok":true}}', "t v2 v3 v4"),
     "an unlucky quote": ("it's {x} | {y} | {z} deg/s", "v1 v2 v3"),
+    "labels that are there again": ("t: {t} t: {t} t: {t} | {x} {y} {z}", "t t_ t__ v4 v5 v6"),
+    "milliseconds after a comma": ("12:00:00,{k:03} | {x},{y},{z}", "t v2 v3 v4"),
     "ESP32": ("I ({k}) imu: {x} {y} {z}", "v1 imu v3 v4"),
 }
 BOOT = ["ets Jun  8 2016 00:22:57", "rst:0x1 (POWERON_RESET)", "", "I2C ok"]

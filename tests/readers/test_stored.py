@@ -129,7 +129,7 @@ def test_units_in_attributes_of_hdf5_are_in_the_name(value, rates, table):
             file["gyro"] = rates
             file["gyro"].attrs["Units"] = value
 
-    assert table(save, name="log.h5").names[0] == "gyro [rad/s].x"
+    assert table(save, name="log.h5").names[0] == "gyro.x [rad/s]"
 
 
 def zipped(*names):

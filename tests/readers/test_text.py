@@ -291,6 +291,8 @@ def test_names_that_are_not_utf_8_come_with_the_option(table):
     assert "not UTF-8: if names look odd, give `encoding`" in table(text.encode("gbk")).listed()
     assert table(text.encode("gbk"), encoding="gbk").names[1] == "角速度x"
     assert "encoding" not in table(text).listed()
+    with pytest.raises(InputError, match="as the rows, 4, got 5.*not UTF-8.*give `encoding`"):
+        table(f"号,{text}".encode("gbk"))
     with pytest.raises(InputError, match="`encoding` in `reader:`.*unknown encoding: gkb"):
         table(text, encoding="gkb")
 

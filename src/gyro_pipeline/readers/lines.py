@@ -15,7 +15,7 @@ from gyro_pipeline.logs import KEPT, Finding
 from gyro_pipeline.readers.table import IN_READER, Table, columns_of
 
 _CHECKSUM = re.compile(r"\*[0-9A-Fa-f]{2}\s*$")
-_DATE, _CLOCK = r"\d{4}[-/.]\d\d[-/.]\d\d", r"\d{1,2}:\d\d(?::\d\d)?(?:[.,:]\d+)?"
+_DATE, _CLOCK = r"\d{4}[-/.]\d\d[-/.]\d\d", r"\d{1,2}:\d\d(?::\d\d)?(?:[.:]\d+|,\d{3})?"
 _TIME = rf"{_DATE}(?:[T ]{_CLOCK}(?:Z|[+-]\d\d:?\d\d)?)?|{_CLOCK}"
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _VALUE = re.compile(
@@ -105,10 +105,13 @@ def expression_of(line: str) -> str | None:
         between = line[end : value.start()]
         label = _LABEL.search(between)
         name = "t" if value["time"] else label[1] if label else f"v{len(names) + 1}"
-        names.append(name + "_" * names.count(name))
-        cell = r"[-+:.,/TZ \d]+" if value["time"] else r"[-+.eE\d]+"
+        while name in names:
+            name += "_"
+        names.append(name)
+        signs = "".join(sign for sign in ",/TZ " if sign in value[0]) if value["time"] else "eE"
+        cell = rf"[-+.{':' if value['time'] else ''}{signs}\d]+"
         blanks = r"\s+" if between and not between.strip() else r"\s*"
-        expression += f"{_literal(between.rstrip())}{blanks}(?P<{names[-1]}>{cell})"
+        expression += f"{_literal(between.rstrip())}{blanks}(?P<{name}>{cell})"
         end = value.end()
     if not _LEAST <= len(names) <= _MOST:
         return None

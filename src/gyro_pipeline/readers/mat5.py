@@ -34,11 +34,11 @@ def check(data: bytes) -> None:
     if order is None:
         raise ValueError("its header says no byte order")
     for kind, inner in _elements(memoryview(data)[_HEADER:], order):
-        whole = [(kind, inner)]
+        elements = [(kind, inner)]
         if kind == _COMPRESSED:
-            whole = list(_elements(memoryview(zlib.decompress(inner)), order))
-        for held, array in whole:
-            if held == _ARRAY:
+            elements = list(_elements(memoryview(zlib.decompress(inner)), order))
+        for element_type, array in elements:
+            if element_type == _ARRAY:
                 _check_array(array, order, 1)
 
 

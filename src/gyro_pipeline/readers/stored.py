@@ -163,7 +163,8 @@ def _arrays_in(stored: Any, name: str) -> Iterator[tuple[str, NDArray[Any]]]:
 
 
 def _inside(name: str, label: str) -> str:
-    return f"{name}.{label}" if name else label
+    stem, bracket, unit = name.partition(" [")
+    return f"{stem}.{label}{bracket}{unit}" if name else label
 
 
 def _with_unit(name: str, attributes: Mapping[Any, Any]) -> str:

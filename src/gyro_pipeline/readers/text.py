@@ -1,7 +1,7 @@
 """Delimited text as a table: Arrow parses it, once; only damaged rows are looked at again."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -29,11 +29,17 @@ def read_text(path: Path, options: ReaderOptions) -> Table:
     Raises:
         InputError: It is not a text, or not one of rows that are told apart safely.
     """
-    where = str(path)
     data, hint = _decoded(path, options.encoding)
-    if options.row is not None:
-        return read_lines(where, data, options.row)
-    layout = layout_of(where, data, options.delimiter)
+    try:
+        if options.row is not None:
+            return read_lines(str(path), data, options.row)
+        return replace(_read_rows(str(path), data, options.delimiter), hint=hint)
+    except InputError as error:
+        raise InputError(f"{error}{hint and f'; {hint}'}") from error
+
+
+def _read_rows(where: str, data: bytes, delimiter: str | None) -> Table:
+    layout = layout_of(where, data, delimiter)
     body, findings = _body(data, layout)
     rows = _Rows(where, body, layout)
     arrays, odd = _parse(body, layout)
@@ -41,7 +47,7 @@ def read_text(path: Path, options: ReaderOptions) -> Table:
     columns, unread, damaged = columns_of(layout.names, arrays, rows.place, layout.decimal_point)
     rows.refuse_second_header(damaged | {*odd})
     findings += rows.check_odd(odd, len(arrays[0])) + unread
-    return Table(where, layout.names, columns, layout.preamble, findings, rows.place, hint)
+    return Table(where, layout.names, columns, layout.preamble, findings, rows.place)
 
 
 def _decoded(path: Path, encoding: str | None) -> tuple[bytes, str]:
