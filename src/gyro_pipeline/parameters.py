@@ -105,7 +105,8 @@ class ReaderOptions(Parameter):
     """
 
     format: str = Field(
-        "auto", description="name in gyro_pipeline.readers.FORMATS; general: none of them; auto: told"
+        "auto",
+        description="name in gyro_pipeline.readers.FORMATS; general: none of them; auto: told",
     )
     trust: Literal["options"] | None = Field(
         None, description="options: these options overrule what the file says of itself"

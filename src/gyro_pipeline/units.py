@@ -59,9 +59,9 @@ class Unit(NamedTuple):
 @lru_cache(1)
 def _registry() -> tuple[Any, dict[Any, str]]:
     """The registry, and what quantity each dimensionality is of."""
-    import pint  # a quarter of a second, which few commands need
+    import pint  # noqa: PLC0415  # a quarter of a second, which few commands need
 
-    units = pint.UnitRegistry(None, on_redefinition="ignore")
+    units: Any = pint.UnitRegistry(None, on_redefinition="ignore")
     units.load_definitions(str(files("pint") / "default_en.txt"))
     for definition in _DEFINITIONS.strip().splitlines():
         units.define(definition)
@@ -82,7 +82,9 @@ def read_unit(text: str) -> Unit | None:
     expression = _spelled_for_pint(text)
     written, small = _parsed(expression), _parsed(expression.lower())
     # DPS, Deg/Sec, °/S; as written where that says something, for mG is not mg
-    unclear = written is None or (written.quantity == "other" and small and small.quantity == "rate")
+    unclear = written is None or (
+        written.quantity == "other" and small and small.quantity == "rate"
+    )
     return small if unclear else written
 
 

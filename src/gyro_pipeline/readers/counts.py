@@ -1,7 +1,7 @@
 """Values that no gyroscope at rest gives, told from the file's own numbers, with the evidence.
 
-Each function takes values (n, 3), NaN where there are none, and returns a text for a message, empty
-where nothing is wrong.
+A recording's values are samples of one device. Each check takes values (n, 3), NaN where there are
+none, and returns a text for a message, empty where nothing is wrong.
 """
 
 from collections.abc import Sequence
@@ -73,8 +73,8 @@ def lost_decimal_points(values: Floats, digits: tuple[int, int] = (6, 9), most: 
     if not _whole(values) or many.mean() < most:
         return ""
     return (
-        f"whole numbers of {digits[0]} to {digits[1]} digits, such as {values[0, 0]:.0f}: the decimal "
-        "points are lost; export the recording again"
+        f"whole numbers of {digits[0]} to {digits[1]} digits, such as {values[0, 0]:.0f}: the "
+        "decimal points are lost; export the recording again"
     )
 
 
@@ -89,5 +89,5 @@ def implausible_level(rates: Floats, most_dps: float = 100.0, trimmed: float = 0
         return ""
     return (
         f"a mean of {means[axis]:.4g} deg/s about {AXES[axis]}, and no MEMS gyroscope at rest has "
-        f"more than {most_dps:g}; check units and scale_dps, or give offset, the count of a rate of 0"
+        f"more than {most_dps:g}; check units and scale_dps, or give offset, the count at rest"
     )

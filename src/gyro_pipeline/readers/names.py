@@ -2,22 +2,27 @@
 
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from gyro_pipeline.conventions import AXES
+from gyro_pipeline.conventions import AXES, InputError
+from gyro_pipeline.logs import KEPT, Finding
+from gyro_pipeline.parameters import Column, ReaderOptions
+from gyro_pipeline.readers.formats import Format
+from gyro_pipeline.readers.table import IN_READER, Table
 from gyro_pipeline.units import Unit, read_unit
 
 RATE, ATTITUDE, OTHER = "rate", "attitude", "other"
 
 _QUANTITIES = {
-    OTHER: r"acc\w*|lin|linear|user|grav\w*|mag|magn\w*|compass|quat\w*|orientation|force|torque|pos"
-    r"|position|dq|dv|velinc|oriinc|bias|offset|cov|covariance|std|var\w*|sigma|err|error|min|max",
+    OTHER: r"acc\w*|lin|linear|user|grav\w*|mag|magn\w*|compass|quat\w*|orientation|force|torque"
+    r"|pos|position|dq|dv|velinc|oriinc|bias|offset|cov\w*|std|var\w*|sigma|err|error|min|max",
     RATE: r"gyr\w*|gy|omega\w*|angular\w*|angl?vel\w*|rates?",
     ATTITUDE: r"roll|pitch|yaw|heading|euler|phi|theta|psi|alpha|beta|gamma|angles?|attitude"
     r"|vel|velocity|speed",
 }
 """Words of each quantity; of two in a name, the first decides: ``gyro_bias_x``, ``roll_rate``."""
-_LETTERS = {OTHER: "a|ac|m|q|f|v", RATE: "g|w", ATTITUDE: "p"}
+_LETTERS = {OTHER: "a|ac|m|q|f|v", RATE: "g|w"}
 """The same of the letters that stand before an axis, in names without any such word: ``gx``."""
 
 _BRACKETS = re.compile(r"\s*[(\[]((?:[^()\[\]]|[(\[][^()\[\]]*[)\]])*)[)\]]")
@@ -39,18 +44,25 @@ class Header(NamedTuple):
 
     @property
     def quantity(self) -> str:
-        """``rate``, ``attitude``, ``other``, or an empty text, by the words of the name."""
+        """``rate``, ``attitude``, ``other``, or an empty text, by the words of the name.
+
+        An angle or a velocity in a unit of angular rate is named by half: an empty text.
+        """
         words = [w.lower() for w in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", self.name)]
         stems = {*words, *(w[:-1] for w in words if w[-1] in AXES)}
         stems |= {w[1:] for w in words if w[0] in AXES}
         for vocabulary in (_QUANTITIES, _LETTERS):
             for quantity, pattern in vocabulary.items():
                 if any(re.fullmatch(pattern, stem) for stem in stems):
-                    return quantity
+                    return "" if quantity == ATTITUDE and self.measures("rate") else quantity
         return ""
 
+    def measures(self, *quantities: str) -> bool:
+        """Whether its unit is of one of these quantities."""
+        return self.unit is not None and self.unit.quantity in quantities
+
     @property
-    def says_another_unit(self) -> bool:
+    def has_unit(self) -> bool:
         """Whether it has a unit, if an unknown one, rather than a remark in brackets."""
         return self.unit is not None or bool(re.search(r"[/^√*\d]", self.said))
 
@@ -73,8 +85,8 @@ def read_header(header: str) -> Header:
         if unit and _stands_without_brackets(unit, text[end:], alone=end == 0):
             return Header(text[:start] + array, text[end:], unit)
     leading = re.match(r"[a-z]{5,}(?=_)", text)  # seconds_elapsed
-    if leading and (unit := read_unit(leading[0])) and unit.quantity == "time":
-        return Header(header, leading[0], unit)
+    if leading and (first := Header(header, leading[0], read_unit(leading[0]))).measures("time"):
+        return first
     return Header(header, "", None)
 
 
@@ -106,14 +118,13 @@ def triples(headers: Sequence[Header]) -> list[tuple[int, ...]]:
 
 def _axes_in(name: str) -> Iterator[tuple[str, str]]:
     """Each way in which a name names an axis: the name without it, and the axis."""
-    for match in re.finditer("[xyz]", name.lower()):
-        yield f"{name[: match.start()]}*{name[match.end() :]}", match[0]
-    for match in re.finditer("alpha|beta|gamma", name.lower()):
-        yield f"{name[: match.start()]}**{name[match.end() :]}", _BROWSER[match[0]]
-    if match := _INDEX.search(name):
-        number = int(match[1])
-        axis = AXES[number] if number < len(AXES) else match[1]
-        yield f"{name[: match.start()]}[*]", axis
+    for match in re.finditer("[xyz]|alpha|beta|gamma", name.lower()):
+        star = "*" * min(len(match[0]), 2)  # of one kind or the other
+        axis = _BROWSER.get(match[0], match[0])
+        yield f"{name[: match.start()]}{star}{name[match.end() :]}", axis
+    if index := _INDEX.search(name):
+        number = int(index[1])
+        yield f"{name[: index.start()]}[*]", AXES[number] if number < len(AXES) else index[1]
 
 
 def samples_a_row(headers: Sequence[Header], columns: Sequence[int]) -> int:
@@ -128,3 +139,54 @@ def samples_a_row(headers: Sequence[Header], columns: Sequence[int]) -> int:
         closed = "]" if match[0].endswith("]") else ""
         counts.append(sum(f"{stem}{opened}{k}{closed}" in names for k in range(len(names))))
     return min(counts)
+
+
+@dataclass(frozen=True)
+class File:
+    """A table, what its names say, the options and the format.
+
+    What contradicts each other and what is worth a word is collected while it is looked at.
+    """
+
+    table: Table
+    headers: Sequence[Header]
+    options: ReaderOptions
+    form: Format | None
+    contradictions: list[str] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
+
+    def listed(self, numbers: Sequence[int]) -> str:
+        """Names of columns, for a message."""
+        return ", ".join(repr(self.table.names[n] or f"column {n}") for n in numbers)
+
+    def note(self, check: str, text: str) -> None:
+        """Something to say, whatever comes of it."""
+        self.findings.append(Finding(check, KEPT, text))
+
+    def refusal(self, text: str) -> InputError:
+        """An error that says where, and in which file to type what it asks for."""
+        return InputError(f"{self.table.where}: {text} {IN_READER}")
+
+    def find(self, column: Column) -> int:
+        """Look up a column by its name, with or without its unit, or by its number from 0.
+
+        Raises:
+            InputError: There is no such column, or more than one.
+        """
+        names = self.table.names
+        if isinstance(column, int):
+            alike = [column] if column < len(names) else []
+        else:
+            exact = [number for number, name in enumerate(names) if name == column]
+            alike = exact or [n for n, header in enumerate(self.headers) if header.name == column]
+        if len(alike) > 1:
+            raise self.refusal(
+                f"expected one column {column!r}, got {len(alike)}, numbers {alike} (from 0): two "
+                "sensors in one file? Give numbers in place of the name"
+            )
+        if not alike:
+            raise self.refusal(
+                f"expected a column {column!r}{' (from 0)' * isinstance(column, int)}, got "
+                f"{len(names)} columns, {self.table.listed()}; correct it"
+            )
+        return alike[0]

@@ -6,7 +6,7 @@ options or where the rows themselves say so. What could be either is refused.
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,9 @@ from gyro_pipeline.readers.table import IN_READER, Table
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 
+WINDOW = 51
+"""Rows whose mean a sample is compared with, to see its noise."""
+
 _DEVICE = re.compile(
     r"(?i)(?:^|[ _.])(?:device|sensor|imu|node|serial|mac|topic|dev)"
     r"(?:[ _]?(?:id|no|nr|num|number|name|index|tag|addr|address))?$"
@@ -28,29 +31,20 @@ _DEVICE = re.compile(
 _FLAGS = {"true", "false", "t", "f", "yes", "no", "y", "n", "on", "off"}
 
 
-def picked(table: Table, rows: Mapping[Any, Any], column_of: Callable[[Any], int]) -> Mask:
-    """Rows with the values that the option ``rows`` asks for.
-
-    Args:
-        table: (n) rows.
-        rows: Values by the name of their column.
-        column_of: Number of a column by its name.
+def with_value(table: Table, number: int, value: Any, count: int) -> Mask:
+    """Rows (count,) with a value in a column.
 
     Raises:
-        InputError: There is no such column, or no row with that value.
+        InputError: There is none, or the column is of another length.
     """
-    keep = np.ones(max(map(len, table.columns), default=0), bool)
-    for name, value in rows.items():
-        column = table.columns[column_of(name)]
-        text = _as_text(value)
-        same = _as_texts(column) == text
-        if len(same) != len(keep) or not same.any():
-            raise InputError(
-                f"{table.where}: expected rows with {name}: {text}, got {_counted(column)}; correct "
-                f"rows {IN_READER}"
-            )
-        keep &= same
-    return keep
+    column = table.columns[number]
+    same = _as_texts(column) == _as_text(value)
+    if len(same) != count or not same.any():
+        raise InputError(
+            f"{table.where}: expected {count} rows, some with {_as_text(value)} in "
+            f"{table.names[number]!r}, got {_counted(column)}; correct rows {IN_READER}"
+        )
+    return same
 
 
 def blank_at_regular_shares(
@@ -69,14 +63,14 @@ def blank_at_regular_shares(
         (n,), nothing where blank rows are losses.
     """
     blank = np.isnan(rates).all(axis=1)
-    lengths = _run_lengths(blank.astype(np.intp))[1:-1]
+    lengths = _run_lengths(np.asarray(blank, np.intp))[1:-1]
     if blank.mean() < least_share or len(lengths) < 2 * least_runs:
         return np.zeros(len(rates), bool)
-    regular = all(
-        (np.abs(some - (usual := np.median(some))) <= max(1, usual / 4)).mean() >= alike
-        for some in (lengths[0::2], lengths[1::2])
-    )
-    return blank & regular
+    for some in (lengths[0::2], lengths[1::2]):
+        usual = np.median(some)
+        if (np.abs(some - usual) <= max(1, usual / 4)).mean() < alike:
+            return np.zeros(len(rates), bool)
+    return np.asarray(blank)
 
 
 def repeated(rates: Floats) -> Mask:
@@ -86,9 +80,7 @@ def repeated(rates: Floats) -> Mask:
     return same
 
 
-def takes_turns(
-    table: Table, number: int, keep: Mask, rates: Floats, most_values: int = 32
-) -> str:
+def takes_turns(table: Table, number: int, keep: Mask, rates: Floats, most_values: int = 32) -> str:
     """Whether a column says what a row is of, such as a device, a sensor or a kind of row.
 
     It has few values, and they come and go. Texts then say what a row is; so do numbers of a column
@@ -115,14 +107,15 @@ def takes_turns(
     evidence = _evidence(name, [_as_text(value) for value in values], codes, rates)
     if not evidence:
         return ""
+    pick = f"{{{name or number}: {_as_text(values[0])}}}"
     return (
-        f"{name or f'column {number}'!r} takes turns among {_counted(column[keep])}, {evidence}: rows "
-        f"of several devices or kinds; pick some by rows: {{{name or number}: {_as_text(values[0])}}}"
+        f"{name or f'column {number}'!r} takes turns among {_counted(column[keep])}, {evidence}, "
+        f"but a recording is of one device; pick its rows, such as rows: {pick}"
     )
 
 
 def _evidence(name: str, values: Sequence[str], codes: NDArray[np.intp], rates: Floats) -> str:
-    """Why values, by the codes (n,) of the rows, say what a row is; an empty text if they do not."""
+    """Why values, by the codes (n,) of the rows, say what a row is; nothing if they do not."""
     rows = np.bincount(codes, minlength=len(values))
     runs = np.bincount(codes[np.flatnonzero(np.diff(codes, prepend=-1))], minlength=len(values))
     filled = np.array([bool(value) for value in values])
@@ -131,8 +124,8 @@ def _evidence(name: str, values: Sequence[str], codes: NDArray[np.intp], rates: 
     texts = filled & np.array([not _is_number_or_flag(value) for value in values])
     if (texts & (runs > 2)).sum() > 1:  # noqa: PLR2004
         return "which say what a row is"
-    for code in np.flatnonzero(runs > 4):  # noqa: PLR2004
-        if difference := _rates_change(rates, codes == code):
+    for code in _suspected(rates, codes, len(values)) if (runs > 4).any() else ():  # noqa: PLR2004
+        if runs[code] > 4 and (difference := _rates_change(rates, codes == code)):  # noqa: PLR2004
             return f"and with {values[code] or 'blank'} {difference}"
     return ""
 
@@ -141,13 +134,26 @@ def _is_number_or_flag(value: str) -> bool:
     return bool(re.fullmatch(r"[-+.\deE]+|inf|-inf", value)) or value.lower() in _FLAGS
 
 
+def _suspected(rates: Floats, codes: NDArray[np.intp], values: int) -> NDArray[np.intp]:
+    """Codes with which means or noise of the rates differ at all; a look that costs little."""
+    finite = np.isfinite(rates).all(axis=1)
+    rates, codes = rates[finite], codes[finite]
+    rows = np.maximum(np.bincount(codes, minlength=values), 1)
+    sizes = np.abs(rates - uniform_filter1d(rates, WINDOW, axis=0))
+    found = np.zeros(values, bool)
+    for column, size in zip(rates.T, sizes.T, strict=True):
+        means, noises = (np.bincount(codes, some, values) / rows for some in (column, size))
+        least = np.maximum(0.1, 4 / np.sqrt(rows)) * 1.5 * np.median(size)
+        found |= (np.abs(means - column.mean()) > least) | (noises > 1.2 * size.mean())
+    return np.flatnonzero(found)
+
+
 def _rates_change(
     rates: Floats,
     there: Mask,
     least: float = 0.2,
     sigmas: float = 8.0,
     noisier: float = 1.5,
-    window: int = 51,
 ) -> str:
     """How rates (n, 3) differ in the runs of some rows (n,) from those in the runs between them.
 
@@ -160,25 +166,24 @@ def _rates_change(
         least: Difference of the means that matters, in standard deviations of a sample.
         sigmas: The same, in standard errors.
         noisier: Ratio of the standard deviations that matters.
-        window: Rows whose mean a sample is compared with, to see its noise.
     """
     finite = np.isfinite(rates).all(axis=1)
     rates, there = rates[finite], there[finite]
     starts = np.flatnonzero(np.diff(there.astype(int), prepend=-1))
-    if len(starts) < 12 or len(rates) < window:  # noqa: PLR2004
+    if len(starts) < 12 or len(rates) < WINDOW:  # noqa: PLR2004
         return ""
     means = np.add.reduceat(rates, starts) / np.diff(starts, append=len(rates))[:, None]
     apart = means[1:-1] - (means[:-2] + means[2:]) / 2
     apart *= np.where(there[starts[1:-1]], 1, -1)[:, None]
     sizes = trim_mean(apart, 0.1)
     errors = _spread(apart - sizes) / np.sqrt(len(apart) / 2)  # neighbours share runs
-    deviations = rates - uniform_filter1d(rates, window, axis=0)
+    deviations = rates - uniform_filter1d(rates, WINDOW, axis=0)
     noise = np.stack([_spread(deviations[there]), _spread(deviations[~there])])
     for axis, size in enumerate(np.abs(sizes)):
         if size > max(sigmas * errors[axis], least * noise[:, axis].min(), 0):
             return f"the rate about {AXES[axis]} differs by {size:.3g} deg/s"
     ratios = noise.max(axis=0) / np.maximum(noise.min(axis=0), 1e-300)
-    enough = min(there.sum(), (~there).sum()) > 4 * window
+    enough = min(there.sum(), (~there).sum()) > 4 * WINDOW
     if enough and ratios.max() > noisier:
         return f"the noise about {AXES[ratios.argmax()]} differs by a factor of {ratios.max():.3g}"
     return ""
@@ -208,5 +213,7 @@ def _as_texts(column: NDArray[Any]) -> NDArray[Any]:
 def _counted(column: NDArray[Any], most: int = 8) -> str:
     """Values and how many rows have each, for a message."""
     values, counts = np.unique(_as_texts(column), return_counts=True)
-    shown = [f"{v or 'blank'} ({n} rows)" for v, n in zip(values[:most], counts[:most], strict=True)]
+    shown = [
+        f"{v or 'blank'} ({n} rows)" for v, n in zip(values[:most], counts[:most], strict=True)
+    ]
     return ", ".join(shown) + (", …" if len(values) > most else "")
