@@ -22,8 +22,8 @@ _QUANTITIES = {
     r"|vel|velocity|speed",
 }
 """Words of each quantity; of two in a name, the first decides: ``gyro_bias_x``, ``roll_rate``."""
-_LETTERS = {OTHER: "a|ac|m|q|f|v", RATE: "g|w"}
-"""The same of the letters that stand before an axis, in names without any such word: ``gx``."""
+_LETTERS = {"g": RATE, "w": RATE}
+"""Of the letters that stand before an axis in names without any such word: ``gx``, but ``ax``."""
 
 _BRACKETS = re.compile(r"\s*[(\[]((?:[^()\[\]]|[(\[][^()\[\]]*[)\]])*)[)\]]")
 # neither gx (deg/s)*100 nor gx (deg/s) per sqrt Hz
@@ -51,11 +51,11 @@ class Header(NamedTuple):
         words = [w.lower() for w in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", self.name)]
         stems = {*words, *(w[:-1] for w in words if w[-1] in AXES)}
         stems |= {w[1:] for w in words if w[0] in AXES}
-        for vocabulary in (_QUANTITIES, _LETTERS):
-            for quantity, pattern in vocabulary.items():
-                if any(re.fullmatch(pattern, stem) for stem in stems):
-                    return "" if quantity == ATTITUDE and self.measures("rate") else quantity
-        return ""
+        for quantity, pattern in _QUANTITIES.items():
+            if any(re.fullmatch(pattern, stem) for stem in stems):
+                return "" if quantity == ATTITUDE and self.measures("rate") else quantity
+        letters = re.search(r"\b(a|ac|m|q|f|v|g|w) ?[xyz]\b", " ".join(words))
+        return _LETTERS.get(letters[1], OTHER) if letters else ""
 
     def measures(self, *quantities: str) -> bool:
         """Whether its unit is of one of these quantities."""

@@ -48,30 +48,42 @@ def scale_of(file: File, rates: Sequence[int]) -> tuple[float, bool]:
             f"{asked[0]}; correct units"
         )
     unit = asked or stated
+    names = file.listed(rates)
     if unit is None:
-        names = file.listed(rates)
         raise file.refusal(f"expected a unit of the rates, got {names}; give units: {RATE_UNITS}")
-    scale = file.options.scale_dps
-    if unit[1].quantity == "count" and scale is None:
-        text = f"{file.listed(rates)} are raw counts: give units: raw and scale_dps, deg/s a count,"
+    raw = unit[1].quantity == "count"
+    if raw and unit[1].factor == 1 and file.options.scale_dps is None:
+        text = f"{names} are raw counts: give units: raw and scale_dps, deg/s a count,"
         raise file.refusal(text)
-    return _with_scale_above(file, scale or unit[1].factor), scale is not None
+    if stated != by_format:
+        _contradict_scale_above(file, unit[1].factor)
+    return unit[1].factor, raw
 
 
 def _asked(file: File) -> Stated | None:
-    units = file.options.units
+    units, scale_dps = file.options.units, file.options.scale_dps
+    if scale_dps is not None:
+        return f"raw, of {scale_dps:g} deg/s", Unit("count", scale_dps)
     return (units, read_unit(units) or Unit("rate")) if units else None
 
 
 def _of_format(file: File, rates: Sequence[int]) -> Stated | None:
-    """The format's unit, of its own columns."""
-    if file.form is None or {*rates} != {find_all(file.table, n)[0] for n in file.form.rates}:
+    """The format's unit, of its own columns; counts, where a line above gives their scale."""
+    form = file.form
+    if form is None or {*rates} != {find_all(file.table, name)[0] for name in form.rates}:
         return None
-    return file.form.units, read_unit(file.form.units) or Unit("rate")
+    factor = (read_unit(form.units) or Unit("rate")).factor
+    if not form.scale:
+        return form.units, Unit("rate", factor)
+    scale = above_header(file.table.preamble, form.scale)
+    return f"counts of {scale:g} {form.units}", Unit("count", factor * scale)
 
 
 def _same(one: Unit, other: Unit) -> bool:
-    return one.quantity == other.quantity and isclose(one.factor, other.factor, rel_tol=1e-9)
+    """Whether two units agree; a header that says counts says nothing of their size."""
+    of_any_size = one.quantity == "count" and 1 in (one.factor, other.factor)
+    alike = isclose(one.factor, other.factor, rel_tol=1e-6)
+    return one.quantity == other.quantity and (of_any_size or alike)
 
 
 def _of_header(file: File, rates: Sequence[int]) -> Stated | None:
@@ -115,18 +127,13 @@ def _above(preamble: str) -> dict[str, Unit]:
     return found
 
 
-def _with_scale_above(file: File, scale: float) -> float:
-    """The scale, times a factor above the header that the format knows; others contradict it."""
-    if file.form and file.form.scale:
-        return scale * above_header(file.table.preamble, file.form.scale)
+def _contradict_scale_above(file: File, scale: float) -> None:
+    """A factor on the rates in the lines above the header that is not the scale."""
     match = _SCALE.search(file.table.preamble)
     factor = float(match[2]) if match else 1.0
-    if match is None or factor in (0, 1):
-        return scale
-    readings = (factor, 1 / factor, _RAD_PER_S_DPS * factor)
-    if not any(isclose(scale, reading, rel_tol=1e-3) for reading in readings):
+    readings = (1.0, scale, 1 / scale, scale / _RAD_PER_S_DPS)
+    if match and factor and not any(isclose(factor, other, rel_tol=1e-3) for other in readings):
         file.contradictions.append(
             f"a line above the header says {match[1]} {match[2]}, but the scale is {scale:g} "
             "deg/s; give units: raw and scale_dps"
         )
-    return scale
