@@ -4,12 +4,21 @@ An unknown key, a value out of bounds or a study that asks for what a sensor can
 refused before any node runs (see :class:`gyro_pipeline.hooks.Preflight`).
 """
 
+import re
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from gyro_pipeline.conventions import AXES, LEAVE_ONE_DEVICE_OUT
+from gyro_pipeline.units import read_unit
 
 PerAxis = tuple[float, float, float]
 Seconds = Annotated[float, Field(gt=0)]
@@ -84,36 +93,67 @@ class Sensor(Parameter):
         return self
 
 
-RateUnits = Literal["deg/s", "rad/s", "mdps", "mrad/s", "deg/h", "raw"]
-TimeUnits = Literal["s", "ms", "us", "ns"]
 Column = Annotated[str | Annotated[int, Field(ge=0)], Field(description="a name, or from 0")]
+Triple = tuple[Column, Column, Column]
 
 
 class ReaderOptions(Parameter):
-    """How the files of a logger are read; what is null comes from the header or the format."""
+    """How the files of a logger are read; what is null comes from the header or the format.
+
+    What the options say and what a file says of itself must agree: where they differ, the file is
+    refused, unless ``trust: options`` says which is right.
+    """
 
     format: str = Field(
-        "auto", description="name in gyro_pipeline.readers.READERS; auto: told by the header"
+        "auto",
+        description="name in gyro_pipeline.readers.FORMATS; general: none of them; auto: told",
     )
-    encoding: str | None = Field(None, description="of a text; null: UTF-8 or UTF-16")
-    delimiter: str | None = Field(
-        None, min_length=1, max_length=1, description="of a text; a blank: runs of them; null: told"
+    trust: Literal["options"] | None = Field(
+        None, description="options: these options overrule what the file says of itself"
     )
+    encoding: str | None = Field(None, description="of a text; null: told")
+    delimiter: str | None = Field(None, min_length=1, description="of a text's fields; null: told")
     row: str | None = Field(
-        None, description="expression with named groups; each line that it matches is a row"
+        None,
+        description="regular expression of a line that holds a sample, with a named group for each "
+        "column; other lines are skipped",
     )
-    columns: tuple[Column, Column, Column] | None = Field(
-        None, description="of the angular rates about x, y, z"
+    rows: dict[Column, str | float] = Field(
+        {}, description="only rows with these values in these columns, such as {sensor: 1}"
     )
-    units: RateUnits | None = Field(None, description="of the angular rates")
+    repeats: Literal["drop"] | None = Field(
+        None, description="drop: rows whose rates are those of the row before are no samples"
+    )
+    topic: str | None = Field(None, description="of a log with several (ulg, bin, bag)")
+    instance: int | None = Field(None, ge=0, description="of several sensors in such a log, from 0")
+    columns: Triple | dict[int, Triple] | None = Field(
+        None, description="of the angular rates about x, y, z; or these of each IMU, by number"
+    )
+    units: str | None = Field(
+        None, description="of the rates: any of angle per time, or raw; of the angle, of increments"
+    )
     scale_dps: float | None = Field(
         None, gt=0, allow_inf_nan=False, description="deg/s in one count; with units: raw only"
     )
+    offset: float | None = Field(
+        None, allow_inf_nan=False, description="count of a rate of 0; with units: raw only"
+    )
+    signed_bits: int | None = Field(
+        None, ge=2, le=32, description="of signed counts that were written as unsigned ones"
+    )
+    increments: bool = Field(False, description="the columns hold angles turned since the last row")
     time_column: Column | None = None
-    time_units: TimeUnits | None = Field(None, description="of the time column")
+    time_units: str | Seconds | None = Field(
+        None, description="of the time column; a number: seconds a tick"
+    )
+    time_is: Literal["steps"] | None = Field(
+        None, description="steps: the time column holds the time since the last row"
+    )
     temperature_column: Column | None = Field(
         None, description="degrees Celsius, unless its header says another unit"
     )
+    acceleration_columns: Triple | None = Field(None, description="along x, y, z")
+    acceleration_units: str | None = Field(None, description="of them, such as g, mg, m/s^2")
     counter_column: Column | None = Field(None, description="counts packets, one a row")
     counter_bits: int | None = Field(
         None, ge=2, le=32, description="it starts anew after 2 to this; null: the format's, or 16"
@@ -122,11 +162,49 @@ class ReaderOptions(Parameter):
         2.0, gt=0, description="that a measured sample rate may differ from the expected one"
     )
 
+    @field_validator("time_units", "acceleration_units")
+    @classmethod
+    def _other_units_are_read(
+        cls, value: str | float | None, info: ValidationInfo
+    ) -> str | float | None:
+        quantity = "time" if info.field_name == "time_units" else "acceleration"
+        if isinstance(value, str):
+            _check_unit(str(info.field_name), value, quantity)
+        return value
+
+    @field_validator("row")
+    @classmethod
+    def _an_expression_has_named_groups(cls, value: str | None) -> str | None:
+        try:
+            if value is not None and not re.compile(value).groupindex:
+                raise ValueError(f"row: expected named groups such as (?P<gx>…), got {value}")
+        except re.error as error:
+            raise ValueError(f"row: expected a regular expression, got {value}: {error}") from error
+        return value
+
     @model_validator(mode="after")
-    def _raw_counts_have_a_scale(self) -> Self:
+    def _units_suit_what_the_columns_hold(self) -> Self:
+        if self.units not in (None, "raw"):
+            _check_unit("units", str(self.units), "angle" if self.increments else "rate")
         if (self.units == "raw") != (self.scale_dps is not None):
             raise ValueError("units: raw and scale_dps go together: give both or none")
+        if self.offset is not None and self.units != "raw":
+            raise ValueError("offset: is of raw counts: give units: raw and scale_dps as well")
+        if self.increments and self.units == "raw":
+            raise ValueError("increments: expected an angle in units, got raw")
         return self
+
+
+def _check_unit(option: str, text: str, quantity: str) -> None:
+    unit = read_unit(text)
+    if unit is None or unit.quantity != quantity:
+        examples = {
+            "rate": "of angle per time, such as deg/s, rad/s, mdps, deg/h or rpm, or raw",
+            "angle": "of an angle, such as deg or rad, as increments are",
+            "time": "of time, such as s, ms, us or ns, or seconds a tick",
+            "acceleration": "of acceleration, such as g, mg or m/s^2",
+        }
+        raise ValueError(f"{option}: expected a unit {examples[quantity]}, got {text!r}")
 
 
 class Quality(Parameter):

@@ -1,0 +1,113 @@
+"""Units as headers and options spell them, read by pint.
+
+To pint a radian is a number, so that 1/s would be an angular rate. Here an angle is a quantity of
+its own, a count of an AD converter is another, and g is the earth's acceleration, not a gram.
+"""
+
+import re
+from functools import lru_cache
+from importlib.resources import files
+from typing import Any, NamedTuple
+
+_DEFINITIONS = """
+degree = [angle] = ° = deg = degs
+radian = 57.29577951308232 * degree = rad = rads
+turn = 360 * degree = _ = revolution = rev = revs
+@alias second = secs
+millis = 0.001 * second
+micros = 0.000001 * second
+count = [count] = counts = lsb = digit = digits = raw
+earth_gravity = 9.80665 * meter / second ** 2 = g
+degree_per_second = degree / second = dps = degps = deg_s = deg_per_s = deg_sec = deg_per_sec
+radian_per_second = radian / second = radps = rad_s = rad_per_s = rad_sec = rad_per_sec
+degree_per_hour = degree / hour = dph = deg_h = deg_per_h
+"""
+
+_REFERENCES = {
+    "rate": "degree_per_second",
+    "angle": "degree",
+    "time": "second",
+    "acceleration": "earth_gravity",
+    "temperature": "degC",
+    "count": "count",
+}
+"""What is told apart, and the unit in which each is used here."""
+
+_SIGNS = str.maketrans({"º": "°", "˚": "°", "℃": "degC", "℉": "degF", "·": "*", "⋅": "*"})
+_POWERS = {"⁻¹": "^-1", "⁻²": "^-2", "²": "^2", "°C": "degC", "°F": "degF", "°c": "degC"}
+_TERM = r"[^\W\d_][^\W\d]*(?:\^?-?[1-3])?"
+# words, products and quotients, but neither numbers nor roots; pint would evaluate 9**9**9
+_EXPRESSION = re.compile(rf"\(?{_TERM}(?:[/* ()]{{1,3}}{_TERM})*\)?")
+_LONGEST = 40
+
+
+class Unit(NamedTuple):
+    """A unit: a value in it, times ``factor`` plus ``offset``, is in deg/s, deg, s, g, °C, counts.
+
+    Attributes:
+        quantity: ``rate``, ``angle``, ``time``, ``acceleration``, ``temperature``, ``count`` or
+            ``other``.
+        factor: As above.
+        offset: As above; of temperatures only.
+    """
+
+    quantity: str
+    factor: float = 1.0
+    offset: float = 0.0
+
+
+@lru_cache(1)
+def _registry() -> tuple[Any, dict[Any, str]]:
+    """The registry, and what quantity each dimensionality is of."""
+    import pint  # noqa: PLC0415  # a quarter of a second, which few commands need
+
+    units: Any = pint.UnitRegistry(None, on_redefinition="ignore")
+    units.load_definitions(str(files("pint") / "default_en.txt"))
+    for definition in _DEFINITIONS.strip().splitlines():
+        units.define(definition)
+    quantities = {
+        units.Quantity(1, reference).dimensionality: quantity
+        for quantity, reference in _REFERENCES.items()
+    }
+    return units, quantities
+
+
+@lru_cache(1 << 12)  # a folder's files have the same headers
+def read_unit(text: str) -> Unit | None:
+    """Read a unit such as ``deg/s``, ``rad s^-1``, ``°/sec``, ``mdps``, ``m/s²`` or ``degC``.
+
+    Returns:
+        What it measures; ``other`` for known units of anything else; None where it is no unit.
+    """
+    expression = _spelled_for_pint(text)
+    written, small = _parsed(expression), _parsed(expression.lower())
+    # DPS, Deg/Sec, °/S; as written where that says something, for mG is not mg
+    unclear = written is None or (
+        written.quantity == "other" and small and small.quantity == "rate"
+    )
+    return small if unclear else written
+
+
+def _spelled_for_pint(text: str) -> str:
+    text = text.strip().translate(_SIGNS)
+    for sign, spelled in _POWERS.items():
+        text = text.replace(sign, spelled)
+    text = re.sub(r"\.(?=\s|$)", "", text.replace("°", "deg"))  # Deg. per s
+    text = re.sub(r"(?<=[^\W\d])\.(?=[^\W\d])", "*", text)
+    return re.sub(r"(?<=[^\W\d])(?=-?[123]\b)", "^", text)  # rad s-1, m/s2
+
+
+def _parsed(expression: str) -> Unit | None:
+    if len(expression) > _LONGEST or not _EXPRESSION.fullmatch(expression):
+        return None
+    units, quantities = _registry()
+    try:
+        unit = units.parse_units(expression)
+        quantity = quantities.get(unit.dimensionality, "other")
+        if quantity == "other":
+            return Unit(quantity)
+        zero, one = (units.Quantity(v, unit).to(_REFERENCES[quantity]).magnitude for v in (0, 1))
+    except Exception:  # pint raises what its parser and Python's tokenizer do
+        return None
+    # conversions are rounded, and a degree per second is exactly one
+    return Unit(quantity, float(f"{one - zero:.14g}"), float(f"{zero:.10g}"))
