@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.logs import KEPT, Finding, Log
 from gyro_pipeline.parameters import ReaderOptions
+from gyro_pipeline.readers.clock import Timing, check_rate, from_counter, from_stamps
 from gyro_pipeline.readers.formats import READERS, Reader, check_format, reader_of
 from gyro_pipeline.readers.headers import listed
 from gyro_pipeline.readers.tables import Table, open_table
-from gyro_pipeline.readers.clock import Timing, check_rate, from_counter, from_stamps
 
 __all__ = ["READERS", "Reader", "Table", "check_format", "read_log"]
 
