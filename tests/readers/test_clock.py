@@ -121,6 +121,13 @@ def test_counters_of_time_and_midnight_are_unwrapped(period, step, unit_s):
     assert timing.findings[0].detail.endswith("once, at row 500")
 
 
+def test_bursts_of_a_counter_that_starts_anew_are_unwrapped():
+    stamps = np.mod(2**16 - 300 + 50 * (np.arange(N) // 5 + 1), 2**16)
+    timing = from_stamps(stamps, 1e-3)
+    assert timing.rate_hz == pytest.approx(100, rel=1e-3)
+    assert not len(timing.gap_rows)
+
+
 @pytest.mark.parametrize("stamps", [np.zeros(9), np.full(9, np.nan)])
 def test_stamps_that_do_not_advance_give_no_rate(stamps):
     timing = from_stamps(stamps, 1.0)

@@ -62,22 +62,22 @@ def from_stamps(stamps: Floats, unit_s: float | None) -> Timing:
     times = np.r_[0.0, np.cumsum(np.where(steps < 0, usual, steps))]
     first = np.r_[True, np.diff(times) > usual / 10]  # of the rows with one stamp
     last = np.r_[first[1:], True]
-    step, lost, even = _follow(times[last], rows[last].astype(float), stamps[rows])
-    gaps = rows[first][lost > 0]
-    findings += _at("gaps", gaps, f"samples are missing, about {lost.sum():.0f}", REPAIRED)
+    step, losses, regularity = _follow(times[last], rows[last].astype(float), stamps[rows])
+    gaps = rows[first][losses > 0]
+    findings += _at("gaps", gaps, f"samples are missing, about {losses.sum():.0f}", REPAIRED)
     if len(rows) > 1.5 * first.sum():
         text = "timestamps are coarse or come in bursts: the rate is the count over the duration"
         findings.append(Finding("timestamps", KEPT, text))
     else:
         findings += _at("duplicated timestamps", repeats, "a timestamp repeats")
     rate_hz = None if unit_s is None else 1 / (step * unit_s)
-    return Timing(rate_hz, np.union1d(gaps, back), (*findings, *even))
+    return Timing(rate_hz, np.union1d(gaps, back), (*findings, *regularity))
 
 
 def _follow(
     times: Floats, rows: Floats, stamps: Floats, pause: int = 100
 ) -> tuple[float, Floats, list[Finding]]:
-    """The step from sample to sample, samples missing before each of k stamps, whether it is even.
+    """The step from sample to sample, how many are missing before each of k stamps, and findings.
 
     Args:
         times: (k,), of the stamps that differ.
@@ -85,24 +85,25 @@ def _follow(
         stamps: (n,), as written.
         pause: A gap of so many samples need not last a whole number of steps.
     """
+    # the step tells the gaps, and these the step
     step, lag = _usual_step(times, rows)
     tick = _tick(times, rows, step, _resolution(stamps, np.diff(times)))
     if tick:
         step = _slope(times, rows, min(200, len(rows) // 10))
     else:
         rows = _without_doubled(times, rows, step)
-    lost = np.zeros(len(rows))
+    losses = np.zeros(len(rows))
     for _ in range(4):
-        late = times - step * rows
-        scatter = np.ptp(np.quantile(late[lag:] - late[:-lag], [0.2, 0.8]))
+        delays = times - step * rows
+        scatter = np.ptp(np.quantile(delays[lag:] - delays[:-lag], [0.2, 0.8]))
         least = max(step / 2, 1.4 * scatter, 1.25 * tick)
-        # of the last stamps, it is not known whether all that follow are late
-        at_the_end = 2 * scatter / np.arange(len(late), 0, -1)
-        lost = _rises(late, least + at_the_end, step * np.diff(rows).mean()) / step
-        lost = np.where(lost < pause, np.rint(lost), lost)
-        step = _slope(times - step * np.cumsum(lost), rows, 9 * len(rows) // 10) or step
-    ordinary = (lost[1:] == 0) & (np.diff(rows) == 1)
-    return step, lost, _uneven(times - step * np.cumsum(lost), rows, ordinary)
+        # at the end, too few stamps follow to show whether all are late
+        at_the_end = 2 * scatter / np.arange(len(delays), 0, -1)
+        losses = _rises(delays, least + at_the_end, step * np.diff(rows).mean()) / step
+        losses = np.where(losses < pause, np.rint(losses), losses)
+        step = _slope(times - step * np.cumsum(losses), rows, 9 * len(rows) // 10) or step
+    ordinary = (losses[1:] == 0) & (np.diff(rows) == 1)
+    return step, losses, _uneven(times - step * np.cumsum(losses), rows, ordinary)
 
 
 def _usual_step(times: Floats, rows: Floats) -> tuple[float, int]:
@@ -113,14 +114,14 @@ def _usual_step(times: Floats, rows: Floats) -> tuple[float, int]:
     """
     lag = 1
     while True:
-        each = (times[lag:] - times[:-lag]) / (rows[lag:] - rows[:-lag])
-        low, step, high = np.quantile(each, [0.2, 0.5, 0.8], method="lower")
+        slopes = (times[lag:] - times[:-lag]) / (rows[lag:] - rows[:-lag])
+        low, step, high = np.quantile(slopes, [0.2, 0.5, 0.8], method="lower")
         if high - low <= step / 4 or 4 * lag > len(times):
             break
         lag *= 2
     if lag == 1:
-        alike = np.abs(each - step) < step / 2
-        step = np.average(each[alike], weights=np.diff(rows)[alike])
+        alike = np.abs(slopes - step) < step / 2
+        step = np.average(slopes[alike], weights=np.diff(rows)[alike])
     return float(step), lag
 
 
@@ -134,44 +135,44 @@ def _tick(times: Floats, rows: Floats, step: float, resolution: float, few: int 
     if resolution < step / 2 and (resolution or not np.allclose(multiples, np.rint(multiples))):
         return 0.0
     tick = resolution or step
-    late, odd = steps - step * np.diff(rows), min(tick, step) / 4
-    short, long = np.sum(late < -odd), np.sum((late > odd) & (late < 1.5 * tick))
+    delays, least = steps - step * np.diff(rows), min(tick, step) / 4
+    short, long = np.sum(delays < -least), np.sum((delays > least) & (delays < 1.5 * tick))
     if short + long < few:
         return resolution
-    many = max(min(ceil(5 * len(steps) / (short + long)), len(steps) // 4), 1)
-    passed = times[many:] - times[:-many]
-    passed -= _slope(times, rows, min(200, len(rows) // 10)) * (rows[many:] - rows[:-many])
-    regular = np.ptp(np.quantile(passed, [0.1, 0.9])) <= 2.5 * max(tick, step)
+    lag = max(min(ceil(5 * len(steps) / (short + long)), len(steps) // 4), 1)
+    durations = times[lag:] - times[:-lag]
+    durations -= _slope(times, rows, min(200, len(rows) // 10)) * (rows[lag:] - rows[:-lag])
+    regular = np.ptp(np.quantile(durations, [0.1, 0.9])) <= 2.5 * max(tick, step)
     return tick if regular or min(short, long) > 0.1 * (short + long) else 0.0
 
 
 def _without_doubled(times: Floats, rows: Floats, step: float) -> Floats:
     """Numbers of rows (k,) that do not count doubled ones, behind which all stamps are early."""
-    late = np.pad(times - step * rows, 5, mode="edge")
-    middle = np.median(np.lib.stride_tricks.sliding_window_view(late, 5), axis=1)
+    delays = np.pad(times - step * rows, 5, mode="edge")
+    medians = np.median(np.lib.stride_tricks.sliding_window_view(delays, 5), axis=1)
     counts, steps = np.diff(rows), np.diff(times)
-    early = middle[6 : len(rows) + 5] - middle[1 : len(rows)] < -step / 2
-    doubled = (counts > 1) & (np.abs(steps - step) < step / 2) & early
-    return np.cumsum(np.r_[rows[0], np.where(doubled, 1.0, counts)])
+    early = medians[6 : len(rows) + 5] - medians[1 : len(rows)] < -step / 2
+    doubles = (counts > 1) & (np.abs(steps - step) < step / 2) & early
+    return np.cumsum(np.r_[rows[0], np.where(doubles, 1.0, counts)])
 
 
-def _rises(late: Floats, least: Floats, each: float) -> Floats:
-    """By how much the least of all that follow is above the delays before it, (k,); else 0.
+def _rises(delays: Floats, least: Floats, interval: float) -> Floats:
+    """How far the least of a stamp's delay and those that follow is above those before it, (k,).
 
     Args:
-        late: (k,), delays of stamps.
-        least: (k,), smaller rises are none.
-        each: Time from stamp to stamp: a delay is waited for to end for ten times as long.
+        delays: (k,), delays of stamps.
+        least: (k,), smaller rises are 0.
+        interval: Time from stamp to stamp; a delay may take ten times as long to end.
     """
-    excess = np.diff(late, prepend=late[0])
-    waited = np.flatnonzero(excess[:-1] > least[:-1])  # the last may be in time later
-    rises, size = np.zeros(len(late)), 64
-    while len(waited):
-        here = waited[(10 * excess[waited] <= (size - 50) * each) | (size > 2 * len(late))]
-        ahead = minimum_filter1d(late, size, mode="nearest", origin=-(size // 2))[here]
-        before = np.median([late[np.maximum(here - n, 0)] for n in range(1, 6)], axis=0)
-        rises[here] = np.minimum(ahead - before, excess[here])
-        waited, size = np.setdiff1d(waited, here), 4 * size
+    excess = np.diff(delays, prepend=delays[0])
+    rows = np.flatnonzero(excess[:-1] > least[:-1])  # behind the last, nothing shows it
+    rises, size = np.zeros(len(delays)), 64
+    while len(rows):
+        chosen = rows[(10 * excess[rows] <= (size - 50) * interval) | (size > 2 * len(delays))]
+        ahead = minimum_filter1d(delays, size, mode="nearest", origin=-(size // 2))[chosen]
+        before = np.median([delays[np.maximum(chosen - n, 0)] for n in range(1, 6)], axis=0)
+        rises[chosen] = np.minimum(ahead - before, excess[chosen])
+        rows, size = np.setdiff1d(rows, chosen), 4 * size
     return np.where(rises > least, rises, 0.0)
 
 
@@ -200,8 +201,8 @@ def _slope(times: Floats, rows: NDArray, lag: int) -> float:
     lag = min(max(lag, 1), len(rows) - 1)
     if lag < 1:
         return 0.0
-    each = (times[lag:] - times[:-lag]) / (rows[lag:] - rows[:-lag])
-    return float(np.quantile(each, 0.5, method="lower"))
+    slopes = (times[lag:] - times[:-lag]) / (rows[lag:] - rows[:-lag])
+    return float(np.quantile(slopes, 0.5, method="lower"))
 
 
 def from_counter(counts: Floats, bits: int) -> Timing:
@@ -215,30 +216,27 @@ def from_counter(counts: Floats, bits: int) -> Timing:
         Rows at which it does not go on by one are gaps; there is no rate.
     """
     counts, strays = _without_strays(counts)
-    there = np.flatnonzero(np.isfinite(counts))
-    rows, steps = there[1:], np.diff(counts[there])
-    broken = np.mod(steps - np.diff(there), 2.0**bits) != 0
-    wraps = ~broken & (steps < 0)
-    what = "the packet counter does not go on by one"
+    numbered = np.flatnonzero(np.isfinite(counts))
+    rows, steps = numbered[1:], np.diff(counts[numbered])
+    skips = np.mod(steps - np.diff(numbered), 2.0**bits) != 0
+    wraps = ~skips & (steps < 0)
+    text = "the packet counter does not go on by one"
     return Timing(
-        gap_rows=rows[broken],
+        gap_rows=rows[skips],
         findings=(
             *_at("packet counter", strays, "a number is far from those beside it, and ignored"),
             *_at("wrap-around", rows[wraps], f"the {bits}-bit packet counter starts anew"),
-            *_at("packet counter", rows[broken], what, REPAIRED),
+            *_at("packet counter", rows[skips], text, REPAIRED),
         ),
     )
 
 
 def check_rate(rate_hz: float, expected_hz: float, tolerance_pct: float) -> tuple[Finding, ...]:
     """Compare a measured sample rate with the expected one; beyond the tolerance: REJECTED."""
-
-    def is_off_by(factor: float) -> bool:
-        return abs(rate_hz / expected_hz / factor - 1) <= tolerance_pct / 100
-
-    if is_off_by(1):
+    ratio = rate_hz / expected_hz
+    powers = [n for n in (0, -6, -3, 3, 6) if abs(ratio / 10.0**n - 1) <= tolerance_pct / 100]
+    if 0 in powers:
         return ()
-    powers = [power for power in (-6, -3, 3, 6) if is_off_by(10.0**power)]
     advice = "check the file's time, and samples and recording_s of the sensor"
     if powers:
         advice = f"it is off by 10^{powers[0]}: check time_units"
@@ -254,12 +252,12 @@ def _unwrapped(steps: Floats, unit_s: float | None) -> tuple[Floats, Mask]:
     wraps = np.zeros(len(steps), bool)
     if not (steps < 0).any():
         return steps, wraps
-    ordinary = np.median(steps)
+    ordinary = np.median(steps[steps > 0]) if (steps > 0).any() else 0.0
     day = [] if unit_s is None else [86_400 / unit_s]
     for period in [2.0**16, 2.0**24, 2.0**32, *day]:
-        found = (steps < 0) & (np.abs(steps + period - ordinary) <= ordinary)
-        steps = np.where(found, steps + period, steps)
-        wraps |= found
+        ends = (steps < 0) & (np.abs(steps + period - ordinary) <= ordinary)
+        steps = np.where(ends, steps + period, steps)
+        wraps |= ends
     return steps, wraps
 
 
@@ -292,11 +290,11 @@ def _resolution(stamps: Floats, steps: Floats) -> float:
     return 0.0
 
 
-def _at(check: str, rows: Rows, what: str, outcome: str = KEPT) -> list[Finding]:
+def _at(check: str, rows: Rows, text: str, outcome: str = KEPT) -> list[Finding]:
     """How often something is so, and where first; no finding if it never is."""
     if not len(rows):
         return []
-    shown = ", ".join(map(str, rows[:3])) + (", …" if len(rows) > len(rows[:3]) else "")
-    times = "once, at row" if len(rows) == 1 else f"{len(rows)} times, at rows"
+    listed = ", ".join(map(str, rows[:3])) + (", …" if len(rows) > len(rows[:3]) else "")
+    count = "once, at row" if len(rows) == 1 else f"{len(rows)} times, at rows"
     cut = ", cut there" if outcome == REPAIRED else ""
-    return [Finding(check, outcome, f"{what}: {times} {shown}{cut}")]
+    return [Finding(check, outcome, f"{text}: {count} {listed}{cut}")]
