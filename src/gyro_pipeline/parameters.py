@@ -158,6 +158,12 @@ class ReaderOptions(Parameter):
     counter_bits: int | None = Field(
         None, ge=2, le=32, description="it starts anew after 2 to this; null: the format's, or 16"
     )
+    topic: str | None = Field(
+        None, description="of a flight log or a bag, the message or topic with the angular rates"
+    )
+    instance: int | None = Field(
+        None, ge=0, description="of a flight log, the number of the device among those of a topic"
+    )
     rate_tolerance_pct: float = Field(
         2.0, gt=0, description="that a measured sample rate may differ from the expected one"
     )

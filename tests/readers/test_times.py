@@ -1,0 +1,76 @@
+"""Columns of times, told by content."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from gyro_pipeline.readers.times import are_steps, seconds
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("texts", "expected"),
+    [
+        (["09:50.0", "09:50.1"], 0.1),
+        (["59:59.9", "00:00.0"], 0.1),
+        (["10:00:00.020", "10:00:00.030"], 0.01),
+        (["10:00:00:020", "10:00:00:030"], 0.01),
+        (["10:00:00:5", "10:00:00:15"], 0.01),
+        (["10:00:00", "10:00:01"], 1.0),
+        (["10:00:00,02", "10:00:00,03"], 0.01),
+        (["2023/05/04 10:00:00.010", "2023/05/04 10:00:00.020"], 0.01),
+        (["04.05.2023 10:00:00.01", "04.05.2023 10:00:00.02"], 0.01),
+        (["2019-09-27T10.12.33.000", "2019-09-27T10.12.33.010"], 0.01),
+        (["2019-09-27T10:12:33.000Z", "2019-09-27T10:12:33.010Z"], 0.01),
+        (["2019-09-27 10:12:33.00 UTC", "2019-09-27 10:12:33.01 UTC"], 0.01),
+        (["2019-09-27T01:59:59.5+02:00", "2019-09-27T01:00:00.5+01:00"], 1.0),
+        (["20190927T101233.000", "20190927T101233.010"], 0.01),
+        (["27-Sep-2019 10:12:33.02", "27-Sep-2019 10:12:33.03"], 0.01),
+        (["9/27/2019 11:59:59.99 AM", "9/27/2019 12:00:00.00 PM"], 0.01),
+        (["11:59:59.99 pm", "12:00:00.00 am"], 0.01),
+        (["23:59:59.99", "00:00:00.00"], 0.01),
+        (["04.05.2023 23:59:59.99", "05.05.2023 00:00:00.00"], 0.01),
+        (["05/04/2023 23:59:59.99", "05/05/2023 00:00:00.00"], 0.01),
+        (["31/05/2023 23:59:59.99", "01/06/2023 00:00:00.00"], 0.01),
+        (["2023-05-31 23:59:59.99", "2023-06-01 00:00:00.00"], 0.01),
+    ],
+)
+def test_texts_of_times_are_told_by_content(texts, expected):
+    times = seconds(np.array([texts[0], None, texts[1]], object), None)
+    assert times[2] - times[0] == pytest.approx(expected, abs=1e-6)
+    assert np.isnan(times[1])
+
+
+@pytest.mark.parametrize(
+    "texts",
+    [["acc", "gyr"], ["09:50", "09:51"], ["2023-05-04", "2023-05-05"], ["1.5", "1.6"], ["a:b", ""]],
+)
+def test_texts_that_are_no_times_or_may_be_two_are_none(texts):
+    assert seconds(np.array([*texts, None], object), 1.0) is None
+
+
+def test_numbers_need_a_unit_of_any_size_and_datetimes_none():
+    numbers = np.array([0.0, 400.0, np.nan])
+    np.testing.assert_allclose(seconds(numbers, 25e-6), [0, 0.01, np.nan])
+    assert seconds(numbers, None) is None
+    dates = pd.to_datetime(["2023-05-04 10:00:00.00", None, "2023-05-04 10:00:00.01"]).to_numpy()
+    np.testing.assert_allclose(seconds(dates, None), [0, np.nan, 0.01])
+    np.testing.assert_allclose(seconds(dates - dates[0], None), [0, np.nan, 0.01])
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        (np.random.default_rng(0).choice([10, 20], 500), True),
+        (np.r_[0, np.random.default_rng(0).normal(8333, 20, 500)], True),
+        (np.full(500, 0.01), True),
+        (np.arange(500) * 0.01, False),
+        (np.mod(np.arange(500) * 997, 2**16), False),  # a counter that starts anew
+        (np.r_[np.arange(300), np.arange(200)], False),
+        (np.repeat(np.arange(50), 10), False),
+        (np.zeros(500), False),
+        (np.full(500, np.nan), False),
+    ],
+)
+def test_steps_since_the_last_row_are_told_from_times(values, expected):
+    assert are_steps(np.asarray(values, float)) is expected
