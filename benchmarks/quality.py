@@ -205,7 +205,9 @@ def tally(inspected: Iterable[Inspected]) -> str:
 
 def show_warm_ups(generator: np.random.Generator, count: int) -> None:
     """What happens to recordings at rest whose bias settles."""
-    print(f"\nof {count} recordings with a warm-up, a quarter of each sensor: how they end; findings")
+    print(
+        f"\nof {count} recordings with a warm-up, a quarter of each sensor: how they end; findings"
+    )
     for name, options in WARM_UPS.items():
         ends = tally(
             inspect(Log(at_rest(generator, sensor, **options)), sensor.rate_hz, QUALITY)  # type: ignore[arg-type]
@@ -222,7 +224,11 @@ def show_rest(generator: np.random.Generator, count: int) -> None:
         for name, noise in COLOURS.items():
             shape = (len(AXES), 60 * minutes * rate_hz)
             ends = tally(
-                inspect(still(simulate_noise(generator, shape, rate_hz, 5 * MDPS, **noise)), rate_hz, QUALITY)  # noqa: E501
+                inspect(
+                    still(simulate_noise(generator, shape, rate_hz, 5 * MDPS, **noise)),
+                    rate_hz,
+                    QUALITY,
+                )  # noqa: E501
                 for _ in range(count)
             )
             print(f"{rate_hz:4d} Hz, {minutes:3d} min, {name:24s} {ends}")
@@ -232,13 +238,17 @@ def show_rest(generator: np.random.Generator, count: int) -> None:
         simulate_noise(generator, shape, 5, 5 * MDPS, random_walk_dps_rts=0.1 * MDPS)
         for _ in range(few)
     )
-    print(f"of {few}, walk of 0.1 mdps/sqrt(s), 5 Hz, 2 h: {tally(inspect(still(x), 5, QUALITY) for x in walks)}")  # noqa: E501
+    print(
+        f"of {few}, walk of 0.1 mdps/sqrt(s), 5 Hz, 2 h: {tally(inspect(still(x), 5, QUALITY) for x in walks)}"
+    )  # noqa: E501
     sections = signal.butter(2, 5, fs=1000, output="sos")
     filtered = (
         signal.sosfilt(sections, generator.normal(0, 0.55, (len(AXES), 60_000)))[:, 1000:]
         for _ in range(few)
     )
-    print(f"of {few}, 0.05 deg/s below 5 Hz, 1 kHz, 1 min: {tally(inspect(still(x), 1000, QUALITY) for x in filtered)}")  # noqa: E501
+    print(
+        f"of {few}, 0.05 deg/s below 5 Hz, 1 kHz, 1 min: {tally(inspect(still(x), 1000, QUALITY) for x in filtered)}"
+    )  # noqa: E501
 
 
 def still(noise: Samples) -> Log:
