@@ -1,4 +1,7 @@
-"""A bias that moves smoothly at rest: it settles after power-on, or drifts on."""
+"""A bias that moves smoothly at rest: it settles after power-on, or drifts on.
+
+Means are (axis, block), noise is the standard deviation of one, (axis,), both in deg/s.
+"""
 
 from statistics import NormalDist
 
@@ -6,91 +9,73 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-SHORTEST = 2
-"""Blocks. What decays with a shorter time constant is no drift but the start of the recording."""
+Array = NDArray[np.float64]
 
 
 def fit_drift(
-    means: NDArray[np.float64],
-    times: NDArray[np.float64],
-    noise: NDArray[np.float64],
-    false_alarm: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    means: Array, times: Array, noise: Array, false_alarm: float, shortest: float = 2.0
+) -> tuple[Array, Array]:
     """Decays of one sign from the first block on, and a line, by least squares.
 
-    An axis on which none of them is significant alone has none, nor has one that a step explains
-    better: that is a movement.
+    An axis has no drift if none of them is significant by itself, which white noise is with a
+    probability of ``false_alarm``, or if a single step explains more: that is a movement.
 
     Args:
-        means: (axis, block), deg/s.
+        means: (axis, block).
         times: (block,), of their middles, in blocks.
-        noise: (axis,), deg/s, standard deviation of a block mean.
-        false_alarm: Probability that white noise has a drift.
+        noise: (axis,).
+        false_alarm: Probability.
+        shortest: Time constant of a drift, in blocks; what is faster is the recording's start.
 
     Returns:
-        The drift and, apart from it, what decays faster than a drift does: (axis, block), deg/s.
+        The drift, and what decays faster: (axis, block), deg/s.
     """
     duration = times[-1] - times[0]
-    slow = SHORTEST * 2.0 ** np.arange(np.ceil(np.log2(2 * duration / SHORTEST)))
-    constants = np.concatenate([[0.25, 1.0], slow])
-    decays = np.exp(-(times - times[0]) / constants[:, None])
+    slow = shortest * 2.0 ** np.arange(np.ceil(np.log2(2 * duration / shortest)))
+    decays = np.exp((times[0] - times) / np.r_[shortest / 8, shortest / 2, slow][:, None])
     shapes = np.vstack([decays, times / duration, -times / duration])
     centred = shapes - shapes.mean(axis=1, keepdims=True)
     rates = means - means.mean(axis=1, keepdims=True)
     alone = np.abs(rates @ centred.T) / np.sqrt((centred**2).sum(axis=1)) / noise[:, None]
     limit = -NormalDist().inv_cdf(false_alarm / (2 * alone.size))
-    drift, transient = np.zeros(means.shape), np.zeros(means.shape)
-    axes = np.flatnonzero(alone.max(axis=1) > limit)
-    if axes.size:
+    before = np.arange(1, times.size)
+    steps = np.cumsum(rates, axis=1)[:, :-1] ** 2 * (1 / before + 1 / before[::-1])
+    drift, fast = np.zeros(means.shape), np.zeros(means.shape)
+    for axis in np.flatnonzero(alone.max(axis=1) > limit):
         base, reduced = np.linalg.qr(centred.T)
-    for axis in axes:
-        target = rates[axis] @ base
+        target = base.T @ rates[axis]
         fits = [(sign, *optimize.nnls(reduced, sign * target)) for sign in (1, -1)]
         sign, weights, left = min(fits, key=lambda fit: fit[2])
-        rest = rates[axis] - base @ (base.T @ rates[axis])
-        if _left_by_step(rates[axis]) < left**2 + rest @ rest:
-            continue
-        drift[axis] = sign * weights[2:] @ shapes[2:]
-        transient[axis] = sign * weights[:2] @ shapes[:2]
-    return drift, transient
+        if target @ target - left**2 > steps[axis].max():
+            fast[axis], drift[axis] = (
+                sign * weights[:2] @ shapes[:2],
+                sign * weights[2:] @ shapes[2:],
+            )
+    return drift, fast
 
 
-def _left_by_step(rates: NDArray[np.float64]) -> float:
-    """Sum of squares, (deg/s)^2, about the best step of rates, (block,), whose mean is zero."""
-    before = np.arange(1, rates.size)
-    explained = np.cumsum(rates)[:-1] ** 2 * (1 / before + 1 / before[::-1])
-    return float(rates @ rates - explained.max())
-
-
-def describe_drift(drift: NDArray[np.float64], times_s: NDArray[np.float64]) -> tuple[float, float]:
-    """How far one axis drifts, and the time constant; infinite where it does not settle.
-
-    Args:
-        drift: (block,), deg/s, fitted.
-        times_s: (block,), seconds from the start of the recording.
-    """
-    change = float(drift[-1] - drift[0])
+def time_constant(drift: Array, times_s: Array) -> float:
+    """When 63 % of a drift, (block,), is done; infinite where it goes on in the last third."""
     done = np.abs(drift - drift[0])
-    late = done[-1] - np.interp(times_s[0] + (times_s[-1] - times_s[0]) * 2 / 3, times_s, done)
+    late = done[-1] - np.interp(times_s[0] / 3 + times_s[-1] * 2 / 3, times_s, done)
     if late > 0.15 * done.max():  # an exponential of half the duration
-        return change, np.inf
-    return change, float(times_s[np.argmax(done >= (1 - np.exp(-1)) * done[-1])])
+        return np.inf
+    return float(times_s[np.argmax(done >= (1 - np.exp(-1)) * done[-1])])
 
 
-def is_freed_of_bias(
-    means: NDArray[np.float64], noise: NDArray[np.float64], longest: int = 8
-) -> bool:
-    """Whether a level goes to zero on all axes at once: the sensor takes the bias off by itself.
+def goes_to_zero(means: Array, noise: Array, least_dps: float = 3e-3, longest: int = 8) -> bool:
+    """Whether a level goes to zero on all axes at once: the sensor takes its bias off by itself.
 
     Args:
-        means: (axis, block), deg/s, from the first row on.
-        noise: (axis,), deg/s, standard deviation of a block mean.
+        means: (axis, block), from the first row on.
+        noise: (axis,).
+        least_dps: Smaller means are zero.
         longest: Blocks in which it goes from 80 to 20 %: a warm-up takes longer.
     """
     late = means[:, -max(means.shape[1] // 4, 1) :]
-    zero = np.maximum(4 * noise / np.sqrt(late.shape[1]), 3e-3)
+    zero = np.maximum(4 * noise / np.sqrt(late.shape[1]), least_dps)
     level = np.abs(means[:, 0])
-    gone = (np.abs(late.mean(axis=1)) < zero).all()
-    was = np.count_nonzero(level > np.maximum(10 * zero, 5 * noise)) > 1
     share = np.abs(means[np.argmax(level)]) / level.max()
-    return bool(gone and was and np.count_nonzero((share > 0.2) & (share < 0.8)) <= longest)
+    was = np.count_nonzero(level > np.maximum(10 * zero, 5 * noise)) > 1
+    gone = (np.abs(late.mean(axis=1)) < zero).all()
+    return bool(was and gone and np.count_nonzero((share > 0.2) & (share < 0.8)) <= longest)
