@@ -8,8 +8,8 @@ the recording; a gap in time does. Limits know how many samples or blocks are co
 |---|---|---|
 | zero rows | first or last rows, zero on every axis | cut, kept |
 | gaps | the longest stretch between two is the recording | repaired |
-| non-finite, stuck values | no numbers; an axis that repeats a value for too long | masked, repaired |
-| spikes, shocks | rows beyond the noise, bursts of them with a block on either side | masked, repaired |
+| non-finite, stuck values | no numbers; an axis that holds a value too long | masked, repaired |
+| spikes, shocks | rows beyond the noise; bursts with a block about | masked, repaired |
 | start | a burst in the first rows, or what settles within two blocks | cut, repaired |
 | motion | a changed mean, raised noise, a burst too long, a drift too large | rejected |
 | bias taken off | a level that goes to zero on all axes | rejected |
@@ -31,7 +31,9 @@ from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding, Log
 from gyro_pipeline.parameters import LEAST_BLOCKS, Quality
 from gyro_pipeline.quality import values
 from gyro_pipeline.quality.blocks import (
+    Array,
     Blocks,
+    Mask,
     cut_blocks,
     excursions,
     fill,
@@ -42,9 +44,6 @@ from gyro_pipeline.quality.blocks import (
 )
 from gyro_pipeline.quality.drift import fit_drift, goes_to_zero, time_constant
 from gyro_pipeline.quality.rest import RestDetector
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 LARGEST_NUMBER = 1e12
 """Garbage bytes read as a number can be as large as 1e308, which overflows when it is squared."""
@@ -88,10 +87,9 @@ def inspect(log: Log, rate_hz: float, quality: Quality) -> Inspected:
             f"expected samples of {len(AXES)} axes, (n, {len(AXES)}), got shape {log.samples.shape}"
         )
     rates = np.ascontiguousarray(log.samples.T, dtype=np.float64)  # an axis at a time is 20x faster
-    recording = _Recording(rates, np.zeros(len(log.samples), bool), rate_hz, quality)
+    recording = _Recording(rates, log.gap_rows, rate_hz, quality)
     checks = (
         recording.mask_values,
-        lambda: recording.take_longest(log.gap_rows),
         recording.check_length,
         recording.check_values,
         recording.mask_bursts,
@@ -108,108 +106,101 @@ def inspect(log: Log, rate_hz: float, quality: Quality) -> Inspected:
     used = np.flatnonzero(~recording.masked)  # what is masked at the ends is cut
     first, last = (int(used[0]), int(used[-1]) + 1) if used.size else (0, 0)
     outcome = max((f.outcome for f in findings), key=(KEPT, REPAIRED, REJECTED).index, default=KEPT)
-    start = recording.start
-    masked = recording.masked[first:last]
-    return Inspected(outcome, start + first, start + last, masked, tuple(findings))
+    rows = recording.start + first, recording.start + last
+    return Inspected(outcome, *rows, recording.masked[first:last], tuple(findings))
 
 
 class _Recording:
-    """The rows of a log that are being judged; a check masks rows and returns its findings.
+    """The rows of a log that are being judged: checks mask some and return their findings."""
 
-    ``rates`` are (axis, n), deg/s, ``masked`` is (n,), ``start`` the row of the log that is first.
-    """
-
-    def __init__(self, rates: Array, masked: Mask, rate_hz: float, quality: Quality) -> None:
-        self.rates, self.masked, self.start, self.total = rates, masked, 0, masked.size
+    def __init__(
+        self, rates: Array, gap_rows: NDArray[np.integer], rate_hz: float, quality: Quality
+    ) -> None:
+        self.rates, self.masked = rates, np.zeros(rates.shape[1], bool)
+        self.start, self.total, self.gap_rows = 0, rates.shape[1], gap_rows
         self.rate_hz, self.quality = rate_hz, quality
         self.size = max(round(quality.block_s * rate_hz), LEAST_BLOCK)
-        self.moved = np.zeros(0, bool)  # rows of bursts that are too long for a shock
 
     def mask_values(self) -> list[Finding]:
-        """Rows whose values are no measurement: zeros at the ends, no numbers, values held."""
-        q, (first, last) = self.quality, rows_between_zeros(self.rates)
+        """Rows of no measurement: zeros at the ends, no numbers, values held; gaps, lastly."""
+        first, last = rows_between_zeros(self.rates)
+        zeros = (np.arange(self.total) < first) | (np.arange(self.total) >= last)
         finite = np.abs(self.rates) < LARGEST_NUMBER  # neither NaN nor infinity is
-        least = max(round(q.stuck_s * self.rate_hz), 2)
-        held = stuck(self.rates, least, q.false_alarm) & finite
-        zeros = np.ones(self.masked.size, bool)
-        zeros[first:last] = False
+        least = max(round(self.quality.stuck_s * self.rate_hz), 2)
+        held = stuck(self.rates, least, self.quality.false_alarm) & finite
         findings = self._mask("zero rows", zeros, "", KEPT)
         for check, samples in (("non-finite values", ~finite), ("stuck values", held)):
             rows = samples.any(axis=0) & ~self.masked
             axes = ", ".join(np.array(AXES)[samples[:, rows].any(axis=1)])
             findings += self._mask(check, rows, f"{'axes' if ',' in axes else 'axis'} {axes}, ")
+        start, stop = longest_stretch(self.masked, self.gap_rows)
+        self.rates, self.masked, self.start = (
+            self.rates[:, start:stop],
+            self.masked[start:stop],
+            start,
+        )
+        if self.gap_rows.size and start < stop:
+            detail = (
+                f"rows {start} to {stop - 1} of {self.total} are the longest stretch without one"
+            )
+            findings.append(Finding("gaps", REPAIRED, detail))
         return findings
 
-    def take_longest(self, gap_rows: NDArray[np.integer]) -> list[Finding]:
-        """The longest stretch between two gaps."""
-        start, stop = longest_stretch(self.masked, gap_rows)
-        self.rates, self.masked = self.rates[:, start:stop], self.masked[start:stop]
-        self.start, self.moved = start, np.zeros(stop - start, bool)
-        if not gap_rows.size or start == stop:
-            return []
-        detail = f"rows {start} to {stop - 1} of {self.total} are the longest stretch without one"
-        return [Finding("gaps", REPAIRED, detail)]
-
     def check_length(self) -> list[Finding]:
-        """Whether enough rows can be used, and enough of all."""
+        """Whether enough rows can be used, and enough of all between two gaps."""
         used, q = int(np.count_nonzero(~self.masked)), self.quality
         least = max(q.least_s * self.rate_hz, LEAST_BLOCKS * self.size)
         if used >= max(least, q.least_share * self.masked.size):
             return []
         detail = (
-            f"{used} of {self.total} rows can be used, {used / self.rate_hz:.4g} s; expected at least "
-            f"{least / self.rate_hz:.4g} s (quality.least_s) and {q.least_share:.0%} of the rows "
-            "between two gaps (quality.least_share)"
+            f"{used} of {self.total} rows can be used, {used / self.rate_hz:.4g} s; expected at "
+            f"least {least / self.rate_hz:.4g} s (quality.least_s) and {q.least_share:.0%} of the "
+            "rows between two gaps (quality.least_share)"
         )
         return [Finding("too short", REJECTED, detail)]
 
     def check_values(self) -> list[Finding]:
         """What the values say by themselves, as they are."""
         self._cut()
-        rates, sigma = self._used(), self.blocks.sigma
-        return _made(
-            values.check_axes(rates),
-            values.check_repeats(rates),
-            values.check_turns(rates, sigma),
-            values.check_steps(rates, sigma, self.quality.largest_step),
-        )
+        rates, sigma = self.rates[:, ~self.masked], self.blocks.sigma
+        steps = values.check_steps(rates, sigma, self.quality.largest_step)
+        turns = values.check_turns(rates, sigma)
+        return _made(values.check_axes(rates), values.check_repeats(rates), turns, steps)
 
     def mask_bursts(self, few: int = 3) -> list[Finding]:
         """Spikes of fewer than ``few`` rows; shocks, with a block about where it may still ring."""
         beyond = excursions(self.rates, self.blocks, self.quality.false_alarm)
-        if not beyond.any():
-            return []
-        kinds = {check: np.zeros(beyond.size, bool) for check in ("start", "shocks", "spikes")}
-        about = np.zeros(beyond.size, bool)
+        spikes, about, start, self.moved = np.zeros((4, beyond.size), bool)
         for first, last in runs(beyond):
             if last - first < few:
-                kinds["spikes"][first:last] = True
+                spikes[first:last] = True
             else:
                 about[max(first - self.size, 0) : last + self.size] = True
         for first, last in runs(about):
-            longest = self.quality.shock_s * self.rate_hz + 2 * self.size
-            check = "start" if first == 0 else "shocks"
-            rows = self.moved if last - first >= longest else kinds[check]
-            rows[first:last] = True
+            if last - first >= self.quality.shock_s * self.rate_hz + 2 * self.size:
+                self.moved[first:last], about[first:last] = True, False
+            elif first == 0:
+                start[:last], about[:last] = True, False
         findings = []
         level = np.median(self.blocks.means, axis=1, keepdims=True)
-        for check, rows in kinds.items():
+        for check, rows in (("start", start), ("shocks", about), ("spikes", spikes)):
             if rows.any():
                 apart = np.abs(self.rates[:, rows] - level).max(axis=1)
-                axis = int(np.argmax(apart))
-                what = f"up to {apart[axis]:.3g} deg/s from the level, axis {AXES[axis]}, "
+                what = (
+                    f"up to {apart.max():.3g} deg/s from the level, axis {AXES[apart.argmax()]}, "
+                )
                 findings += self._mask(check, rows & ~self.masked, what)
-        self._cut()
+        if findings:
+            self._cut()
         return findings
 
     def check_noise(self) -> list[Finding]:
         """What the values say once what is brief is masked."""
-        rates, seconds = self._used(), np.array([[1], [self.size]]) / self.rate_hz
+        rates, seconds = self.rates[:, ~self.masked], np.array([[1], [self.size]]) / self.rate_hz
         noise = np.array([self.blocks.sigma, self.blocks.noise])  # a filter leaves N to the means
         density = (noise * np.sqrt(seconds)).max(axis=0)
-        largest = self.quality.largest_noise_dps
-        checks = values.check_zeros(rates), values.check_tops(rates)
-        return _made(*checks, values.check_noise(rates, density, largest))
+        level = values.check_noise(rates, density, self.quality.largest_noise_dps)
+        return _made(values.check_zeros(rates), values.check_tops(rates), level)
 
     def check_rest(self) -> list[Finding]:
         """Motion, a bias that is taken off, and a drift."""
@@ -229,16 +220,26 @@ class _Recording:
         if motion:
             return [Finding("motion", REJECTED, motion)]
         start = np.arange(self.masked.size) < rest.starts[0]
-        cut = self._mask("start", start, "settles at once, ") if first else []
-        return cut + self._drifts(drift, times[first:] * self.size / self.rate_hz)
+        findings = self._mask("start", start, "settles at once, ") if first else []
+        for name, axis in zip(AXES, drift, strict=True):
+            if np.ptp(axis) > q.drift_mdps * MDPS:
+                constant_s = time_constant(axis, times[first:] * self.size / self.rate_hz)
+                settles = np.isfinite(constant_s)
+                end = (
+                    f"time constant about {constant_s:.2g} s"
+                    if settles
+                    else "not settled at its end"
+                )
+                size = f"axis {name} by {(axis[-1] - axis[0]) / MDPS:+.3g} mdps"
+                findings.append(Finding("warm-up" if settles else "drift", KEPT, f"{size}, {end}"))
+        return findings
 
     def _motion(self, blocks: Blocks, drift: Array) -> str:
         """What shows that the gyroscope moved; empty at rest."""
-        left, q = blocks.means - drift, self.quality
-        size = np.ptp(drift, axis=1)
-        if size.max() > q.largest_drift_dps:
+        left, q, drifts = blocks.means - drift, self.quality, np.ptp(drift, axis=1)
+        if drifts.max() > q.largest_drift_dps:
             return (
-                f"the rate drifts by {size.max():.2g} deg/s, axis {AXES[int(np.argmax(size))]}; expected "
+                f"the rate drifts by {drifts.max():.2g} deg/s, axis {AXES[drifts.argmax()]}; expected "
                 f"at most {q.largest_drift_dps:g} of a bias (quality.largest_drift_dps)"
             )
         detector = RestDetector(self.size, q.false_alarm, q.least_change_dps)
@@ -249,47 +250,27 @@ class _Recording:
             apart = np.abs(left - np.median(left, axis=1, keepdims=True))
             axis = int(np.argmax(apart.max(axis=1) / blocks.noise))
             far = (apart > q.least_change_dps + 6 * blocks.noise[:, None]).any(axis=0)
-            where = self._where(self._rows(blocks, far if far.any() else changed) | self.moved)
-            return f"the rate changes by up to {apart[axis].max():.2g} deg/s, axis {AXES[axis]}, {where}"
-        if not noisier.any():
+            size = f"{apart[axis].max():.2g} deg/s, axis {AXES[axis]}"
+            text, alarms = f"the rate changes by up to {size}", changed
+        elif noisier.any():
+            rise = np.sqrt(blocks.variances) / blocks.sigma[:, None]
+            far = (rise > detector.least_rise).any(axis=0)
+            text, alarms = f"the noise rises up to {rise.max():.2g}-fold", noisier
+        else:
             return ""
-        rise = np.sqrt(blocks.variances) / blocks.sigma[:, None]
-        far = (rise > detector.least_rise).any(axis=0)
-        where = self._where(self._rows(blocks, far if far.any() else noisier))
-        return f"the noise rises up to {rise.max():.2g}-fold, {where}"
-
-    def _drifts(self, drift: Array, times_s: Array) -> list[Finding]:
-        """Warm-ups and drifts of at least the size that is reported."""
-        details: dict[str, list[str]] = {"warm-up": [], "drift": []}
-        for name, axis in zip(AXES, drift, strict=True):
-            if np.ptp(axis) > self.quality.drift_mdps * MDPS:
-                constant_s = time_constant(axis, times_s)
-                text = f"axis {name} by {(axis[-1] - axis[0]) / MDPS:+.3g} mdps"
-                if np.isfinite(constant_s):
-                    details["warm-up"].append(f"{text} (time constant about {constant_s:.2g} s)")
-                else:
-                    details["drift"].append(f"{text}, not settled when the recording ends")
-        return [Finding(check, KEPT, ", ".join(text)) for check, text in details.items() if text]
+        rows = self.moved.copy()
+        rows[blocks.starts[far if far.any() else alarms, None] + np.arange(self.size)] = True
+        return f"{text}, {self._where(rows)}"
 
     def _cut(self) -> None:
         self.rates = fill(self.rates, self.masked)
         self.blocks = cut_blocks(self.rates, self.masked, self.size)
 
-    def _used(self) -> Array:
-        return self.rates[:, ~self.masked] if self.masked.any() else self.rates
-
     def _mask(self, check: str, rows: Mask, what: str, outcome: str = REPAIRED) -> list[Finding]:
         """Mask rows, and say so if there are any."""
-        if not rows.any():
-            return []
         self.masked = self.masked | rows
         done = "cut" if check in {"zero rows", "start"} else "masked"
-        return [Finding(check, outcome, f"{what}{self._where(rows)}, {done}")]
-
-    def _rows(self, blocks: Blocks, chosen: Mask) -> Mask:
-        rows = np.zeros(self.masked.size, bool)
-        rows[blocks.starts[chosen, None] + np.arange(self.size)] = True
-        return rows
+        return [Finding(check, outcome, f"{what}{self._where(rows)}, {done}")] * int(rows.any())
 
     def _where(self, rows: Mask, most: int = 5) -> str:
         """Rows of the log, for a person; long runs with their times."""

@@ -19,18 +19,19 @@ Mask = NDArray[np.bool_]
 class Blocks:
     """Blocks of ``size`` rows: first rows (block,), and (axis, block) in deg/s what they hold.
 
-    ``reach`` is the largest distance of a sample from the mean, ``variances`` are about it.
+    ``variances`` are about the means, ``apart`` and ``reach`` the mean and largest distance to them.
     """
 
     size: int
     starts: NDArray[np.integer]
     means: Array
     variances: Array
+    apart: Array
     reach: Array
 
     def where(self, chosen: Mask | slice) -> "Blocks":
         """Some of them."""
-        arrays = (self.starts, self.means, self.variances, self.reach)
+        arrays = (self.starts, self.means, self.variances, self.apart, self.reach)
         return Blocks(self.size, *(array[..., chosen] for array in arrays))
 
     @cached_property
@@ -68,10 +69,11 @@ def cut_blocks(rates: Array, masked: Mask, size: int) -> Blocks:
     means = samples.mean(axis=-1)
     apart = samples - means[..., None]
     squares = np.einsum("abs,abs->ab", apart, apart)
-    reach = np.abs(apart, out=apart).max(axis=-1)
+    apart = np.abs(apart, out=apart)
     lost = np.concatenate([[0], np.cumsum(masked)])
     used = size - (lost[starts + size] - lost[starts])
-    blocks = Blocks(size, starts, means, squares / np.maximum(used - 1, 1), reach)
+    variances = squares / np.maximum(used - 1, 1)
+    blocks = Blocks(size, starts, means, variances, apart.mean(axis=-1), apart.max(axis=-1))
     return blocks if used.min() == size else blocks.where(used >= 0.75 * size)
 
 
@@ -118,10 +120,12 @@ def excursions(rates: Array, blocks: Blocks, false_alarm: float) -> Mask:
     """Rows farther from the level about them than noise explains.
 
     The level is the median of the means of nine blocks, so that a movement does not hide itself.
-    White noise has such a row with a probability of ``false_alarm``, however many samples there are.
+    White noise has any with a probability of ``false_alarm``, however many samples there are.
     """
     normal = -NormalDist().inv_cdf(false_alarm / (2 * rates.size))
-    limits = normal * np.sqrt(1 + np.pi / (18 * blocks.size)) * blocks.sigma[:, None]
+    # sigma from distances: squares would let frequent spikes hide themselves
+    sigma = np.median(blocks.apart, axis=1) * np.sqrt(np.pi / 2 * blocks.size / (blocks.size - 1))
+    limits = normal * np.sqrt(1 + np.pi / (18 * blocks.size)) * sigma[:, None]
     beyond = np.zeros(rates.shape[1], bool)
     if (blocks.reach < 0.8 * limits).all():  # one sample of five moves their mean by a fifth
         return beyond

@@ -6,10 +6,9 @@ Means are (axis, block), noise is the standard deviation of one, (axis,), both i
 from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize
 
-Array = NDArray[np.float64]
+from gyro_pipeline.quality.blocks import Array
 
 
 def fit_drift(
@@ -75,7 +74,7 @@ def goes_to_zero(means: Array, noise: Array, least_dps: float = 3e-3, longest: i
     late = means[:, -max(means.shape[1] // 4, 1) :]
     zero = np.maximum(4 * noise / np.sqrt(late.shape[1]), least_dps)
     level = np.abs(means[:, 0])
-    share = np.abs(means[np.argmax(level)]) / level.max()
+    middle = np.abs(np.abs(means[np.argmax(level)]) / level.max() - 0.5) < 0.3  # noqa: PLR2004
     was = np.count_nonzero(level > np.maximum(10 * zero, 5 * noise)) > 1
     gone = (np.abs(late.mean(axis=1)) < zero).all()
-    return bool(was and gone and np.count_nonzero((share > 0.2) & (share < 0.8)) <= longest)
+    return bool(was and gone and np.count_nonzero(middle) <= longest)

@@ -7,12 +7,11 @@ check returns its finding, if there is one.
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import AXES, MDPS
 from gyro_pipeline.logs import KEPT, REJECTED, Finding
+from gyro_pipeline.quality.blocks import Array
 
-Array = NDArray[np.float64]
 READER = "in `reader:` of the catalog entry in catalog.yml"
 
 
@@ -48,10 +47,12 @@ def check_repeats(rates: Array, reported: float = 0.01, most: float = 0.2) -> Fi
 
 
 def check_turns(rates: Array, sigma: Array, least: float = 0.5, period: int = 12) -> Finding | None:
-    """Rows of several levels in turn: any divisor of ``period``, apart by ``least`` of the noise."""
+    """Rows of levels in turn, ``period`` or a divisor of it, apart by ``least`` of the noise."""
     turns = rates[:, : rates.shape[1] // period * period].reshape(len(rates), -1, period)
+    slope = (turns[:, -1].mean(axis=1) - turns[:, 0].mean(axis=1)) / rates.shape[1]
 
     def excess(levels: Array) -> Array:
+        levels = levels - slope[:, None] * np.arange(period)
         about = np.sqrt(np.maximum(sigma**2 - levels.var(axis=1), 0.01 * sigma**2))
         chance = 8 / np.sqrt(turns.shape[1])  # the range of so many means or medians, at most
         return np.ptp(levels, axis=1) - max(least, chance) * about
@@ -63,10 +64,11 @@ def check_turns(rates: Array, sigma: Array, least: float = 0.5, period: int = 12
     if excess(levels)[axis] <= 0:
         return None
     size = np.ptp(levels[axis])
-    every = [np.ptp(levels[axis].reshape(-1, p), axis=0).max() < size / 2 for p in (2, 3, 4, 6, 12)]
+    ranges = {p: np.ptp(levels[axis].reshape(-1, p), axis=0).max() for p in (2, 3, 4, 6, period)}
+    every = min(p for p in ranges if ranges[p] < size / 2)
     detail = (
-        f"every {(2, 3, 4, 6, 12)[every.index(True)]} rows the level of axis {AXES[axis]} differs, by "
-        f"{size:.3g} deg/s: several sensors in one file? Pick one by `rows: {{COLUMN: VALUE}}` {READER}"
+        f"every {every} rows axis {AXES[axis]} is at another level, {size:.3g} deg/s off: several "
+        f"sensors in one file? Pick one by `rows: {{COLUMN: VALUE}}` {READER}"
     )
     return Finding("alternating rows", REJECTED, detail)
 
@@ -81,8 +83,8 @@ def check_zeros(rates: Array, least: int = 8) -> Finding | None:
         # a quantisation step has one level there, noise far from zero more samples
         if counts.size > 2 and zeros > max(2 * counts.max(), near.size / 3):  # noqa: PLR2004
             detail = (
-                f"axis {AXES[axis]} has {zeros} zeros in a dead band of ± {band:.2g} deg/s; the mean is "
-                "pulled to zero. Record without it"
+                f"axis {AXES[axis]} has {zeros} zeros in a dead band of ± {band:.2g} deg/s; the mean "
+                "is pulled to zero. Record without it"
             )
             return Finding("dead band", REJECTED, detail)
     return None
@@ -119,7 +121,7 @@ def check_steps(
     # rounding to a step adds step^2 / 12 to the variance (Sheppard)
     noise = np.sqrt(np.maximum(sigma**2 - steps**2 / 12, 0))
     axis = int(np.argmax(steps - largest * noise))
-    if steps[axis] <= reported * noise[axis]:
+    if steps[axis] <= noise[axis]:
         return None
     detail = (
         f"axis {AXES[axis]} has a step of {steps[axis] / MDPS:.4g} mdps beside a noise of "
@@ -149,7 +151,7 @@ def check_noise(
     if density.max() >= least_mdps_rts * MDPS:
         return None
     detail = (
-        f"less noise than any MEMS gyroscope has, N is {density.max() / MDPS:.2g} mdps sqrt(s): check "
-        f"the unit (`units` {READER})"
+        f"N is {density.max() / MDPS:.2g} mdps sqrt(s), less noise than any MEMS gyroscope has; "
+        f"check the unit (`units` {READER})"
     )
     return Finding("little noise", KEPT, detail)
