@@ -209,14 +209,16 @@ class _Recording:
             return []  # too short
         times = blocks.starts / self.size + 0.5
         drift, fast = fit_drift(blocks.means, times, blocks.noise, q.false_alarm)
-        large = np.abs(fast).max(axis=1) > q.least_change_dps  # a smaller start harms nothing
+        # a smaller start harms nothing
+        large = np.abs(fast).max(axis=1) > q.least_change_dps + 6 * blocks.noise
         first = int(np.argmax((np.abs(fast) <= blocks.noise[:, None])[large].all(axis=0)))
         rest, drift = blocks.where(slice(first, None)), drift[:, first:]
         motion = self._motion(rest, drift)
-        whole = cut_blocks(self.rates, np.zeros_like(self.masked), self.size)
-        if (motion or first or drift.any()) and goes_to_zero(whole.means, blocks.noise):
-            detail = "the level goes to zero on all axes: the sensor does it; record its raw rates"
-            return [Finding("bias taken off", REJECTED, detail)]
+        if motion or first or drift.any():
+            whole = cut_blocks(self.rates, np.zeros_like(self.masked), self.size)
+            if goes_to_zero(whole.means, blocks.noise):
+                detail = "the sensor takes its level to zero on all axes; log its raw rates"
+                return [Finding("bias taken off", REJECTED, detail)]
         if motion:
             return [Finding("motion", REJECTED, motion)]
         start = np.arange(self.masked.size) < rest.starts[0]
