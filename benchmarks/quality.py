@@ -3,7 +3,7 @@
     python benchmarks/quality.py                # everything, some five minutes
     python benchmarks/quality.py --repeat 10    # a tenth of the recordings
 
-Disturbances and warm-ups are added to the noise of the four embedded sensors (conf/base/globals.yml)
+Disturbances and warm-ups are added to the noise of the four embedded sensors, conf/base/globals.yml,
 at their rates, 13,000 samples a recording. Its last results: benchmarks/README.md.
 """
 
@@ -223,32 +223,25 @@ def show_rest(generator: np.random.Generator, count: int) -> None:
     for rate_hz, minutes in LENGTHS:
         for name, noise in COLOURS.items():
             shape = (len(AXES), 60 * minutes * rate_hz)
-            ends = tally(
-                inspect(
-                    still(simulate_noise(generator, shape, rate_hz, 5 * MDPS, **noise)),
-                    rate_hz,
-                    QUALITY,
-                )  # noqa: E501
-                for _ in range(count)
+            draws = (
+                simulate_noise(generator, shape, rate_hz, 5 * MDPS, **noise) for _ in range(count)
             )
+            ends = tally(inspect(still(draw), rate_hz, QUALITY) for draw in draws)
             print(f"{rate_hz:4d} Hz, {minutes:3d} min, {name:24s} {ends}")
-    few = count // 10
-    shape = (len(AXES), 36_000)
-    walks = (
+    few, shape = count // 10, (len(AXES), 36_000)
+    draws = (
         simulate_noise(generator, shape, 5, 5 * MDPS, random_walk_dps_rts=0.1 * MDPS)
         for _ in range(few)
     )
-    print(
-        f"of {few}, walk of 0.1 mdps/sqrt(s), 5 Hz, 2 h: {tally(inspect(still(x), 5, QUALITY) for x in walks)}"
-    )  # noqa: E501
+    ends = tally(inspect(still(draw), 5, QUALITY) for draw in draws)
+    print(f"of {few}, walk of 0.1 mdps/sqrt(s), 5 Hz, 2 h: {ends}")
     sections = signal.butter(2, 5, fs=1000, output="sos")
-    filtered = (
-        signal.sosfilt(sections, generator.normal(0, 0.55, (len(AXES), 60_000)))[:, 1000:]
+    draws = (
+        signal.sosfilt(sections, generator.normal(0, 0.55, (len(AXES), 61_000)))[:, 1000:]
         for _ in range(few)
     )
-    print(
-        f"of {few}, 0.05 deg/s below 5 Hz, 1 kHz, 1 min: {tally(inspect(still(x), 1000, QUALITY) for x in filtered)}"
-    )  # noqa: E501
+    ends = tally(inspect(still(draw), 1000, QUALITY) for draw in draws)
+    print(f"of {few}, 0.05 deg/s below 5 Hz, 1 kHz, 1 min: {ends}")
 
 
 def still(noise: Samples) -> Log:

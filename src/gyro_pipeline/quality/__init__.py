@@ -38,7 +38,6 @@ from gyro_pipeline.quality.blocks import (
     excursions,
     fill,
     longest_stretch,
-    rows_between_zeros,
     runs,
     stuck,
 )
@@ -123,8 +122,8 @@ class _Recording:
 
     def mask_values(self) -> list[Finding]:
         """Rows of no measurement: zeros at the ends, no numbers, values held; gaps, lastly."""
-        first, last = rows_between_zeros(self.rates)
-        zeros = (np.arange(self.total) < first) | (np.arange(self.total) >= last)
+        zeros, all_so_far = ~np.any(self.rates, axis=0), np.logical_and.accumulate
+        zeros = all_so_far(zeros) | all_so_far(zeros[::-1])[::-1]
         finite = np.abs(self.rates) < LARGEST_NUMBER  # neither NaN nor infinity is
         least = max(round(self.quality.stuck_s * self.rate_hz), 2)
         held = stuck(self.rates, least, self.quality.false_alarm) & finite
@@ -134,15 +133,10 @@ class _Recording:
             axes = ", ".join(np.array(AXES)[samples[:, rows].any(axis=1)])
             findings += self._mask(check, rows, f"{'axes' if ',' in axes else 'axis'} {axes}, ")
         start, stop = longest_stretch(self.masked, self.gap_rows)
-        self.rates, self.masked, self.start = (
-            self.rates[:, start:stop],
-            self.masked[start:stop],
-            start,
-        )
+        self.rates, self.masked = self.rates[:, start:stop], self.masked[start:stop]
+        self.start = start
         if self.gap_rows.size and start < stop:
-            detail = (
-                f"rows {start} to {stop - 1} of {self.total} are the longest stretch without one"
-            )
+            detail = f"rows {start} to {stop - 1}, of {self.total}, are the longest stretch"
             findings.append(Finding("gaps", REPAIRED, detail))
         return findings
 
@@ -162,7 +156,7 @@ class _Recording:
     def check_values(self) -> list[Finding]:
         """What the values say by themselves, as they are."""
         self._cut()
-        rates, sigma = self.rates[:, ~self.masked], self.blocks.sigma
+        rates, sigma = self.used, self.blocks.sigma
         steps = values.check_steps(rates, sigma, self.quality.largest_step)
         turns = values.check_turns(rates, sigma)
         return _made(values.check_axes(rates), values.check_repeats(rates), turns, steps)
@@ -185,10 +179,8 @@ class _Recording:
         level = np.median(self.blocks.means, axis=1, keepdims=True)
         for check, rows in (("start", start), ("shocks", about), ("spikes", spikes)):
             if rows.any():
-                apart = np.abs(self.rates[:, rows] - level).max(axis=1)
-                what = (
-                    f"up to {apart.max():.3g} deg/s from the level, axis {AXES[apart.argmax()]}, "
-                )
+                far = np.abs(self.rates[:, rows] - level).max(axis=1)
+                what = f"up to {far.max():.3g} deg/s from the level, axis {AXES[far.argmax()]}, "
                 findings += self._mask(check, rows & ~self.masked, what)
         if findings:
             self._cut()
@@ -196,7 +188,7 @@ class _Recording:
 
     def check_noise(self) -> list[Finding]:
         """What the values say once what is brief is masked."""
-        rates, seconds = self.rates[:, ~self.masked], np.array([[1], [self.size]]) / self.rate_hz
+        rates, seconds = self.used, np.array([[1], [self.size]]) / self.rate_hz
         noise = np.array([self.blocks.sigma, self.blocks.noise])  # a filter leaves N to the means
         density = (noise * np.sqrt(seconds)).max(axis=0)
         level = values.check_noise(rates, density, self.quality.largest_noise_dps)
@@ -212,8 +204,13 @@ class _Recording:
         # a smaller start harms nothing
         large = np.abs(fast).max(axis=1) > q.least_change_dps + 6 * blocks.noise
         first = int(np.argmax((np.abs(fast) <= blocks.noise[:, None])[large].all(axis=0)))
+        changed, noisier = self._alarms(blocks.where(slice(first, None)), drift[:, first:])
+        if not changed.any() and not noisier[2:].any():  # a start that is only noisier
+            first += int(np.append(-1, np.flatnonzero(noisier))[-1]) + 1
+            noisier[:] = False
         rest, drift = blocks.where(slice(first, None)), drift[:, first:]
-        motion = self._motion(rest, drift)
+        size = len(rest.starts)
+        motion = self._motion(rest, drift, changed[-size:], noisier[-size:])
         if motion or first or drift.any():
             whole = cut_blocks(self.rates, np.zeros_like(self.masked), self.size)
             if goes_to_zero(whole.means, blocks.noise):
@@ -226,47 +223,49 @@ class _Recording:
         for name, axis in zip(AXES, drift, strict=True):
             if np.ptp(axis) > q.drift_mdps * MDPS:
                 constant_s = time_constant(axis, times[first:] * self.size / self.rate_hz)
-                settles = np.isfinite(constant_s)
-                end = (
-                    f"time constant about {constant_s:.2g} s"
-                    if settles
-                    else "not settled at its end"
-                )
-                size = f"axis {name} by {(axis[-1] - axis[0]) / MDPS:+.3g} mdps"
-                findings.append(Finding("warm-up" if settles else "drift", KEPT, f"{size}, {end}"))
+                check, end = "warm-up", f"time constant about {constant_s:.2g} s"
+                if np.isinf(constant_s):
+                    check, end = "drift", "not settled at the end"
+                change = f"axis {name} by {(axis[-1] - axis[0]) / MDPS:+.3g} mdps"
+                findings.append(Finding(check, KEPT, f"{change}, {end}"))
         return findings
 
-    def _motion(self, blocks: Blocks, drift: Array) -> str:
+    def _alarms(self, blocks: Blocks, drift: Array) -> tuple[Mask, Mask]:
+        """Blocks whose mean changes, and whose noise rises, once the drift is taken off."""
+        detector = RestDetector(self.size, self.quality.false_alarm, self.quality.least_change_dps)
+        # forwards and backwards: its first blocks have little before them to be compared with
+        series = (np.hstack([x.T, x.T[::-1]]) for x in (blocks.means - drift, blocks.variances))
+        axes = len(AXES)
+        changed, noisier = (x[:, :axes] | x[::-1, axes:] for x in detector.update(*series))
+        return np.any(changed, axis=1), np.any(noisier, axis=1)
+
+    def _motion(self, blocks: Blocks, drift: Array, changed: Mask, noisier: Mask) -> str:
         """What shows that the gyroscope moved; empty at rest."""
-        left, q, drifts = blocks.means - drift, self.quality, np.ptp(drift, axis=1)
+        q, drifts, left = self.quality, np.ptp(drift, axis=1), blocks.means - drift
         if drifts.max() > q.largest_drift_dps:
             return (
-                f"the rate drifts by {drifts.max():.2g} deg/s, axis {AXES[drifts.argmax()]}; expected "
-                f"at most {q.largest_drift_dps:g} of a bias (quality.largest_drift_dps)"
+                f"the rate drifts by {drifts.max():.2g} deg/s, axis {AXES[drifts.argmax()]}; a "
+                f"bias by at most {q.largest_drift_dps:g} (quality.largest_drift_dps)"
             )
-        detector = RestDetector(self.size, q.false_alarm, q.least_change_dps)
-        # forwards and backwards: its first blocks have little before them to be compared with
-        series = (np.hstack([x.T, x.T[::-1]]) for x in (left, blocks.variances))
-        changed, noisier = ((x[:, :3] | x[::-1, 3:]).any(axis=1) for x in detector.update(*series))
         if changed.any() or self.moved.any():
             apart = np.abs(left - np.median(left, axis=1, keepdims=True))
             axis = int(np.argmax(apart.max(axis=1) / blocks.noise))
             far = (apart > q.least_change_dps + 6 * blocks.noise[:, None]).any(axis=0)
-            size = f"{apart[axis].max():.2g} deg/s, axis {AXES[axis]}"
-            text, alarms = f"the rate changes by up to {size}", changed
-        elif noisier.any():
-            rise = np.sqrt(blocks.variances) / blocks.sigma[:, None]
-            far = (rise > detector.least_rise).any(axis=0)
-            text, alarms = f"the noise rises up to {rise.max():.2g}-fold", noisier
+            text = f"the rate changes by up to {apart[axis].max():.2g} deg/s, axis {AXES[axis]}"
         else:
-            return ""
-        rows = self.moved.copy()
-        rows[blocks.starts[far if far.any() else alarms, None] + np.arange(self.size)] = True
-        return f"{text}, {self._where(rows)}"
+            rise = np.sqrt(blocks.variances) / blocks.sigma[:, None]
+            far = noisier & (rise > 1).any(axis=0)
+            text = f"the noise rises up to {rise.max():.2g}-fold"
+        rows, far = self.moved.copy(), far if far.any() else changed | noisier
+        rows[blocks.starts[far, None] + np.arange(self.size)] = True
+        return f"{text}, {self._where(rows)}" * int(rows.any())
 
     def _cut(self) -> None:
         self.rates = fill(self.rates, self.masked)
         self.blocks = cut_blocks(self.rates, self.masked, self.size)
+        self.used = self.rates
+        if self.masked.any():
+            self.used = self.rates.compress(~self.masked, axis=1)
 
     def _mask(self, check: str, rows: Mask, what: str, outcome: str = REPAIRED) -> list[Finding]:
         """Mask rows, and say so if there are any."""

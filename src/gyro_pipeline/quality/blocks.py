@@ -19,7 +19,7 @@ Mask = NDArray[np.bool_]
 class Blocks:
     """Blocks of ``size`` rows: first rows (block,), and (axis, block) in deg/s what they hold.
 
-    ``variances`` are about the means, ``apart`` and ``reach`` the mean and largest distance to them.
+    ``variances`` are about the means, ``apart`` and ``reach`` mean and largest distance to them.
     """
 
     size: int
@@ -31,8 +31,8 @@ class Blocks:
 
     def where(self, chosen: Mask | slice) -> "Blocks":
         """Some of them."""
-        arrays = (self.starts, self.means, self.variances, self.apart, self.reach)
-        return Blocks(self.size, *(array[..., chosen] for array in arrays))
+        arrays = (self.means, self.variances, self.apart, self.reach)
+        return Blocks(self.size, self.starts[chosen], *(array[:, chosen] for array in arrays))
 
     @cached_property
     def sigma(self) -> Array:
@@ -75,15 +75,6 @@ def cut_blocks(rates: Array, masked: Mask, size: int) -> Blocks:
     variances = squares / np.maximum(used - 1, 1)
     blocks = Blocks(size, starts, means, variances, apart.mean(axis=-1), apart.max(axis=-1))
     return blocks if used.min() == size else blocks.where(used >= 0.75 * size)
-
-
-def rows_between_zeros(rates: Array) -> tuple[int, int]:
-    """First row that is not zero on every axis, and the row after the last; equal if all are."""
-    n = rates.shape[1]
-    if n and rates[:, 0].any() and rates[:, -1].any():
-        return 0, n
-    rows = np.flatnonzero(rates.any(axis=0))
-    return (int(rows[0]), int(rows[-1]) + 1) if rows.size else (n, n)
 
 
 def longest_stretch(masked: Mask, gap_rows: NDArray[np.integer]) -> tuple[int, int]:

@@ -70,7 +70,7 @@ class RestDetector:
         count = self.blocks - len(sums) + 1 + np.arange(len(sums))  # blocks up to each row
         chance, noise, worth, sways = self._limits(sums, count)
         first = len(sums) - len(means)
-        moved, noisier = sways[first:].copy(), np.zeros(means.shape, bool)
+        moved, noisier = sways[first:], np.zeros(means.shape, bool)
         for lag in self.lags:
             rows = np.arange(max(first, lag + (count[0] == 0)), len(sums))
             before, start = rows - lag, np.maximum(rows - lag - self.reference, 0)
@@ -95,7 +95,7 @@ class RestDetector:
         self.blocks, self._last = self.blocks + len(series), series[-1:]
         return np.vstack([sums[:-1], np.add.accumulate(np.vstack([sums[-1:], new]))])
 
-    def _limits(self, sums: Array, count: NDArray[np.integer]) -> tuple[Array, Array, Array, Array]:
+    def _limits(self, sums: Array, count: NDArray[np.integer]) -> tuple[NDArray, ...]:
         """After each row: what chance allows one block of both series, noise, its worth, sways."""
         axes, known = sums.shape[1] // 5, self.known
         worth = np.maximum(count, 1)[:, None] + known

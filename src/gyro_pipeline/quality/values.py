@@ -83,8 +83,8 @@ def check_zeros(rates: Array, least: int = 8) -> Finding | None:
         # a quantisation step has one level there, noise far from zero more samples
         if counts.size > 2 and zeros > max(2 * counts.max(), near.size / 3):  # noqa: PLR2004
             detail = (
-                f"axis {AXES[axis]} has {zeros} zeros in a dead band of ± {band:.2g} deg/s; the mean "
-                "is pulled to zero. Record without it"
+                f"axis {AXES[axis]} has {zeros} zeros in a dead band of ± {band:.2g} deg/s; the "
+                "mean is pulled to zero. Record without it"
             )
             return Finding("dead band", REJECTED, detail)
     return None
@@ -120,7 +120,7 @@ def check_steps(
         steps[axis] = np.quantile(changes[axis][changes[axis] > 0], 0.01, method="lower")
     # rounding to a step adds step^2 / 12 to the variance (Sheppard)
     noise = np.sqrt(np.maximum(sigma**2 - steps**2 / 12, 0))
-    axis = int(np.argmax(steps - largest * noise))
+    axis = np.argmax(steps - largest * noise)
     if steps[axis] <= noise[axis]:
         return None
     detail = (
