@@ -25,7 +25,8 @@ ALLOWED = {
     "tracking": {"conventions"},
     "physics": {"conventions"},
     "estimators": {"conventions", "learning", "physics"},
-    "protocol": {"conventions", "logs", "parameters", "physics"},
+    "quality": {"conventions", "logs", "parameters", "physics"},
+    "protocol": {"conventions", "logs", "parameters", "physics", "quality"},
     "learning": {"conventions", "executors", "parameters", "protocol"},
     "datasets": {
         "conventions",
@@ -179,7 +180,12 @@ def test_physics_is_numpy():
         assert roots(names) <= known, name
 
 
-@pytest.mark.parametrize("part", ["physics", "protocol", "estimators", "learning"])
+def test_the_test_of_rest_is_numpy_alone():
+    (names,) = [names for name, names in names_of("quality").items() if name.endswith(".rest")]
+    assert roots(names) <= {"numpy", *sys.stdlib_module_names}
+
+
+@pytest.mark.parametrize("part", ["physics", "protocol", "quality", "estimators", "learning"])
 def test_the_science_knows_neither_kedro_nor_mlflow(part):
     assert names_of(part)
     for name, names in names_of(part).items():

@@ -214,30 +214,29 @@ def _check_unit(option: str, text: str, quantity: str) -> None:
 
 
 class Quality(Parameter):
-    """What quality control asks of a recording (gyro_pipeline.protocol.quality).
+    """What quality control asks of a recording (gyro_pipeline.quality).
 
-    Its thresholds are multiples of the recording's own noise, chosen by ``false_alarm``.
+    Other thresholds are multiples of the recording's own noise, chosen by ``false_alarm``.
     """
 
-    least_s: float = Field(gt=0, description="shortest stretch that is kept, seconds")
+    least_s: float = Field(gt=0, description="of samples that can be used, seconds")
     least_share: float = Field(
-        gt=0,
-        le=1,
-        description="of a recording's rows, in the stretch that is kept of it, where all of a "
-        "sensor's recordings are cut to the shortest one (length_s: null)",
+        gt=0, le=1, description="of the rows between two gaps that must remain unmasked"
     )
     false_alarm: float = Field(
         gt=0, lt=0.5, description="probability of an alarm, for each check of a recording at rest"
     )
     block_s: float = Field(gt=0, description="of the blocks whose means are compared, seconds")
-    lags_s: list[Annotated[float, Field(gt=0)]] = Field(
-        min_length=1, description="between compared blocks, seconds; long ones see slow onsets"
+    least_change_dps: float = Field(
+        gt=0,
+        description="of the mean within half a minute, for motion, deg/s; the bias moves by less",
     )
     shock_s: float = Field(gt=0, description="a burst at least so long, in seconds, is a motion")
     stuck_s: float = Field(ge=0, description="values may repeat for less than this, seconds")
-    coarse_step: float = Field(gt=0, description="quantisation step over noise that is reported")
-    largest_step: float = Field(gt=0, description="the same, of a mean that can be trusted")
-    drift_mdps: float = Field(ge=0, description="least warm-up drift that is reported, mdps")
+    largest_step: float = Field(
+        gt=0, description="quantisation step over noise, of a mean that can be trusted"
+    )
+    drift_mdps: float = Field(ge=0, description="least warm-up or drift that is reported, mdps")
     largest_noise_dps: float = Field(gt=0, description="of a sample at rest, deg/s")
     largest_drift_dps: float = Field(gt=0, description="of a recording at rest, deg/s")
     length_s: float | None = Field(

@@ -9,7 +9,7 @@ import numpy as np
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.logs import REJECTED, Finding, Log, LogEntry
 from gyro_pipeline.parameters import Quality
-from gyro_pipeline.protocol.quality import inspect
+from gyro_pipeline.quality import inspect
 
 
 @dataclass(frozen=True)

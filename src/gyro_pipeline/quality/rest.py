@@ -1,0 +1,132 @@
+"""At rest or not, told from the means and variances of blocks as they come.
+
+One rule for two series, the means and the cube roots of the variances (nearly normal: Wilson and
+Hilferty 1931): the last blocks may differ from those before by the least change that matters and
+by what chance allows. The error probability is spent over all blocks that may ever come, so the
+limits hold at any time. Beside it, the means may not scatter more than those of coloured noise.
+
+Quality control feeds it a file at once, a live stream block by block; NumPy is all it needs.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from statistics import NormalDist
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+KNOWN_BLOCKS = 1e9
+"""Blocks that a stated noise is worth beside those that have come."""
+
+
+class RestDetector:
+    """A changed mean or raised noise of gyroscopes, block by block.
+
+    The noise is that of the blocks before the tested ones, with its degrees of freedom. The scatter
+    of block means is at least that of white noise; colour adds what their differences show, up to
+    the least change that matters and to a block worth eight samples, as behind a low-pass filter.
+
+    Args:
+        size: Samples in a block.
+        false_alarm: Probability of any alarm at rest, ever.
+        least_dps: Smaller changes of the mean are the bias's own.
+        least_rise: Smaller factors on the noise are no alarm.
+        noise_dps: (axis,), standard deviation of a sample at rest, where it is known.
+        lags: Numbers of last blocks that are tested.
+        reference: Blocks before them with whose mean theirs is compared.
+    """
+
+    def __init__(
+        self,
+        size: int,
+        false_alarm: float,
+        least_dps: float,
+        least_rise: float = 1.5,
+        noise_dps: ArrayLike | None = None,
+        lags: Sequence[int] = (1, 4, 16),
+        reference: int = 40,
+    ) -> None:
+        self.size, self.false_alarm, self.least_dps = size, false_alarm, least_dps
+        self.least_rise = least_rise
+        self.least_growth = least_rise ** (2 / 3) - 1  # of the cube root of the variance
+        self.known = 0.0 if noise_dps is None else KNOWN_BLOCKS
+        self.known_variance = 0.0 if noise_dps is None else np.square(noise_dps)
+        self.lags, self.reference, self.blocks = tuple(lags), reference, 0
+        self._last, self._sums = np.empty((0, 0)), np.empty((0, 0))  # sums: up to the last blocks
+
+    def update(self, means: Array, variances: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Take the next blocks; how they are dealt to calls changes no bit.
+
+        Args:
+            means: (block, axis), deg/s.
+            variances: (block, axis), (deg/s)^2, of the samples about the mean of their block.
+
+        Returns:
+            Whether the mean changes, and whether the noise rises: (block, axis).
+        """
+        axes, sums = means.shape[1], self._add(means, variances)
+        count = self.blocks - len(sums) + 1 + np.arange(len(sums))  # blocks up to each row
+        chance, noise, worth, sways = self._limits(sums, count)
+        first = len(sums) - len(means)
+        moved, noisier = sways[first:], np.zeros(means.shape, bool)
+        for lag in self.lags:
+            rows = np.arange(max(first, lag + (count[0] == 0)), len(sums))
+            before, start = rows - lag, np.maximum(rows - lag - self.reference, 0)
+            last = (sums[rows, : 2 * axes] - sums[before, : 2 * axes]) / lag
+            length = (before - start)[:, None]
+            change = last[:, :axes] - (sums[before, :axes] - sums[start, :axes]) / length
+            limit = self.least_dps + chance[before, :axes] * np.sqrt(1 / lag + 1 / length)
+            moved[rows - first] |= np.abs(change) > limit
+            limit = chance[before, axes:] * np.sqrt(1 / lag + 1 / worth[before])
+            noisier[rows - first] |= (
+                last[:, axes:] > (1 + self.least_growth) * noise[before] + limit
+            )
+        self._sums = sums[-(self.reference + max(self.lags)) - 1 :]
+        return moved, noisier
+
+    def _add(self, means: Array, variances: Array) -> Array:
+        """Sums up to each block of both series, of half their squared differences, of variances."""
+        series = np.hstack([means, np.cbrt(variances)])
+        steps = np.diff(np.vstack([self._last if self.blocks else series[:1], series]), axis=0)
+        new = np.hstack([series, steps**2 / 2, variances])
+        sums = self._sums if self.blocks else np.zeros((1, new.shape[1]))
+        self.blocks, self._last = self.blocks + len(series), series[-1:]
+        return np.vstack([sums[:-1], np.add.accumulate(np.vstack([sums[-1:], new]))])
+
+    def _limits(self, sums: Array, count: NDArray[np.integer]) -> tuple[NDArray, ...]:
+        """After each row: what chance allows one block of both series, noise, its worth, sways."""
+        axes, known = sums.shape[1] // 5, self.known
+        worth = np.maximum(count, 1)[:, None] + known
+        variance = (sums[:, 4 * axes :] + known * self.known_variance) / worth
+        relative = 2 / (9 * (self.size - 1))  # variance of the cube root, and what its mean lacks
+        noise = sums[:, axes : 2 * axes] + known * np.cbrt(self.known_variance) * (1 - relative)
+        noise /= worth
+        white = np.hstack([variance / self.size, noise**2 * relative])
+        coloured = variance / min(self.size, 8) + self.least_dps**2
+        largest = np.hstack([coloured, white[:, axes:] + (self.least_growth * noise) ** 2])
+        shown = (sums[:, 2 * axes : 4 * axes] + known * white) / np.maximum(worth - 1, 1)
+        freedom = np.maximum(worth - 1, 1e-3) * 2 / 3  # of differences between neighbours
+        tests = 4 * axes * len(self.lags)
+        z = _spent(self.false_alarm / tests)[np.frexp(np.maximum(count, 1))[1] - 1][:, None]
+        chance = np.minimum(
+            student_limits(z, freedom) * np.sqrt(np.maximum(shown, white)),
+            student_limits(z, worth * (self.size - 1)) * np.sqrt(largest),
+        )
+        excess = np.cbrt(shown[:, :axes] / coloured) - 1 + 2 / (9 * freedom)
+        return chance, noise, worth, (excess > z * np.sqrt(2 / (9 * freedom))) & (freedom > 1)
+
+
+@cache
+def _spent(probability: float) -> Array:
+    """Normal limits for 1, 2-3, 4-7, ... blocks, which are given 1/(1*2), 1/(2*3), ... of it."""
+    epochs = [e * (e + 1) * 2 ** (e - 1) for e in range(1, 40)]
+    return np.array([-NormalDist().inv_cdf(probability / blocks) for blocks in epochs])
+
+
+def student_limits(normal: ArrayLike, freedom: ArrayLike) -> Array:
+    """Student's t that is exceeded as seldom as a normal limit (Wallace 1959)."""
+    freedom = np.asarray(freedom)
+    power = (np.asarray(normal) * (8 * freedom + 3) / (8 * freedom + 1)) ** 2 / freedom
+    return np.sqrt(freedom * np.expm1(np.minimum(power, 600)))
