@@ -1,12 +1,14 @@
 """Nodes of the ground-truth stage."""
 
+import logging
 from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
-from gyro_pipeline.conventions import MDPS
+from gyro_pipeline.conventions import AXES, MDPS
+from gyro_pipeline.logs import REJECTED
 from gyro_pipeline.parameters import GroundTruth
 from gyro_pipeline.physics.allan import (
     SHORTEST_FIT_SAMPLES,
@@ -15,6 +17,8 @@ from gyro_pipeline.physics.allan import (
     fit_noise,
 )
 from gyro_pipeline.physics.bias import recording_mean, settling_time_s
+
+logger = logging.getLogger(__name__)
 
 _KEYS = ["imu", "recording", "axis"]
 
@@ -103,6 +107,55 @@ def measure_noise(recordings: xr.Dataset, allan: xr.Dataset, bias: pd.DataFrame)
     figures = figures.reset_index()
     figures.insert(0, "sensor", recordings.attrs["sensor"])
     return figures
+
+
+def report_biases(
+    recordings: xr.Dataset, bias: pd.DataFrame, quality: pd.DataFrame, shown: int = 20
+) -> None:
+    """Print the bias of every recording and axis with its standard error, in deg/s.
+
+    Args:
+        recordings: For their durations, and the samples that are masked.
+        bias: From :func:`measure_bias`.
+        quality: The outcome of every recording.
+        shown: So many recordings are printed, the others counted.
+    """
+    lines = []
+    for imu, recording in list(dict.fromkeys(zip(bias.imu, bias.recording, strict=True)))[:shown]:
+        rates = recordings.angular_rate.sel(imu=imu, recording=recording)
+        rows = np.flatnonzero(np.isfinite(rates).all("axis"))
+        own = bias[(bias.imu == imu) & (bias.recording == recording)].set_index("axis")
+        judged = quality[(quality.imu == imu) & (quality.recording == recording)]
+        lines.append(
+            {
+                "IMU": imu,
+                "recording": recording,
+                **{a: _with_error(*own.loc[a, ["bias_dps", "standard_error_dps"]]) for a in AXES},
+                "seconds": f"{(rows[-1] + 1) / recordings.attrs['rate_hz']:.2f}",
+                "masked": f"{rows[-1] + 1 - len(rows)} rows",
+                "outcome": judged.outcome.iloc[0],
+            }
+        )
+    table = pd.DataFrame(lines).to_string(index=False)
+    notes = {
+        "{} more recordings are in the table of biases": len(bias) // len(AXES) - len(lines),
+        "{} recordings were rejected; why is in the table of quality": int(
+            (quality.outcome == REJECTED).sum()
+        ),
+    }
+    said = [text.format(count) for text, count in notes.items() if count]
+    if bias.standard_error_dps.isna().any():
+        said.append("± –: no standard error, the recording is too short to tell its noise")
+    sensor = recordings.attrs["sensor"]
+    logger.info("%s: biases in deg/s, ± standard error\n%s", sensor, "\n".join([table, *said]))
+
+
+def _with_error(value: float, error: float) -> str:
+    """A value and its standard error, of which two digits are given."""
+    if not error > 0:
+        return f"{value:.5f} ± –"
+    digits = max(0, 1 - int(np.floor(np.log10(error))))
+    return f"{value:.{digits}f} ± {error:.{digits}f}"
 
 
 def _noise_figures(allan: xr.Dataset, duration_s: float, rate_hz: float) -> xr.Dataset:
