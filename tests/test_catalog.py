@@ -284,9 +284,9 @@ def test_an_added_key_is_seen():
     assert additions({"training": {"epochs": 3}, "seeds": [1]}, base) == set()
 
 
-def test_an_environments_catalog_overrides_entries_of_base(pipelines):
-    names = datasets_of(pipelines())
+def test_an_environments_catalog_overrides_entries_of_its_pipelines(pipelines):
     for env in ENVS:
+        names = datasets_of(pipelines(env))
         for entry in files_of(env, "catalog"):
             assert entry in names or entry in configuration("base")["catalog"], entry
 

@@ -20,7 +20,7 @@ from gyro_pipeline import pipeline_registry
 from gyro_pipeline.conventions import InputError, Missing
 from gyro_pipeline.datasets.atomic import check_writable
 from gyro_pipeline.datasets.tracked_runs import TrackedRuns
-from gyro_pipeline.parameters import Parameters
+from gyro_pipeline.parameters import Parameters, ReaderOptions
 from gyro_pipeline.studies import DEFAULT, check_possible
 
 logger = logging.getLogger(__name__)
@@ -113,15 +113,19 @@ def _check_logs_are_read(
     parameters: Parameters, project: Path, pipeline: Pipeline, catalog: CatalogProtocol
 ) -> None:
     """Refuse a folder of logs that nothing reads, rather than to run on other recordings."""
-    if parameters.logs is None and parameters.reader is None:
-        return
+    asked: dict[str, Any] = {}
+    if parameters.logs is not None:
+        asked["path"] = str(project / parameters.logs)
+    if parameters.reader is not None:
+        asked["reader"] = parameters.reader.model_dump(exclude_defaults=True)
     sources = [name for name in pipeline.inputs() if name.endswith(".raw_logs.files")]
-    read = [path for name in sources for path in _paths(catalog.get(name))]
-    if parameters.logs is None or project / parameters.logs not in read:
+    read = [source._describe() for name in sources if (source := catalog.get(name))]
+    if read and not any(asked.items() <= source.items() for source in read):
+        given = [name for name in ("logs", "reader") if getattr(parameters, name) is not None]
         raise InputError(
-            "logs, reader: expected both or logs alone, together with the environment that reads "
-            f"them, got logs={parameters.logs}, read are {', '.join(map(str, read)) or 'no logs'}; "
-            "type --env=logs --params=logs=FOLDER"
+            f"{' and '.join(given)} of --params: not taken by what is read here, "
+            f"{', '.join(source['path'] for source in read)}; "
+            "type --env=logs --params=logs=FOLDER, or give it in a catalog entry of your own"
         )
 
 
@@ -145,6 +149,8 @@ def _explained(error: ValidationError) -> str:
         message = problem["msg"].removeprefix("Value error, ")
         if problem["type"] == "extra_forbidden":
             message = "unknown key; see conf/base for the keys there are"
+            if problem["loc"][0] == "reader":
+                message = f"unknown key; there are {', '.join(ReaderOptions.model_fields)}"
         lines.append(f"{where}: {message}" if problem["loc"] else message)
     return "parameters: " + "\n  ".join(lines)
 

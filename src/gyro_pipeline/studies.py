@@ -185,8 +185,8 @@ def check_possible(parameters: Parameters, pipelines: Sequence[str]) -> None:
     if studies and not any(studies.values()):
         only = parameters.only.model_dump(exclude_none=True)
         raise InputError(
-            f"only={only} matches nothing in {', '.join(studies)}; for what there is, see "
-            "studies.yml and leakage.yml in conf/base/parameters"
+            f"only={only} matches nothing in {', '.join(studies)}; for what there is, and to "
+            "name a new sensor, see studies.yml and leakage.yml in conf/base/parameters"
         )
     for study, sensors in studies.items():
         for sensor in sensors:
