@@ -172,9 +172,7 @@ def test_a_folder_with_a_mutated_file_is_stored_whole_and_the_same_again(edits, 
         folder = Path(name)
         (folder / "1.csv").write_bytes(SOUND)
         (folder / "2.csv").write_bytes(damaged)
-        source = FileLogs(
-            *("dot", {"dot": SENSOR}, "mine", name, "{imu}.csv"), cache={"path": f"{name}/.read"}
-        )
+        source = FileLogs("dot", "mine", name, {"dot": SENSOR}, "{imu}.csv")
         recordings, table = inspect_logs(source.load(), asked, serial)
         store = Recordings(f"{name}/recordings.nc")
         store.save(require_enough(recordings, table, asked))
