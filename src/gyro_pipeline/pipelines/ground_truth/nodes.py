@@ -110,44 +110,31 @@ def measure_noise(recordings: xr.Dataset, allan: xr.Dataset, bias: pd.DataFrame)
 
 
 def report_biases(
-    recordings: xr.Dataset, bias: pd.DataFrame, quality: pd.DataFrame, shown: int = 20
+    recordings: xr.Dataset, bias: pd.DataFrame, quality: pd.DataFrame, most: int = 20
 ) -> None:
     """Print the bias of every recording and axis with its standard error, in deg/s.
 
     Args:
-        recordings: For their durations, and the samples that are masked.
+        recordings: For the sensor and its sample rate.
         bias: From :func:`measure_bias`.
-        quality: The outcome of every recording.
-        shown: So many recordings are printed, the others counted.
+        quality: A row per recording: its outcome, and how many of which rows are masked.
+        most: Number of recordings that are printed; more are counted.
     """
-    lines = []
-    for imu, recording in list(dict.fromkeys(zip(bias.imu, bias.recording, strict=True)))[:shown]:
-        rates = recordings.angular_rate.sel(imu=imu, recording=recording)
-        rows = np.flatnonzero(np.isfinite(rates).all("axis"))
-        own = bias[(bias.imu == imu) & (bias.recording == recording)].set_index("axis")
-        judged = quality[(quality.imu == imu) & (quality.recording == recording)]
-        lines.append(
-            {
-                "IMU": imu,
-                "recording": recording,
-                **{a: _with_error(*own.loc[a, ["bias_dps", "standard_error_dps"]]) for a in AXES},
-                "seconds": f"{(rows[-1] + 1) / recordings.attrs['rate_hz']:.2f}",
-                "masked": f"{rows[-1] + 1 - len(rows)} rows",
-                "outcome": judged.outcome.iloc[0],
-            }
-        )
-    table = pd.DataFrame(lines).to_string(index=False)
-    notes = {
-        "{} more recordings are in the table of biases": len(bias) // len(AXES) - len(lines),
-        "{} recordings were rejected; why is in the table of quality": int(
-            (quality.outcome == REJECTED).sum()
-        ),
-    }
-    said = [text.format(count) for text, count in notes.items() if count]
+    sensor, rate_hz = recordings.attrs["sensor"], recordings.attrs["rate_hz"]
+    texts = list(map(_with_error, bias.bias_dps, bias.standard_error_dps))
+    table = bias.assign(text=texts).pivot(index=_KEYS[:2], columns="axis", values="text")
+    table = table.reset_index().merge(quality, on=_KEYS[:2])
+    table["seconds"] = [f"{rows / rate_hz:.2f}" for rows in table["stop"] - table["start"]]
+    columns = [*_KEYS[:2], *AXES, "seconds", "outcome", *table.columns.intersection(["masked"])]
+    lines = [table[columns].head(most).to_string(index=False)]
+    rejected = int((quality.outcome == REJECTED).sum())
+    if len(table) > most:
+        lines.append(f"{len(table) - most} more recordings are in the table of biases")
+    if rejected:
+        lines.append(f"{rejected} recordings were rejected; why is in the table of their quality")
     if bias.standard_error_dps.isna().any():
-        said.append("± –: no standard error, the recording is too short to tell its noise")
-    sensor = recordings.attrs["sensor"]
-    logger.info("%s: biases in deg/s, ± standard error\n%s", sensor, "\n".join([table, *said]))
+        lines.append("± –: no standard error, the recording is too short to tell its noise")
+    logger.info("%s: biases ± standard errors, deg/s\n%s", sensor, "\n".join(lines))
 
 
 def _with_error(value: float, error: float) -> str:
