@@ -48,7 +48,7 @@ class Preflight:
             raise InputError(_explained(error)) from None
         pipeline_registry.select(self._parameters)
 
-    @hook_impl
+    @hook_impl(tryfirst=True)  # before any dataset is made
     def before_pipeline_run(
         self, run_params: dict[str, Any], pipeline: Pipeline, catalog: CatalogProtocol
     ) -> None:
