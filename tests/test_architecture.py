@@ -16,15 +16,17 @@ STAGES = [path.name for path in (PACKAGE / "pipelines").iterdir() if (path / "no
 ALLOWED = {
     "conventions": set(),
     "fingerprints": set(),
-    "parameters": {"conventions"},
+    "units": set(),
+    "parameters": {"conventions", "units"},
     "executors": {"parameters"},
     "studies": {"conventions", "parameters"},
     "logs": {"conventions"},
-    "readers": {"conventions", "logs", "parameters"},
+    "readers": {"conventions", "logs", "parameters", "units"},
+    "quality": {"conventions", "logs", "parameters"},
     "tracking": {"conventions"},
     "physics": {"conventions"},
     "estimators": {"conventions", "learning", "physics"},
-    "protocol": {"conventions", "logs", "parameters", "physics"},
+    "protocol": {"conventions", "logs", "parameters", "physics", "quality"},
     "learning": {"conventions", "executors", "parameters", "protocol"},
     "datasets": {
         "conventions",
@@ -46,6 +48,7 @@ ALLOWED = {
             "parameters",
             "physics",
             "protocol",
+            "quality",
             "studies",
             "tracking",
         }
@@ -152,6 +155,8 @@ def test_imports_point_one_way(name):
     [
         ("physics.bias", "from gyro_pipeline.parameters import Sensor"),
         ("protocol.scores", "from gyro_pipeline import estimators"),
+        ("quality.rest", "from gyro_pipeline.protocol.inspection import judge"),
+        ("readers.columns", "from gyro_pipeline.quality import inspect"),
         ("learning.trainer", "from ..tracking import StoredRun"),
         ("datasets.recordings", "def load():\n    from gyro_pipeline import learning"),
         ("datasets.recordings", "import gyro_pipeline.pipelines.training.nodes"),
@@ -178,7 +183,9 @@ def test_physics_is_numpy():
         assert roots(names) <= known, name
 
 
-@pytest.mark.parametrize("part", ["physics", "protocol", "estimators", "learning"])
+@pytest.mark.parametrize(
+    "part", ["physics", "readers", "quality", "protocol", "estimators", "learning"]
+)
 def test_the_science_knows_neither_kedro_nor_mlflow(part):
     assert names_of(part)
     for name, names in names_of(part).items():
