@@ -130,10 +130,7 @@ def pipeline(folder: Path, scratch: Path, processes: int) -> Callable[[], Any]:
     sensor = yaml.safe_load((CONF / "globals.yml").read_text())["sensors"]["dot"]
     imus = sum(1 for _ in folder.iterdir())
     sensors = {"dot": sensor | {"imus": imus, "samples": ROWS, "recording_s": ROWS / RATE_HZ}}
-    source = FileLogs(
-        *("dot", sensors, "fleet", str(folder), "imu{imu}/{recording}.csv"),
-        cache={"path": str(scratch / "read")},
-    )
+    source = FileLogs("dot", "fleet", str(folder), sensors, "imu{imu}/{recording}.csv")
     execution = Execution(executor="processes", workers=processes)
 
     def run() -> Any:

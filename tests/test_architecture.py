@@ -48,6 +48,7 @@ ALLOWED = {
             "parameters",
             "physics",
             "protocol",
+            "quality",
             "studies",
             "tracking",
         }
@@ -154,6 +155,8 @@ def test_imports_point_one_way(name):
     [
         ("physics.bias", "from gyro_pipeline.parameters import Sensor"),
         ("protocol.scores", "from gyro_pipeline import estimators"),
+        ("quality.rest", "from gyro_pipeline.protocol.inspection import judge"),
+        ("readers.columns", "from gyro_pipeline.quality import inspect"),
         ("learning.trainer", "from ..tracking import StoredRun"),
         ("datasets.recordings", "def load():\n    from gyro_pipeline import learning"),
         ("datasets.recordings", "import gyro_pipeline.pipelines.training.nodes"),

@@ -91,10 +91,6 @@ def check_refusal(project, done, before):
             ["studies.real2real.dot", "15 real gyroscopes", "dot has 12"],
         ),
         (
-            {"studies": {"augmentation": {"sensors": {"dot": {"virtual_gyros": [27]}}}}},
-            ["studies.augmentation.dot", "27 virtual gyroscopes", "makes 24"],
-        ),
-        (
             {"studies": {"real2real": {"sensors": {"foo": {"method": 2, "real_gyros": [3]}}}}},
             ["studies.real2real", "unknown sensor 'foo'", "conf/base/globals.yml"],
         ),

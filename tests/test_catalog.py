@@ -11,7 +11,7 @@ from kedro.framework.startup import bootstrap_project
 from kedro.io import CatalogConfigResolver
 
 from gyro_pipeline import pipeline_registry
-from gyro_pipeline.parameters import Only
+from gyro_pipeline.parameters import Only, Sensor
 from gyro_pipeline.settings import CONFIG_LOADER_ARGS
 
 ROOT = Path(__file__).parents[1]
@@ -243,8 +243,9 @@ def leaves(tree, place=()):
 
 
 def additions(tree, base):
-    """Keys of a tree that a base lacks; ``only`` is empty in the base, its model has the keys."""
+    """Keys of a tree that a base lacks; the keys of ``only`` and of sensors are their models'."""
     known = leaves(base) | {("only", key) for key in Only.model_fields}
+    known |= {("sensors", name, key) for name in base["sensors"] for key in Sensor.model_fields}
     return {place for place in leaves(tree) if place not in known}
 
 
@@ -284,9 +285,9 @@ def test_an_added_key_is_seen():
     assert additions({"training": {"epochs": 3}, "seeds": [1]}, base) == set()
 
 
-def test_an_environments_catalog_overrides_entries_of_base(pipelines):
-    names = datasets_of(pipelines())
+def test_an_environments_catalog_overrides_entries_of_its_pipelines(pipelines):
     for env in ENVS:
+        names = datasets_of(pipelines(env))
         for entry in files_of(env, "catalog"):
             assert entry in names or entry in configuration("base")["catalog"], entry
 

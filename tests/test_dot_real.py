@@ -144,8 +144,10 @@ def test_copies_in_other_formats_and_units_give_the_same_biases(
     sensors = yaml.safe_load((Path(__file__).parents[1] / "conf/base/globals.yml").read_text())
     source = FileLogs(
         "dot",
-        {"dot": sensors["sensors"]["dot"] | {"samples": 14448, "recording_s": 120.4}},
-        *("copies", str(tmp_path), name, {"path": str(tmp_path / "read")}, reader),
+        *("copies", str(tmp_path)),
+        sensors={"dot": sensors["sensors"]["dot"] | {"rate_hz": 120}},
+        pattern=name,
+        reader=reader,
     )
     asked = parameters("dot_real").quality
     serial = Execution(executor="serial", workers=None)

@@ -9,7 +9,9 @@ from gyro_pipeline.conventions import InputError
 from gyro_pipeline.hooks import Preflight
 from gyro_pipeline.parameters import Parameters
 from gyro_pipeline.settings import CONFIG_LOADER_ARGS
+from gyro_pipeline.studies import check_possible
 
+ONE_DOT = {"sensor": "dot", "real_gyros": 3}
 CONF = str(Path(__file__).parents[1] / "conf")
 
 
@@ -62,22 +64,7 @@ def test_the_configuration_of_this_project_is_accepted(loaded, monkeypatch, tmp_
         ({"splits": {"test_fraction": 1.0}}, "splits.test_fraction:", "less than 1"),
         ({"source": "My Files"}, "source:", "match pattern"),
         ({"only": {"real_gyros": 4}}, "only.real_gyros:", "multiple of 3"),
-        (
-            {"studies": {"real2real": {"sensors": {"bosch": {"method": 2, "real_gyros": [3]}}}}},
-            "studies.real2real:",
-            "unknown sensor 'bosch'; conf/base/globals.yml knows sparkfun, dot, ng, memsense",
-        ),
-        ({"only": {"sensor": "bosch"}}, "only.sensor:", "unknown sensor 'bosch'; conf/base"),
-        (
-            {"studies": {"real2real": {"sensors": {"ng": {"real_gyros": [3, 9]}}}}},
-            "studies.real2real.ng:",
-            "9 real gyroscopes asked, ng has 6",
-        ),
-        (
-            {"studies": {"augmentation": {"sensors": {"dot": {"virtual_gyros": [27]}}}}},
-            "studies.augmentation.dot:",
-            "27 virtual gyroscopes asked, virtual_gyros.imus makes 24",
-        ),
+        ({"only": {"sensor": "bosch"}}, "only.sensor:", "sparkfun, dot, ng, memsense"),
         (
             {"studies": {"input_channels": {"sensors": {"sparkfun": {"virtual_gyros": [12]}}}}},
             "studies.input_channels.sensors.sparkfun:",
@@ -98,26 +85,14 @@ def test_the_configuration_of_this_project_is_accepted(loaded, monkeypatch, tmp_
             "studies.real2real.experiment:",
             "expected 'real2real'",
         ),
-        (
-            {"windows_s": [10, 60]},
-            "windows_s:",
-            "a window of 60 s is longer than a recording of memsense, 52 s",
-        ),
         ({"windows_s": []}, "windows_s:", "at least 1 item"),
         (
-            {"studies": {"estimators": {"windows_s": [10, 60]}}},
-            "studies.estimators.windows_s:",
-            "a window of 60 s is longer than a recording of memsense, 52 s",
-        ),
-        (
             {"studies": {"estimators": {"estimators": ["mean", "mean"]}}},
-            "studies.estimators.estimators:",
-            "names one of them twice",
+            "studies.estimators:",
+            "estimators: ['mean', 'mean'] names one of them twice",
         ),
         ({"windows_s": [0]}, "windows_s.0:", "greater than 0"),
         ({"seeds": []}, "seeds:", "at least 1 item"),
-        ({"leakage": {"sensors": ["bosch"]}}, "", "leakage.sensors: unknown sensor 'bosch'"),
-        ({"leakage": {"window_s": 53}}, "", "leakage.window_s: 53 s is longer than a recording of"),
         ({"leakage": {"strides_s": [1, 0]}}, "leakage.strides_s.1:", "greater than 0"),
         ({"leakage": {"strides_s": [1, 1]}}, "leakage:", "strides_s: [1.0, 1.0] names one of"),
         ({"leakage": {"folds": 12}}, "leakage:", "folds: 12 parts of 11 recordings"),
@@ -127,12 +102,97 @@ def test_the_configuration_of_this_project_is_accepted(loaded, monkeypatch, tmp_
             "sensors.ng:",
             "train_recordings must leave at least one recording for testing",
         ),
+        ({"sensors": {"ng": {"rate_hz": 0}}}, "sensors.ng.rate_hz:", "greater than 0"),
+        ({"logs": 5}, "logs:", "valid string"),
+        ({"reader": {"unit": "deg/s"}}, "reader.unit:", "unknown key; there are format, columns"),
     ],
 )
 def test_a_bad_parameter_is_refused_by_its_place(loaded, refusal, changes, place, said):
     message = refusal(loaded(**changes))
     assert place in message
     assert said in message
+
+
+ASKED = {
+    "unknown sensor": (
+        {"studies": {"real2real": {"sensors": {"bosch": {"method": 2, "real_gyros": [3]}}}}},
+        "real2real",
+        "studies.real2real: unknown sensor 'bosch'",
+    ),
+    "real gyroscopes": (
+        {"sensors": {"dot": {"imus": 1}}},
+        "augmentation",
+        "studies.augmentation.dot: 12 real gyroscopes asked, dot has 3 (its imus: 1)",
+    ),
+    "virtual gyroscopes": (
+        {"virtual_gyros": {"imus": 4}},
+        "augmentation",
+        "studies.augmentation.sparkfun: 24 virtual gyroscopes asked, virtual_gyros.imus makes 12",
+    ),
+    "windows": (
+        {"sensors": {"dot": {"recording_s": 20}}},
+        "real2real",
+        "studies.real2real.dot: 30 s windows asked, longer than a recording of dot, 20 s",
+    ),
+    "leaking windows": (
+        {"leakage": {"window_s": 53}},
+        "leakage",
+        "leakage.memsense: 53 s windows asked, longer than a recording of memsense, 52 s",
+    ),
+    "leaking sensor": (
+        {"leakage": {"sensors": ["bosch"]}},
+        "leakage",
+        "leakage: unknown sensor 'bosch'",
+    ),
+    "nothing": (
+        {"only": {"sensor": "ng"}},
+        "augmentation",
+        "only={'sensor': 'ng'} matches nothing in augmentation",
+    ),
+}
+"""Changes of the parameters, the pipeline that they stop, and why."""
+
+
+@pytest.mark.parametrize("name", ASKED)
+def test_what_sensors_cannot_give_stops_the_studies_that_ask_for_it_and_no_other(loaded, name):
+    changes, pipeline, said = ASKED[name]
+    parameters = Parameters(**loaded(**changes))
+    with pytest.raises(InputError) as refused:
+        check_possible(parameters, ["ground_truth", pipeline])
+    assert said in str(refused.value)
+    for other in ("ground_truth", "virtual_gyros", "reporting"):
+        check_possible(parameters, [other])
+
+
+def test_a_study_without_a_name_is_checked_like_one_with_it(loaded):
+    parameters = Parameters(**loaded(sensors={"dot": {"imus": 1}}))
+    with pytest.raises(InputError, match="12 real gyroscopes"):
+        check_possible(parameters, ["__default__"])
+    check_possible(Parameters(**loaded(sensors={"dot": {"imus": 1}}, only=ONE_DOT)), ["real2real"])
+
+
+def test_the_report_wants_the_sensors_that_the_paper_speaks_of(loaded):
+    given = loaded()
+    given["published"]["hours"][0]["sensor"] = "bosch"
+    check_possible(Parameters(**given), ["augmentation"])
+    with pytest.raises(InputError, match="published: unknown sensor 'bosch'"):
+        check_possible(Parameters(**given), ["reporting"])
+
+
+@pytest.mark.parametrize(
+    ("entry", "rate_hz"),
+    [
+        ({}, None),
+        ({"rate_hz": 100}, 100),
+        ({"samples": 1000, "recording_s": 20}, 50),
+        ({"samples": 1000, "recording_s": 20, "rate_hz": 100}, 100),
+        ({"samples": 1000}, None),
+    ],
+)
+def test_a_sensor_with_files_may_say_its_rate_or_nothing(loaded, entry, rate_hz):
+    parameters = Parameters(**loaded(sensors={"device": entry}, only={"sensor": "device"}))
+    assert parameters.sensors["device"].rate_hz == rate_hz
+    check_possible(parameters, ["ground_truth"])
 
 
 def test_all_problems_are_told_at_once(loaded, refusal):

@@ -5,7 +5,6 @@ import logging
 import platform
 import subprocess
 import sys
-from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
@@ -21,8 +20,8 @@ from gyro_pipeline import pipeline_registry
 from gyro_pipeline.conventions import InputError, Missing
 from gyro_pipeline.datasets.atomic import check_writable
 from gyro_pipeline.datasets.tracked_runs import TrackedRuns
-from gyro_pipeline.parameters import Parameters
-from gyro_pipeline.studies import LEAKAGE, leak_sensors, used_sensors
+from gyro_pipeline.parameters import Parameters, ReaderOptions
+from gyro_pipeline.studies import DEFAULT, check_possible
 
 logger = logging.getLogger(__name__)
 
@@ -49,13 +48,14 @@ class Preflight:
             raise InputError(_explained(error)) from None
         pipeline_registry.select(self._parameters)
 
-    @hook_impl
+    @hook_impl(tryfirst=True)  # before any dataset is made
     def before_pipeline_run(
         self, run_params: dict[str, Any], pipeline: Pipeline, catalog: CatalogProtocol
     ) -> None:
-        """Check that something is left to do and that every result can be written."""
+        """Check what these pipelines ask for, and that every result can be written."""
         if self._parameters is not None:
-            _check_matches(self._parameters, run_params["pipeline_names"] or ["__default__"])
+            check_possible(self._parameters, run_params["pipeline_names"] or [DEFAULT])
+            _check_logs_are_read(self._parameters, self._project, pipeline, catalog)
         for name in sorted(pipeline.all_outputs()):
             for path in _paths(catalog.get(name)):
                 check_writable(path)
@@ -74,6 +74,10 @@ class Preflight:
         folders = {path.parent.parent for name in tables for path in _paths(catalog.get(name))}
         for folder in sorted(folders):
             logger.info("tables and figures: %s", _relative(folder, self._project))
+        stored = (name for name in pipeline.all_outputs() if name.endswith((".quality", ".bias")))
+        if not folders:
+            for path in sorted(path for name in stored for path in _paths(catalog.get(name))):
+                logger.info("table:              %s", _relative(path, self._project))
         for name in pipeline.all_outputs() & {"reporting.report"}:
             for path in _paths(catalog.get(name)):
                 logger.info("report:             %s", _relative(path, self._project))
@@ -105,22 +109,23 @@ class Provenance:
                 dataset.provenance |= tags
 
 
-def _check_matches(parameters: Parameters, pipelines: Sequence[str]) -> None:
-    """Refuse an ``only`` that leaves the studies to run without a single cell."""
-    sensors = used_sensors(parameters)
-    studies = [
-        study
-        for study, asked in parameters.studies.items()
-        if study in pipelines or (asked.default and "__default__" in pipelines)
-    ]
-    if LEAKAGE in pipelines:
-        sensors[LEAKAGE] = leak_sensors(parameters.leakage, parameters.only)
-        studies.append(LEAKAGE)
-    if studies and not any(sensors[study] for study in studies):
-        only = parameters.only.model_dump(exclude_none=True)
+def _check_logs_are_read(
+    parameters: Parameters, project: Path, pipeline: Pipeline, catalog: CatalogProtocol
+) -> None:
+    """Refuse a folder of logs that nothing reads, rather than to run on other recordings."""
+    asked: dict[str, Any] = {}
+    if parameters.logs is not None:
+        asked["path"] = str(project / parameters.logs)
+    if parameters.reader is not None:
+        asked["reader"] = parameters.reader.model_dump(exclude_defaults=True)
+    sources = [name for name in pipeline.inputs() if name.endswith(".raw_logs.files")]
+    read = [source._describe() for name in sources if (source := catalog.get(name))]
+    if read and not any(asked.items() <= source.items() for source in read):
+        given = [name for name in ("logs", "reader") if getattr(parameters, name) is not None]
         raise InputError(
-            f"only={only} matches nothing in {', '.join(studies)}; for what there is, see "
-            "studies.yml and leakage.yml in conf/base/parameters"
+            f"{' and '.join(given)} of --params: not taken by what is read here, "
+            f"{', '.join(source['path'] for source in read)}; "
+            "type --env=logs --params=logs=FOLDER, or give it in a catalog entry of your own"
         )
 
 
@@ -144,6 +149,8 @@ def _explained(error: ValidationError) -> str:
         message = problem["msg"].removeprefix("Value error, ")
         if problem["type"] == "extra_forbidden":
             message = "unknown key; see conf/base for the keys there are"
+            if problem["loc"][0] == "reader":
+                message = f"unknown key; there are {', '.join(ReaderOptions.model_fields)}"
         lines.append(f"{where}: {message}" if problem["loc"] else message)
     return "parameters: " + "\n  ".join(lines)
 

@@ -90,7 +90,7 @@ class Logs:
         sensor: Its name.
         source: Where the logs come from, as stored paths name it.
         simulated: Whether they are.
-        rate_hz: Expected; measured ones are compared with it.
+        rate_hz: Expected; measured ones are compared with it. None: not known beforehand.
         entries: The recordings, by IMU and number.
         drawn: What was drawn for simulated recordings, to be stored with them.
     """
@@ -98,6 +98,6 @@ class Logs:
     sensor: str
     source: str
     simulated: bool
-    rate_hz: float
+    rate_hz: float | None
     entries: Sequence[LogEntry]
     drawn: "xr.Dataset | None" = None

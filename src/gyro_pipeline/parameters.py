@@ -1,10 +1,13 @@
 """Typed parameters: every key that ``conf/*/parameters`` may hold, with its unit and source.
 
-An unknown key, a value out of bounds or a study that asks for what a sensor cannot give is
-refused before any node runs (see :class:`gyro_pipeline.hooks.Preflight`).
+An unknown key or a value out of bounds is refused whatever runs. What one part asks of another,
+such as a study of a sensor, is checked for the studies that are to run
+(:func:`gyro_pipeline.studies.check_possible`). Both before any node runs.
 """
 
+import math
 import re
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -17,7 +20,7 @@ from pydantic import (
     model_validator,
 )
 
-from gyro_pipeline.conventions import AXES, LEAVE_ONE_DEVICE_OUT
+from gyro_pipeline.conventions import AXES, LEAVE_ONE_DEVICE_OUT, InputError
 from gyro_pipeline.units import read_unit
 
 PerAxis = tuple[float, float, float]
@@ -33,6 +36,11 @@ class Parameter(BaseModel):
     """Base of all groups: no unknown keys, no change after loading."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def _refuse_twice(name: str, values: Sequence[Any]) -> None:
+    if len(set(values)) < len(values):
+        raise ValueError(f"{name}: {values} names one of them twice")
 
 
 class WarmUp(Parameter):
@@ -71,25 +79,63 @@ class SimulatedNoise(Parameter):
     warm_up: WarmUp | None = Field(None, description="of each axis on its own; null for none")
 
 
+def _implied_rate(given: dict[str, Any]) -> float | None:
+    """Sample rate in Hz that the counts of a sensor imply, if both are there."""
+    samples, recording_s = given.get("samples"), given.get("recording_s")
+    return samples / recording_s if samples and recording_s else None
+
+
 class Sensor(Parameter):
-    """One brand of gyroscope: how it was recorded, and its simulated stand-in."""
+    """One brand of gyroscope.
 
-    imus: int = Field(ge=1)
-    recordings: int = Field(ge=2, description="power-ons per IMU")
-    train_recordings: int = Field(ge=1, description="of these, the ones in the training file")
-    samples: int = Field(ge=2, description="per recording and axis")
-    recording_s: float = Field(gt=0, description="T, seconds (paper, section IV-A)")
-    simulated: SimulatedNoise
+    Files need nothing of it, or the rate where they have no timestamps; all else describes a
+    simulated stand-in (:class:`SimulatedSensor`), and lets studies of it be checked beforehand.
+    """
 
-    @property
-    def rate_hz(self) -> float:
-        """Sample rate that the counts imply, Hz."""
-        return self.samples / self.recording_s
+    imus: int | None = Field(None, ge=1)
+    recordings: int | None = Field(None, ge=2, description="power-ons per IMU")
+    train_recordings: int | None = Field(
+        None, ge=1, description="of these, the ones in the training file"
+    )
+    samples: int | None = Field(None, ge=2, description="per recording and axis")
+    recording_s: float | None = Field(None, gt=0, description="T, seconds (paper, section IV-A)")
+    rate_hz: float | None = Field(
+        default_factory=_implied_rate,
+        gt=0,
+        allow_inf_nan=False,
+        description="expected sample rate; else samples / recording_s, or what timestamps say",
+    )
+    simulated: SimulatedNoise | None = None
 
     @model_validator(mode="after")
     def _some_recordings_are_for_testing(self) -> Self:
-        if self.train_recordings >= self.recordings:
+        if (
+            self.recordings is not None
+            and self.train_recordings is not None
+            and self.train_recordings >= self.recordings
+        ):
             raise ValueError("train_recordings must leave at least one recording for testing")
+        return self
+
+
+class SimulatedSensor(Sensor):
+    """A sensor with all that it takes to simulate it."""
+
+    imus: int = Field(ge=1)
+    recordings: int = Field(ge=2)
+    train_recordings: int = Field(ge=1)
+    samples: int = Field(ge=2)
+    recording_s: float = Field(gt=0)
+    rate_hz: float = Field(gt=0)
+    simulated: SimulatedNoise
+
+    @model_validator(mode="after")
+    def _counts_and_rate_agree(self) -> Self:
+        implied = self.samples / self.recording_s
+        if not math.isclose(self.rate_hz, implied, rel_tol=1e-6):
+            raise ValueError(
+                f"rate_hz is {self.rate_hz:g}, samples / recording_s {implied:g}; correct one"
+            )
         return self
 
 
@@ -362,9 +408,8 @@ class Grid(Parameter):
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
-        for name, counts in (("real", self.real_gyros), ("virtual", self.virtual_gyros)):
-            if len(set(counts)) < len(counts):
-                raise ValueError(f"{name}_gyros: {counts} names one of them twice")
+        for name in ("real_gyros", "virtual_gyros"):
+            _refuse_twice(name, getattr(self, name))
         if min(self.real_gyros) < len(AXES):
             raise ValueError("real_gyros: at least one IMU, 3 gyroscopes, is needed")
         if self.method == 1 and any(self.virtual_gyros):
@@ -398,6 +443,12 @@ class Study(Parameter):
         return self.protocol == LEAVE_ONE_DEVICE_OUT
 
     @model_validator(mode="after")
+    def _nothing_is_named_twice(self) -> Self:
+        for name in ("estimators", "windows_s"):
+            _refuse_twice(name, getattr(self, name) or [])
+        return self
+
+    @model_validator(mode="after")
     def _networks_know_their_device(self) -> Self:
         networks = [name for name in self.estimators if name.startswith("cnn")]
         if self.unseen_devices and networks:
@@ -423,8 +474,7 @@ class Leakage(Parameter):
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
-        if len(set(self.strides_s)) < len(self.strides_s):
-            raise ValueError(f"strides_s: {self.strides_s} names one of them twice")
+        _refuse_twice("strides_s", self.strides_s)
         if self.folds > self.recordings:
             raise ValueError(f"folds: {self.folds} parts of {self.recordings} recordings")
         return self
@@ -512,6 +562,10 @@ class Parameters(Parameter):
     published_address: str = Field(
         pattern="^https?://", description="base address of the authors' files; the catalog reads it"
     )
+    logs: str | None = Field(
+        None, description="folder of a logger's files; the catalog of the environment logs reads it"
+    )
+    reader: ReaderOptions | None = Field(None, description="how these are read; likewise")
     sensors: dict[str, Sensor]
     quality: Quality
     ground_truth: GroundTruth
@@ -527,75 +581,33 @@ class Parameters(Parameter):
     only: Only
     published: Published
 
-    @property
-    def _known(self) -> str:
-        return f"conf/base/globals.yml knows {', '.join(self.sensors)}"
-
     @model_validator(mode="after")
-    def _the_paper_speaks_of_known_sensors(self) -> Self:
-        p = self.published
-        for sensor in (row.sensor for rows in (p.specifications, p.hours) for row in rows):
-            if sensor not in self.sensors:
-                raise ValueError(f"published: unknown sensor {sensor!r}; {self._known}")
-        return self
-
-    @model_validator(mode="after")
-    def _the_leak_study_asks_for_what_sensors_give(self) -> Self:
-        for name in self.leakage.sensors:
-            if name not in self.sensors:
-                raise ValueError(f"leakage.sensors: unknown sensor {name!r}; {self._known}")
-            if self.leakage.window_s > self.sensors[name].recording_s:
-                raise ValueError(
-                    f"leakage.window_s: {self.leakage.window_s:g} s is longer than a recording of "
-                    f"{name}, {self.sensors[name].recording_s:g} s"
-                )
-        return self
-
-    @model_validator(mode="after")
-    def _studies_ask_for_what_sensors_give(self) -> Self:
-        listed: dict[str, list[Any]] = {"seeds": self.seeds, "windows_s": self.windows_s}
-        for study, asked in self.studies.items():
-            listed[f"studies.{study}.windows_s"] = asked.windows_s or []
-            listed[f"studies.{study}.estimators"] = asked.estimators
-        for name, values in listed.items():
-            if len(set(values)) < len(values):
-                raise ValueError(f"{name}: {values} names one of them twice")
-        known = self._known
+    def _names_are_used_once(self) -> Self:
+        for name in ("seeds", "windows_s"):
+            _refuse_twice(name, getattr(self, name))
         for study, asked in self.studies.items():
             if asked.experiment != study:
                 raise ValueError(f"studies.{study}.experiment: expected {study!r}")
-            for name, grid in asked.sensors.items():
-                if name not in self.sensors:
-                    raise ValueError(f"studies.{study}: unknown sensor {name!r}; {known}")
-                available = len(AXES) * self.sensors[name].imus
-                if max(grid.real_gyros) > available:
-                    raise ValueError(
-                        f"studies.{study}.{name}: {max(grid.real_gyros)} real gyroscopes asked, "
-                        f"{name} has {available}"
-                    )
-                virtual = len(AXES) * self.virtual_gyros.imus
-                if max(grid.virtual_gyros) > virtual:
-                    raise ValueError(
-                        f"studies.{study}.{name}: {max(grid.virtual_gyros)} virtual gyroscopes "
-                        f"asked, virtual_gyros.imus makes {virtual}"
-                    )
-        if self.only.sensor is not None and self.only.sensor not in self.sensors:
-            raise ValueError(f"only.sensor: unknown sensor {self.only.sensor!r}; {known}")
         return self
 
     @model_validator(mode="after")
-    def _windows_fit_into_recordings(self) -> Self:
-        asked = [("windows_s", self.windows_s, name) for name in self.sensors]
-        asked += [
-            (f"studies.{study}.windows_s", one.windows_s or [], name)
-            for study, one in self.studies.items()
-            for name in one.sensors
-        ]
-        for where, windows_s, name in asked:
-            recording_s = self.sensors[name].recording_s
-            if max(windows_s, default=0) > recording_s:
-                raise ValueError(
-                    f"{where}: a window of {max(windows_s):g} s is longer than a "
-                    f"recording of {name}, {recording_s:g} s"
-                )
+    def _only_names_a_sensor(self) -> Self:
+        if self.only.sensor is not None:
+            self.check_sensor("only.sensor", self.only.sensor)
         return self
+
+    def check_sensor(self, where: str, name: str) -> None:
+        """Refuse an unknown sensor.
+
+        Args:
+            where: The parameter that names it, for the message.
+            name: Of the sensor.
+
+        Raises:
+            InputError: There is none of this name.
+        """
+        if name not in self.sensors:
+            raise InputError(
+                f"{where}: unknown sensor {name!r}; conf/base/globals.yml and the environment's "
+                f"know {', '.join(self.sensors)}"
+            )

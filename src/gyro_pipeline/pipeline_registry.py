@@ -44,7 +44,9 @@ def register_pipelines() -> dict[str, Pipeline]:
     }
     known = [sensor for sensor in parameters.sensors if wanted in (None, sensor)]
     drawn = _virtual_sensors(parameters)
-    pipelines["ground_truth"] = sum(map(_measured, known), Pipeline([]))
+    pipelines["ground_truth"] = sum(
+        (_measured(sensor) + ground_truth.create_report(sensor) for sensor in known), Pipeline([])
+    )
     pipelines["virtual_gyros"] = sum(
         (_measured(sensor) + _split(sensor, sensor in drawn) for sensor in known), Pipeline([])
     )

@@ -30,6 +30,9 @@ NETWORKS = (CNN, CNN_SHUFFLED)
 RESIDUAL_NETWORK = "residual_network"
 """The estimator that is fitted to what a cell of the paper trains on: its real and virtual IMUs."""
 
+DEFAULT = "__default__"
+"""The pipeline without a name."""
+
 LEAKAGE = "leakage"
 """The leak study: its pipeline, MLflow experiment and parameters."""
 
@@ -149,6 +152,79 @@ def used_sensors(parameters: Parameters) -> dict[str, list[str]]:
         ]
         for name, study in p.studies.items()
     }
+
+
+def studies_to_run(parameters: Parameters, pipelines: Sequence[str]) -> dict[str, list[str]]:
+    """Sensors of each study that some pipelines run, as ``only`` leaves them."""
+    studies = {
+        study: sensors
+        for study, sensors in used_sensors(parameters).items()
+        if study in pipelines or (parameters.studies[study].default and DEFAULT in pipelines)
+    }
+    if LEAKAGE in pipelines:
+        studies[LEAKAGE] = leak_sensors(parameters.leakage, parameters.only)
+    return studies
+
+
+def check_possible(parameters: Parameters, pipelines: Sequence[str]) -> None:
+    """Refuse what these pipelines ask of sensors that cannot give it.
+
+    Nobody has to mend a study that does not run, so no other is looked at. Where a sensor's entry
+    does not say how many IMUs there are, or how long recordings are, its files decide: the plan of
+    the runs compares with them.
+
+    Args:
+        parameters: All of them.
+        pipelines: Names of those to run.
+
+    Raises:
+        InputError: ``only`` leaves nothing of the studies, a sensor is unknown, or it has fewer
+            IMUs or shorter recordings than a study needs.
+    """
+    studies = studies_to_run(parameters, pipelines)
+    if studies and not any(studies.values()):
+        only = parameters.only.model_dump(exclude_none=True)
+        raise InputError(
+            f"only={only} matches nothing in {', '.join(studies)}; for what there is, and to "
+            "name a new sensor, see studies.yml and leakage.yml in conf/base/parameters"
+        )
+    for study, sensors in studies.items():
+        for sensor in sensors:
+            parameters.check_sensor(_parameter(study), sensor)
+            _check_cells(parameters, study, sensor)
+    if {"reporting", DEFAULT} & set(pipelines):
+        published = parameters.published
+        named = [row.sensor for row in published.specifications]
+        for sensor in named + [row.sensor for row in published.hours]:
+            parameters.check_sensor("published", sensor)
+
+
+def _parameter(study: str) -> str:
+    return LEAKAGE if study == LEAKAGE else f"studies.{study}"
+
+
+def _check_cells(p: Parameters, study: str, name: str) -> None:
+    """Compare the cells of a study on a sensor with what the sensor's entry says."""
+    cells: Sequence[Cell] = (
+        leak_cells(p.leakage, name, p.source, p.seeds)
+        if study == LEAKAGE
+        else study_cells(p.studies[study], name, p.source, p.windows_s, p.seeds, p.only)
+    )
+    imus, length_s = p.sensors[name].imus, p.sensors[name].recording_s
+    has, makes = len(AXES) * (imus or 0), len(AXES) * p.virtual_gyros.imus
+    for asked, limit, words in (
+        ("real_gyros", has or None, f"real gyroscopes asked, {name} has {has} (its imus: {imus})"),
+        ("virtual_gyros", makes, f"virtual gyroscopes asked, virtual_gyros.imus makes {makes}"),
+        (
+            "window_s",
+            length_s,
+            f"s windows asked, longer than a recording of {name}, {length_s or 0:g} s "
+            "(windows_s of the studies, window_s of leakage; recording_s of the sensor)",
+        ),
+    ):
+        most = max(getattr(cell, asked) for cell in cells)
+        if limit is not None and most > limit:
+            raise InputError(f"{_parameter(study)}.{name}: {most:g} {words}")
 
 
 def over_folds(cells: Sequence[Cell], folds: Sequence[int], only: Only) -> list[Cell]:

@@ -54,6 +54,23 @@ def stamps(folder):
     return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in folder.iterdir()}
 
 
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (
+            {"imus": None, "simulated": None},
+            ["dot has no files", "dot.raw_logs.files", "catalog.yml", "globals.yml: imus, simula"],
+        ),
+        ({"rate_hz": 90}, ["rate_hz is 90, samples / recording_s 100; correct one"]),
+    ],
+)
+def test_what_it_takes_to_simulate_a_sensor_is_named(tmp_path, changes, words):
+    with pytest.raises(InputError) as refused:
+        simulated(tmp_path, **changes)
+    for word in words:
+        assert word in str(refused.value)
+
+
 def test_files_have_the_published_layout_and_give_what_was_read(tmp_path):
     logs = simulated(tmp_path).load()
     assert set(os.listdir(tmp_path)) == {"dot_train.npy", "dot_test.npy", "dot_truth.nc"}

@@ -7,7 +7,8 @@ import os
 import pkgutil
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from gyro_pipeline.datasets.atomic import check_writable
 from gyro_pipeline.datasets.log_source import LogSource
 from gyro_pipeline.datasets.parse_cache import Reading
 from gyro_pipeline.fingerprints import code_hash, fingerprint
-from gyro_pipeline.logs import LogEntry, Logs
+from gyro_pipeline.logs import Log, LogEntry, Logs
 from gyro_pipeline.parameters import ReaderOptions
 
 _LOG = logging.getLogger(__name__)
@@ -41,13 +42,14 @@ class FileLogs(LogSource):
     """Lists the files of a folder that match a pattern, each one recording of one IMU.
 
     Args:
-        sensor, sensors, source, path, metadata: As :class:`~.log_source.LogSource` takes them.
-        pattern: Of the files' paths in the folder. ``{imu}`` and ``{recording}`` stand for their
-            numbers; ``{imu:name}`` and ``{recording:name}`` for names, which are numbered in
-            their order; ``*`` for anything but a slash. Without an IMU all files are of IMU 1;
-            without a recording the files of an IMU are numbered in their order.
-        cache: ``{"path": folder}`` for what was read of the files, which are parsed once only, also
-            where a run was interrupted. (Kedro makes a ``path`` absolute.)
+        sensor, source, path, sensors, metadata: As :class:`~.log_source.LogSource` takes them.
+        pattern: Of the files' paths in the folder; by default all files in it. ``{imu}`` and
+            ``{recording}`` stand for their numbers; ``{imu:name}`` and ``{recording:name}`` for
+            names, which are numbered in their order; ``*`` for anything but a slash. Without an
+            IMU all files are of IMU 1; without a recording the files of an IMU are numbered in
+            their order.
+        cache: ``{"path": folder}`` for what was read of the files, which are then parsed once
+            only, also where a run was interrupted. (Kedro makes a ``path`` absolute.)
         reader: How the files are read (:class:`gyro_pipeline.parameters.ReaderOptions`).
 
     Raises:
@@ -57,11 +59,11 @@ class FileLogs(LogSource):
     def __init__(
         self,
         sensor: str,
-        sensors: Mapping[str, Mapping[str, Any]],
         source: str,
         path: str,
-        pattern: str,
-        cache: Mapping[str, str],
+        sensors: Mapping[str, Mapping[str, Any]] | None = None,
+        pattern: str = "*",
+        cache: Mapping[str, str] | None = None,
         reader: Mapping[str, Any] | None = None,
         metadata: dict[str, Any] | None = None,
     ) -> None:
@@ -73,13 +75,13 @@ class FileLogs(LogSource):
         except ValidationError as error:
             raise InputError(f"{sensor}: reader in the catalog entry: {error}") from error
         readers.check_format(self._options.format, f"{sensor}: reader in the catalog entry")
-        if not (
+        if cache is not None and not (
             isinstance(cache, Mapping) and cache.get("path") and isinstance(cache["path"], str)
         ):
             raise InputError(
                 f"{sensor}: cache in the catalog entry: expected {{path: a folder}}, got {cache!r}"
             )
-        self._cache = Path(cache["path"])
+        self._cache = None if cache is None else Path(cache["path"])
 
     def load(self) -> Logs:
         """List the recordings; their files are read later, one at a time.
@@ -90,17 +92,16 @@ class FileLogs(LogSource):
         """
         found = self._matching()
         numbers = _numbered(self._sensor, self._pattern, found)
+        self._say_order(numbers)
         imus = len({imu for imu, _ in numbers.values()})
-        if imus != self.entry.imus:
+        if self.entry.imus not in (None, imus):
             _LOG.warning(
                 "%s: files of %d IMUs in %s, where globals.yml says imus: %d",
                 *(self._sensor, imus, self._path, self.entry.imus),
             )
-        check_writable(self._cache / _KEPT)
         readings = self._readings(found)
-        self._tidy([one.kept_as for one in readings.values()])
         entries = [
-            LogEntry(*numbers[name], name, reading, reading.path.stat().st_size)
+            LogEntry(*numbers[name], name, reading, (self._path / name).stat().st_size)
             for name, reading in readings.items()
         ]
         entries.sort(key=lambda entry: (entry.imu, entry.recording))
@@ -140,8 +141,21 @@ class FileLogs(LogSource):
         names = (path.relative_to(self._path).as_posix() for path in _files(self._path))
         return sorted((name for name in names if not _HIDDEN.search(name)), key=_natural)
 
-    def _readings(self, names: Iterable[str]) -> dict[str, Reading]:
+    def _say_order(self, numbers: Numbers) -> None:
+        """Say which file is which recording, where no number in its name does."""
+        if "{recording" not in self._pattern and "*" in self._pattern:
+            order = [f"{name} is {number}" for name, (_, number) in numbers.items()]
+            _LOG.info(
+                "%s: recordings of each IMU are numbered in the order of the files' names: %s",
+                *(self._sensor, _listed(order)),
+            )
+
+    def _readings(self, names: Iterable[str]) -> dict[str, Callable[[], Log]]:
         """How each file is read, and where its reading is kept."""
+        if self._cache is None:
+            given = self._options, self.entry.rate_hz
+            return {name: partial(readers.read_log, self._path / name, *given) for name in names}
+        check_writable(self._cache / _KEPT)
         settings = [self._options.model_dump(mode="json"), self.entry.rate_hz, _readers_hash()]
         found = {}
         for name in names:
@@ -156,11 +170,12 @@ class FileLogs(LogSource):
             key = fingerprint([str(path), state.st_size, state.st_mtime_ns, settings])
             kept_as = self._cache / f"{self._sensor}.{key}{_KEPT}"
             found[name] = Reading(path, self._options, self.entry.rate_hz, kept_as)
-        return found
+        self._tidy(self._cache, [one.kept_as for one in found.values()])
+        return {**found}
 
-    def _tidy(self, wanted: Sequence[Path]) -> None:
+    def _tidy(self, cache: Path, wanted: Sequence[Path]) -> None:
         """Say what is there of an earlier run, and remove what is of other files."""
-        there = set(self._cache.glob(f"{glob.escape(self._sensor)}.*{_KEPT}"))  # and other files
+        there = set(cache.glob(f"{glob.escape(self._sensor)}.*{_KEPT}"))  # and other files
         for path in there.difference(wanted):
             path.unlink(missing_ok=True)
         before = len(there.intersection(wanted))

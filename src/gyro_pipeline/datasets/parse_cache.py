@@ -30,7 +30,7 @@ class Reading:
 
     path: Path
     options: ReaderOptions
-    rate_hz: float
+    rate_hz: float | None
     kept_as: Path
 
     def __call__(self) -> Log:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from pydantic import ValidationError
 
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 from gyro_pipeline.datasets.array_logs import LAYOUT, ArrayLogs
@@ -18,7 +19,7 @@ from gyro_pipeline.datasets.atomic import replacing
 from gyro_pipeline.datasets.log_source import LogSource
 from gyro_pipeline.datasets.recordings import Recordings, open_recordings
 from gyro_pipeline.logs import Logs
-from gyro_pipeline.parameters import Sensor
+from gyro_pipeline.parameters import Sensor, SimulatedSensor
 from gyro_pipeline.physics.noise import simulate_noise, warm_up
 
 _LOG = logging.getLogger(__name__)
@@ -36,7 +37,7 @@ class SimulatedLogs(LogSource):
         seed: Of all draws, together with the sensor's name; 0 or more.
 
     Raises:
-        InputError: An unknown sensor, or an entry that is not usable.
+        InputError: An unknown sensor, or an entry that lacks what simulating it takes.
     """
 
     def __init__(
@@ -49,6 +50,7 @@ class SimulatedLogs(LogSource):
         metadata: dict[str, Any] | None = None,
     ) -> None:
         super().__init__(sensor, sensors, source, path, metadata)
+        self._stand_in = _to_simulate(sensor, self.entry)
         files = {split: f"{sensor}_{split}.npy" for split in ("train", "test")}
         self._arrays = ArrayLogs(sensor, sensors, source, path, files, axes_order=LAYOUT)
         self._seed = seed
@@ -93,8 +95,8 @@ class SimulatedLogs(LogSource):
     def _settings(self) -> str:
         """All that the files depend on."""
         # without what was left at its default: files of versions that did not know it stay valid
-        entry = self.entry.model_dump(mode="json")
-        known = self.entry.simulated.model_dump(mode="json")
+        entry = self._stand_in.model_dump(mode="json", exclude={"rate_hz"})  # the counts give it
+        known = self._stand_in.simulated.model_dump(mode="json")
         for added, default in (("random_walk_mdps_per_rts", 0.0), ("warm_up", None)):
             if known[added] == default:
                 del entry["simulated"][added]
@@ -116,9 +118,9 @@ class SimulatedLogs(LogSource):
         """Write the logs, then what was drawn, which marks them as complete."""
         name = zlib.crc32(self._sensor.encode())  # sensors with one seed get different draws
         generator = np.random.default_rng(np.random.SeedSequence([self._seed, name]))
-        truth = draw_biases(generator, self.entry)
+        truth = draw_biases(generator, self._stand_in)
         with replacing(self._train) as train, replacing(self._test) as test:
-            write_logs(generator, self.entry, truth, train, test)
+            write_logs(generator, self._stand_in, truth, train, test)
             # from here on the old mark would vouch for the new arrays
             self._truth.unlink(missing_ok=True)
         truth.attrs = {"settings": self._settings(), "files_hash": self._files_hash()}
@@ -133,7 +135,23 @@ class SimulatedLogs(LogSource):
         return " ".join(digests)
 
 
-def draw_biases(generator: np.random.Generator, entry: Sensor) -> xr.Dataset:
+def _to_simulate(sensor: str, entry: Sensor) -> SimulatedSensor:
+    """A sensor's entry, with all that simulating it takes."""
+    needed = [name for name in SimulatedSensor.model_fields if name != "rate_hz"]
+    missing = [name for name in needed if getattr(entry, name) is None]
+    if missing:
+        raise InputError(
+            f"{sensor} has no files: an entry {sensor}.raw_logs.files in conf/<env>/catalog.yml "
+            "says where they are. To simulate it instead, write to its entry under sensors in "
+            f"conf/<env>/globals.yml: {', '.join(missing)}"
+        )
+    try:
+        return SimulatedSensor.model_validate(entry.model_dump())
+    except ValidationError as error:
+        raise InputError(f"sensor {sensor} in globals.yml: {error}") from error
+
+
+def draw_biases(generator: np.random.Generator, entry: SimulatedSensor) -> xr.Dataset:
     """Draw the bias of every gyroscope at every power-on.
 
     Args:
@@ -177,7 +195,7 @@ def draw_biases(generator: np.random.Generator, entry: Sensor) -> xr.Dataset:
 
 def write_logs(
     generator: np.random.Generator,
-    entry: Sensor,
+    entry: SimulatedSensor,
     truth: xr.Dataset,
     train: Path,
     test: Path,
@@ -216,6 +234,8 @@ def write_logs(
     test_array.flush()
 
 
-def _new_array(path: Path, recordings: int, entry: Sensor) -> np.memmap[Any, np.dtype[Any]]:
+def _new_array(
+    path: Path, recordings: int, entry: SimulatedSensor
+) -> np.memmap[Any, np.dtype[Any]]:
     shape = (recordings, entry.imus * len(AXES), entry.samples)
     return np.lib.format.open_memmap(path, mode="w+", dtype=np.float32, shape=shape)

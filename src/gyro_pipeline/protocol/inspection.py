@@ -23,7 +23,7 @@ class Inspection:
     """
 
     entry: LogEntry
-    rate_hz: float
+    rate_hz: float | None
     quality: Quality
 
     @property
@@ -33,9 +33,9 @@ class Inspection:
 
     @property
     def samples(self) -> int | None:
-        """That ``quality.length_s`` asks for, at the expected rate."""
+        """That ``quality.length_s`` asks for, at the expected rate, if there is one."""
         asked = self.quality.length_s
-        return None if asked is None else round(asked * self.rate_hz)
+        return None if asked is None or self.rate_hz is None else round(asked * self.rate_hz)
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,11 @@ def _judged(log: Log, job: Inspection) -> Judged:
     with np.errstate(over="ignore"):  # becomes infinite, and is found as such
         stored = np.ascontiguousarray(log.samples.T, dtype=np.float32)
     rounded = replace(log, samples=stored.T.astype(np.float64))
-    found = inspect(rounded, log.rate_hz or job.rate_hz, job.quality)
+    rate_hz = log.rate_hz or job.rate_hz
+    if rate_hz is None:
+        problem = "no timestamps, and none is expected; write rate_hz to the sensor in globals.yml"
+        return Judged(REJECTED, (*log.findings, Finding("sample rate", REJECTED, problem)))
+    found = inspect(rounded, rate_hz, job.quality)
     usable = found.stop - found.start
     stop = found.start + min(usable, job.samples or usable)
     judged = Judged(

@@ -6,7 +6,24 @@ from gyro_pipeline.pipelines.ground_truth.nodes import (
     measure_allan_variance,
     measure_bias,
     measure_noise,
+    report_biases,
 )
+
+
+def create_report(sensor: str) -> Pipeline:
+    """The biases, on the terminal."""
+    stage = f"{sensor}.ground_truth"
+    return Pipeline(
+        [
+            Node(
+                report_biases,
+                [f"{sensor}.raw_logs.recordings", f"{stage}.bias", f"{sensor}.raw_logs.quality"],
+                None,
+                name=f"report_biases_{sensor}",
+                namespace="ground_truth",
+            )
+        ]
+    )
 
 
 def create_pipeline(sensor: str) -> Pipeline:

@@ -129,12 +129,13 @@ def _common_length(files: Logs, used: Sequence[Row], quality: Quality) -> int:
     lengths = [judged.stop - judged.start for _, judged in used]
     shortest = int(np.argmin(lengths))
     length, usual = lengths[shortest], float(np.median(lengths))
+    rate_hz = _agreed_rate(used, files.rate_hz)
     if length < quality.least_share * usual:
         logger.warning(
             "%s: all recordings are cut to %.4g s, as long as IMU %d recording %d, %s; half of "
             "them have %.4g s or more. Remove or repair it, or raise quality.least_s",
-            *(files.sensor, length / files.rate_hz, used[shortest][0].imu),
-            *(used[shortest][0].recording, used[shortest][0].where, usual / files.rate_hz),
+            *(files.sensor, length / rate_hz, used[shortest][0].imu),
+            *(used[shortest][0].recording, used[shortest][0].where, usual / rate_hz),
         )
     return length
 
@@ -203,10 +204,10 @@ def _described(sensor: str, row: Row, length: int) -> dict[str, Any]:
     }
 
 
-def _agreed_rate(used: Sequence[Row], expected_hz: float) -> float:
+def _agreed_rate(used: Sequence[Row], expected_hz: float | None) -> float:
     """The median of the measured rates; the reader has rejected those far from the expected one."""
     measured = [judged.rate_hz for _, judged in used if judged.rate_hz is not None]
-    return _rounded(np.median(measured)) if measured else expected_hz
+    return _rounded(np.median(measured)) if measured else expected_hz or np.nan
 
 
 def _rounded(rate_hz: np.floating | float) -> float:

@@ -78,16 +78,19 @@ def find(
 
 
 def _beyond_any_ceiling(published: Sequence[PublishedResult], sensors: Mapping[str, Sensor]) -> str:
-    known = [one for one in published if one.sensor in sensors]
-    limits = [
-        100 * best_gain(np.sqrt(one.window_s / sensors[one.sensor].recording_s)) for one in known
-    ]
+    lengths = {
+        name: sensor.recording_s
+        for name, sensor in sensors.items()
+        if sensor.recording_s is not None
+    }
+    known = [one for one in published if one.sensor in lengths]
+    limits = [100 * best_gain(np.sqrt(one.window_s / lengths[one.sensor])) for one in known]
     beyond = sum(one.accuracy_gain_pct > a for one, a in zip(known, limits, strict=True))
     names = dict.fromkeys(one.sensor for one in known)
-    lengths = ", ".join(f"{sensors[name].recording_s:g} s on {name}" for name in names)
+    listed = ", ".join(f"{lengths[name]:g} s on {name}" for name in names)
     return (
         f"{beyond} of {len(known)} published results exceed the limit A = 1 − √(T0/T), with T = "
-        f"{lengths}. It holds for white noise even if the bias is known exactly, and no training "
+        f"{listed}. It holds for white noise even if the bias is known exactly, and no training "
         "set can move it."
     )
 
@@ -165,7 +168,9 @@ def _constant(networks: pd.DataFrame, sensor: Sensor) -> float:
 
     The bias of a power-on and the averaging of the truth scatter about it: tau^2 + N^2 / T.
     """
-    if sensor.simulated.flicker_mdps or not networks.simulated.all():
+    if sensor.simulated is None or sensor.recording_s is None or not networks.simulated.all():
+        return np.nan
+    if sensor.simulated.flicker_mdps:
         return np.nan
     tau, noise = (
         MDPS * np.asarray(values)

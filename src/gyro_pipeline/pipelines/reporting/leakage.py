@@ -161,14 +161,15 @@ def accuracy_against_stride(
         results: From :func:`pool_leakage`.
         published: The paper's gain.
         leakage: Its network's hop.
-        sensors: Their rates, by which the hop is a time.
+        sensors: Their rates, by which the hop is a time, where they are known.
     """
     names = list(dict.fromkeys(results.sensor))
     with LOOK():
         figure = Figure(figsize=(9.5, 1.2 + 4.4 * len(names)), layout="constrained")
         axes = figure.subplots(len(names), 1, squeeze=False)[:, 0]
         for ax, sensor in zip(axes, names, strict=True):
-            hop_s = leakage.network.hop / Sensor(**sensors[sensor]).rate_hz
+            rate_hz = Sensor(**sensors[sensor]).rate_hz
+            hop_s = np.nan if rate_hz is None else leakage.network.hop / rate_hz
             _draw(ax, results[results.sensor == sensor], published, hop_s)
         share_legend(figure, axes, columns=3)
     return figure
@@ -212,6 +213,8 @@ def _draw(ax: Axes, results: pd.DataFrame, published: Published, hop_s: float) -
 
 def _stride_label(stride_s: float, hop_s: float) -> str:
     hops = stride_s / hop_s
+    if np.isnan(hops):
+        return f"{stride_s:g}"
     whole = abs(hops - round(hops)) < _WHOLE
     return f"{stride_s:g}\n{'= ' if whole else ''}{hops:.3g} hop{'s' if hops > 1 + _WHOLE else ''}"
 

@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 
 from gyro_pipeline.conventions import AXES, Missing
-from gyro_pipeline.parameters import Only, Published, Sensor
+from gyro_pipeline.parameters import Only, Published, Sensor, SimulatedSensor
 from gyro_pipeline.pipelines.reporting.captions import CAPTIONS, FURTHER, Caption
 from gyro_pipeline.pipelines.reporting.findings import compare, find
 from gyro_pipeline.studies import CNN, MEAN
@@ -187,16 +187,17 @@ def _lengths(results: pd.DataFrame) -> str:
 
 
 def _recordings(sensors: Mapping[str, Sensor]) -> str:
-    """How many hours."""
+    """How many hours were simulated."""
+    simulated = {name: SimulatedSensor(**one.model_dump()) for name, one in sensors.items()}
     seconds = [
         len(AXES)
         * (one.imus * one.train_recordings + one.recordings - one.train_recordings)
         * one.recording_s
-        for one in sensors.values()
+        for one in simulated.values()
     ]
     each = ", ".join(
         f"{name} {one.imus} × {one.recordings} of {one.recording_s:g} s"
-        for name, one in sensors.items()
+        for name, one in simulated.items()
     )
     return (
         f"{sum(seconds) / 3600:.1f} h: training recordings of every gyroscope, test recordings of "

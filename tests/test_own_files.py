@@ -1,0 +1,177 @@
+"""A user's own device: a folder of files in, biases with their standard errors out."""
+
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+
+BIAS, NOISE, RATE_HZ = (0.7, -0.4, 0.15), 0.05, 100
+HEADER = "time (s),gx (rad/s),gy (rad/s),gz (rad/s)"
+FOLDER = "data/01_raw/mine"
+
+ENVIRONMENT = {
+    "globals": """\
+source: mine
+sensors: {device: {}}
+""",
+    "parameters": """\
+only: {sensor: device}
+""",
+    "catalog": """\
+device.raw_logs.files:
+  type: gyro_pipeline.datasets.file_logs.FileLogs
+  sensor: device
+  source: ${globals:source}
+  path: data/01_raw/mine
+""",
+}
+
+
+def write(path, seconds=60, seed=0):
+    """A device at rest, in rad/s."""
+    rows = round(RATE_HZ * seconds)
+    rates = np.deg2rad(np.random.default_rng(seed).normal(BIAS, NOISE, (rows, 3)))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    table = np.column_stack([np.arange(rows) / RATE_HZ, rates])
+    np.savetxt(path, table, "%.9g", ",", header=HEADER, comments="")
+
+
+@pytest.fixture(scope="module")
+def make(new_project):
+    """A project with these files of 60 s, or of so many seconds, and the environment ``mine``."""
+
+    def project(*names, seconds=60, **changes):
+        made = new_project()
+        for seed, name in enumerate(names):
+            write(made.folder / FOLDER / name, seconds, seed)
+        (made.folder / "conf/mine").mkdir()
+        for kind, text in (ENVIRONMENT | changes).items():
+            (made.folder / f"conf/mine/{kind}.yml").write_text(text)
+        return made
+
+    return project
+
+
+def biases(project, source="mine", sensor="device"):
+    return pd.read_csv(project.folder / f"data/03_primary/{source}/{sensor}/bias.csv")
+
+
+def printed(done):
+    """The rows of the table on the terminal: IMU, recording, then value and error of each axis."""
+    rows = re.findall(r"^ +(\d+) +(\d+) +(.*±.*)$", done.output, re.MULTILINE)
+    values = [re.findall(r"(-?\d+\.\d+) ± (\d+\.\d+)", row) for *_, row in rows]
+    return {
+        (int(imu), int(number)): np.array(pairs, float)
+        for (imu, number, _), pairs in zip(rows, values, strict=True)
+    }
+
+
+def check(done, recordings, seconds=60):
+    assert done.code == 0, done.output
+    shown = printed(done)
+    assert list(shown) == recordings
+    expected_error = NOISE / np.sqrt(RATE_HZ * seconds)
+    for pairs in shown.values():
+        np.testing.assert_allclose(pairs[:, 0], BIAS, rtol=0, atol=5 * expected_error)
+        np.testing.assert_allclose(pairs[:, 1], expected_error, rtol=0.25)
+
+
+THREE = ("still_1.csv", "still_2.csv", "still_10.csv")
+
+
+def test_eight_lines_and_one_command_are_enough(make):
+    assert sum(len(text.splitlines()) for text in ENVIRONMENT.values()) <= 8
+    project = make(*THREE)
+    done = project.kedro_run("--pipeline=ground_truth", "--env=mine")
+    check(done, [(1, 1), (1, 2), (1, 3)])
+    assert "still_1.csv is 1, still_2.csv is 2, still_10.csv is 3" in done.output
+    assert "data/03_primary/mine/device/bias.csv" in done.output
+    assert "data/02_intermediate/mine/device/quality.csv" in done.output
+    assert len(biases(project)) == 3 * 3
+
+
+def test_one_line_is_enough(make):
+    project = make(*THREE)
+    arguments = f"--params=logs={FOLDER},reader.units=rad/s"
+    check(project.kedro_run("--pipeline=ground_truth", "--env=logs", arguments),
+          [(1, 1), (1, 2), (1, 3)])  # fmt: skip
+    assert set(biases(project, "logs").sensor) == {"device"}
+
+
+@pytest.mark.parametrize(
+    ("env", "params", "words"),
+    [
+        ("base", {"logs": FOLDER, "only": {"sensor": "ng"}}, ["logs of --params", "--env=logs"]),
+        ("mine", {"reader": {"units": "deg/s"}}, ["reader of --params", "not taken", FOLDER]),
+        ("logs", {"reader": {"unit": "deg/s"}}, ["reader.unit: unknown key; there are format"]),
+        ("logs", {"log": FOLDER}, ["log: unknown key"]),
+        ("logs", {"logs": "nowhere"}, ["nowhere: no such folder"]),
+        (
+            "mine",
+            {"only": {"sensor": "devise"}},
+            ["only.sensor: unknown sensor 'devise'", "device"],
+        ),
+    ],
+)
+def test_what_is_typed_wrong_is_said_in_one_message(make, env, params, words):
+    done = make("1.csv").run_here("ground_truth", env, **params)
+    assert done.code == 1
+    assert "Traceback" not in done.output
+    assert done.output.count("error: ") == 1
+    for word in words:
+        assert word in done.output
+
+
+@pytest.mark.parametrize(
+    ("names", "recordings"),
+    [
+        (["1/a.csv"], [(1, 1)]),
+        (["2/a.csv", "2/b.csv", "3/a.csv"], [(2, 1), (2, 2), (3, 1)]),
+    ],
+)
+def test_any_numbers_of_imus_and_recordings(make, names, recordings):
+    pattern = '  pattern: "{imu}/*.csv"\n'
+    project = make(*names, catalog=ENVIRONMENT["catalog"] + pattern)
+    check(project.run_here("ground_truth", "mine"), recordings)
+
+
+def test_one_short_recording_of_a_sensor_with_studies_that_ask_for_more(make):
+    files = ENVIRONMENT["catalog"].replace("device", "dot")
+    project = make(
+        "1.csv",
+        seconds=20,
+        globals="source: mine\nsensors: {dot: {imus: 1, samples: 2000, recording_s: 20}}\n",
+        parameters="only: {sensor: dot}\n",
+        catalog=files + "  sensors: ${globals:sensors}\n",
+    )
+    check(project.run_here("ground_truth", "mine"), [(1, 1)], seconds=20)
+    refused = project.run_here("real2real", "mine")
+    assert refused.code == 1
+    assert "studies.real2real.dot: 12 real gyroscopes asked, dot has 3" in refused.output
+
+
+def test_without_times_the_rate_is_asked_for_and_taken(make):
+    names = {
+        "sensors": "  sensors: ${globals:sensors}\n",
+        "reader": "  reader: {columns: [1, 2, 3]}\n",
+    }
+    project = make("1.csv", catalog=ENVIRONMENT["catalog"] + "".join(names.values()))
+    path = project.folder / FOLDER / "1.csv"
+    path.write_text(path.read_text().replace("time (s)", "row"))
+    refused = project.run_here("ground_truth", "mine")
+    assert refused.code == 1
+    assert "rate_hz" in refused.output
+    known = f"source: mine\nsensors: {{device: {{rate_hz: {RATE_HZ}}}}}\n"
+    (project.folder / "conf/mine/globals.yml").write_text(known)
+    check(project.run_here("ground_truth", "mine"), [(1, 1)])
+
+
+def test_a_sensor_without_files_is_not_simulated_from_nothing(make):
+    project = make("1.csv", catalog="{}\n")
+    done = project.run_here("ground_truth", "mine")
+    assert done.code == 1
+    assert (
+        "device has no files: an entry device.raw_logs.files in conf/<env>/catalog" in done.output
+    )
+    assert "imus, recordings, train_recordings, samples, recording_s, simulated" in done.output
