@@ -17,7 +17,7 @@ class LogSource(AbstractDataset[Logs, Logs]):
 
     Args:
         sensor: Name of the sensor the files are of.
-        sensors: All sensors, as in ``conf/base/globals.yml``.
+        sensors: All sensors, as in ``conf/base/globals.yml``; None: nothing is known of this one.
         source: Where the logs come from, as stored paths name it.
         path: Folder of the files.
         metadata: For other tools, such as Kedro-Viz.
@@ -29,12 +29,12 @@ class LogSource(AbstractDataset[Logs, Logs]):
     def __init__(
         self,
         sensor: str,
-        sensors: Mapping[str, Mapping[str, Any]],
+        sensors: Mapping[str, Mapping[str, Any]] | None,
         source: str,
         path: str,
         metadata: dict[str, Any] | None,
     ) -> None:
-        self.entry = _entry(sensor, sensors)
+        self.entry = Sensor.model_validate({}) if sensors is None else _entry(sensor, sensors)
         if not isinstance(path, str):
             raise InputError(
                 f"{sensor}: path in the catalog entry: expected a folder, got {path!r}"
@@ -60,4 +60,4 @@ def _entry(sensor: str, sensors: Mapping[str, Mapping[str, Any]]) -> Sensor:
     try:
         return Sensor.model_validate(sensors[sensor])
     except ValidationError as error:
-        raise InputError(f"sensor {sensor} in conf/base/globals.yml: {error}") from error
+        raise InputError(f"sensor {sensor} in globals.yml: {error}") from error

@@ -99,6 +99,11 @@ class Inspected:
     stop: int
     findings: tuple[Finding, ...]
 
+    @property
+    def masked(self) -> NDArray[np.bool_]:
+        """Rows between them that hold no measurement; none."""
+        return np.zeros(self.stop - self.start, np.bool_)
+
 
 def inspect(log: Log, rate_hz: float, quality: Quality) -> Inspected:
     """Find what is wrong with a recording, and the longest stretch of it that can be used.
