@@ -256,7 +256,10 @@ def make_recordings() -> Callable[..., xr.Dataset]:
         rates = simulate_noise(generator, (*bias.shape, samples), rate_hz, noise_dps_rts)
         rates += bias[..., None].astype(np.float32)
         return xr.Dataset(
-            {"angular_rate": (DIMENSIONS, rates)},
+            {
+                "angular_rate": (DIMENSIONS, rates),
+                "samples": (DIMENSIONS[:2], np.full(bias.shape[:2], samples)),
+            },
             coords={
                 "imu": np.arange(1, 1 + bias.shape[0]),
                 "recording": np.arange(1, 1 + bias.shape[1]),

@@ -70,7 +70,7 @@ class FileLogs(LogSource):
             raise InputError(f"{sensor}: reader in the catalog entry: {error}") from error
         readers.check_format(self._options.format, f"{sensor}: reader in the catalog entry")
         columns = self._options.columns
-        self._side_by_side = list(columns) if isinstance(columns, Mapping) else []
+        self._side_by_side: list[int] = list(columns) if isinstance(columns, Mapping) else []
         if self._side_by_side and "imu" in self._regex.groupindex:
             raise InputError(
                 f"{sensor}: columns in the catalog entry's reader name IMUs "
@@ -176,7 +176,7 @@ class FileLogs(LogSource):
         return {name: place for place, name in taken.items()}
 
     def _numbers(self, part: str, matches: Matches) -> dict[str, int]:
-        """What one part of each path says, as a number; nothing where the pattern lacks the part."""
+        """What one part of each path says, as a number; nothing where there is no such part."""
         if part not in self._regex.groupindex:
             return {}
         texts = {name: match[part] for name, match in matches.items()}

@@ -94,7 +94,7 @@ class InspectedRecordings(AbstractDataset[Listing | Recording, list[Recording]])
 
     def __init__(self, filepath: str, metadata: dict[str, Any] | None = None) -> None:
         self._final = Path(filepath)
-        self._path = unfinished(self._final)
+        self._path = path_in_progress(self._final)
         self.metadata = metadata
 
     def load(self) -> list[Recording]:
@@ -137,13 +137,13 @@ class CompletedRecordings(Recordings):
             data: ``samples`` (imu, recording), 0 for recordings that are not to be used, attributes
                 and all that is not measured.
         """
-        path = unfinished(self._filepath)
+        path = path_in_progress(self._filepath)
         _erase(path, data["samples"])
         data.to_netcdf(path, mode="a", engine=_ENGINE)
         os.replace(path, self._filepath)
 
 
-def unfinished(final: Path) -> Path:
+def path_in_progress(final: Path) -> Path:
     """The file in which recordings are kept while others are still read."""
     return final.with_suffix(f".unfinished{final.suffix}")
 

@@ -1,6 +1,7 @@
 """Nodes of the raw-logs stage."""
 
 import logging
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -26,7 +27,7 @@ _WORTH_PROCESSES = 10**8
 """Bytes to read; fewer are read by this process before others have started."""
 
 _AT_ONCE, _BYTES_AT_ONCE = 16, 16 * 10**6
-"""Recordings, and bytes of them, that go to a process together; what they become waits in memory."""
+"""Recordings, and bytes of them, that go to a process together, and come back so."""
 
 _NAMED = 10
 """So many are named in a message; all are in the table."""
@@ -63,9 +64,7 @@ def inspect_logs(
     yield from _read(files.sensor, missing, execution)
 
 
-def _read(
-    sensor: str, jobs: Sequence[Inspection], execution: Execution
-) -> Iterator[Recording]:
+def _read(sensor: str, jobs: Sequence[Inspection], execution: Execution) -> Iterator[Recording]:
     """Recordings in any order, read here or in several processes."""
     sizes = [job.entry.size for job in jobs]
     if sum(sizes) < _WORTH_PROCESSES:
@@ -76,7 +75,7 @@ def _read(
 
 
 def quality_table(files: Logs, inspected: Sequence[Recording]) -> pd.DataFrame:
-    """How each recording was found. One that is there under two numbers is rejected the second time.
+    """How each recording was found; one that is there under two numbers is rejected once.
 
     Args:
         files: For the sensor's name.
@@ -112,8 +111,8 @@ def label_recordings(
     require_enough(table, quality)
     used = table[table.outcome != REJECTED].set_index(["imu", "recording"])
     imus, numbers = (sorted(table[name].unique().tolist()) for name in ("imu", "recording"))
-    lengths = (used.stop - used.start).unstack(fill_value=0)
-    lengths = lengths.reindex(index=imus, columns=numbers, fill_value=0).to_numpy(np.int64)
+    lengths = (used["stop"] - used["start"]).unstack(fill_value=0)
+    samples = lengths.reindex(index=imus, columns=numbers, fill_value=0).to_numpy(np.int64)
     coordinates: dict[str, Any] = {"imu": imus, "recording": numbers, "axis": list(AXES)}
     splits = {entry.recording: entry.split for entry in files.entries}
     if any(splits.values()):
@@ -126,7 +125,7 @@ def label_recordings(
     }
     contents = [[*one.place, one.content] for one in inspected if one.place in used.index]
     attributes["data_hash"] = fingerprint([attributes, sorted(splits.items()), contents])
-    labels = xr.Dataset({"samples": (("imu", "recording"), lengths)}, coordinates, attributes)
+    labels = xr.Dataset({"samples": (("imu", "recording"), samples)}, coordinates, attributes)
     if files.drawn is not None:
         labels = labels.assign(files.drawn.sel(imu=imus, recording=numbers).data_vars)
     return labels
@@ -210,14 +209,15 @@ def _rounded(rate_hz: float) -> float:
 
 def _reasons(rejected: pd.DataFrame) -> list[str]:
     """Why recordings were rejected, each reason once, with the recordings that it is of."""
-    files = zip(rejected.findings, rejected.file, strict=True)
-    reasons = rejected.assign(reason=[text.replace(file, "the file") for text, file in files])
+    alike: dict[str, list[Any]] = {}
+    for row in rejected.itertuples():
+        reason = re.sub(rf"\S*{re.escape(str(row.file))}", "the file", str(row.findings))
+        alike.setdefault(reason, []).append(row)
     lines = []
-    for reason, same in reasons.groupby("reason", sort=False):
-        first = same.iloc[0]
-        which = f"IMU {first.imu} recording {first.recording}, {first.file}"
-        which += f", and {len(same) - 1} more" if len(same) > 1 else ""
-        lines.append(f"{which}: {first.findings if len(same) == 1 else reason}")
+    for reason, rows in alike.items():
+        which = f"IMU {rows[0].imu} recording {rows[0].recording}, {rows[0].file}"
+        which += f", and {len(rows) - 1} more" if len(rows) > 1 else ""
+        lines.append(f"{which}: {reason}")
     further = len(lines) - _NAMED
     more = [f"and {further} other reasons, in the table of their quality"] if further > 0 else []
     return lines[:_NAMED] + more
