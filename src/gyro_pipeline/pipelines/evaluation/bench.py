@@ -104,7 +104,7 @@ class Bench:
         return self.recordings.sizes["sample"] / self.recordings.attrs["rate_hz"]
 
     @cached_property
-    def recordings_of_test_imu(self) -> list[TestRecording]:
+    def tested(self) -> list[TestRecording]:
         """The test recordings with what is needed to judge an estimate."""
         known = "true_bias" in self.recordings
         places, there = product(self.imus, self.numbers), present(self.recordings)

@@ -219,7 +219,7 @@ def _samples(recordings: xr.Dataset, one: pd.Series) -> NDArray[np.float64]:
     """All samples of its own length; masked ones are their mean."""
     chosen = recordings.sel(imu=one.imu, recording=one.recording, axis=one.axis)
     samples = chosen.angular_rate.to_numpy()[: int(chosen["samples"])]
-    return fill_masked(samples.astype(np.float64))
+    return fill_masked(samples).astype(np.float64)
 
 
 def _running_mean(
