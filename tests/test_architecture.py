@@ -24,7 +24,7 @@ ALLOWED = {
     "tracking": {"conventions"},
     "physics": {"conventions"},
     "estimators": {"conventions", "learning", "physics"},
-    "protocol": {"conventions", "logs", "parameters", "physics"},
+    "protocol": {"conventions", "fingerprints", "logs", "parameters", "physics"},
     "learning": {"conventions", "executors", "parameters", "protocol"},
     "datasets": {
         "conventions",

@@ -48,7 +48,8 @@ def inspect_logs(
         What there is to read, then the recordings that were not read before, as they are done.
     """
     code = code_hash([checks, damage, stationarity, inspection])
-    settings = [quality.model_dump(mode="json"), files.rate_hz, code]
+    judged_by = quality.model_dump(mode="json", exclude={"needed_pct"})  # which is of all together
+    settings = [judged_by, files.rate_hz, code]
     jobs = {
         (entry.imu, entry.recording): Inspection(
             entry, files.rate_hz, quality, fingerprint([entry.key, settings])
