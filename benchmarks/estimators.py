@@ -90,6 +90,8 @@ def simulate(generator: np.random.Generator, model: RecordingModel, count: int) 
 def labelled(data: dict[str, tuple], count: int, rate_hz: float) -> xr.Dataset:
     """Recordings of IMU 1 in the layout of the conventions."""
     coords = {"imu": [1], "recording": np.arange(1, 1 + count), "axis": list(AXES)}
+    lengths = np.full((1, count), data["angular_rate"][1].shape[-1])
+    data["samples"] = (DIMENSIONS[:2], lengths)
     return xr.Dataset(data, coords, {"rate_hz": rate_hz, "sensor": "benchmark"})
 
 

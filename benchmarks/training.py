@@ -523,7 +523,11 @@ def recorded(path: Path, imus: int, recordings: int, samples: int) -> xr.Dataset
     shape = (imus, recordings, len(AXES))
     rates = random.standard_normal((*shape, samples), np.float32)
     bias = random.normal(size=shape)
-    data = {"angular_rate": (DIMENSIONS, rates), "recording_mean": (DIMENSIONS[:-1], bias)}
+    data = {
+        "angular_rate": (DIMENSIONS, rates),
+        "recording_mean": (DIMENSIONS[:-1], bias),
+        "samples": (DIMENSIONS[:2], np.full(shape[:2], samples)),
+    }
     Recordings(str(path)).save(xr.Dataset(data, coordinates))
     return Recordings(str(path)).load()
 

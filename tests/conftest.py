@@ -29,9 +29,12 @@ from mlflow import MlflowClient
 from mlflow.entities import Run
 
 from gyro_pipeline.conventions import AXES, DIMENSIONS, HOLD_OUT, TEST, TRAIN, VALIDATION
+from gyro_pipeline.datasets.recordings import CompletedRecordings, InspectedRecordings
 from gyro_pipeline.fingerprints import data_hash
-from gyro_pipeline.parameters import Parameters
+from gyro_pipeline.logs import Logs
+from gyro_pipeline.parameters import Execution, Parameters, Quality
 from gyro_pipeline.physics.noise import simulate_noise
+from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs, label_recordings, quality_table
 from gyro_pipeline.settings import CONFIG_LOADER_ARGS
 
 ROOT = Path(__file__).parents[1]
@@ -246,6 +249,26 @@ def parameters() -> Callable[..., Parameters]:
 
 
 @pytest.fixture(scope="session")
+def read_logs() -> Callable[..., tuple[xr.Dataset, pd.DataFrame]]:
+    """The raw-logs stage with its datasets, as ``kedro run`` wires them."""
+
+    def read(
+        files: Logs, quality: Quality, folder: Path, workers: int | None = None
+    ) -> tuple[xr.Dataset, pd.DataFrame]:
+        """Recordings, and the table of their quality."""
+        execution = Execution(executor="processes" if workers else "serial", workers=workers)
+        path = str(folder / "recordings.nc")
+        reading, final = InspectedRecordings(path), CompletedRecordings(path)
+        for item in inspect_logs(files, reading.load(), quality, execution):
+            reading.save(item)
+        table = quality_table(files, reading.load())
+        final.save(label_recordings(files, reading.load(), table, quality))
+        return final.load(), table
+
+    return read
+
+
+@pytest.fixture(scope="session")
 def make_recordings() -> Callable[..., xr.Dataset]:
     """White noise of known N around known biases, in the layout of the conventions."""
 
@@ -256,7 +279,10 @@ def make_recordings() -> Callable[..., xr.Dataset]:
         rates = simulate_noise(generator, (*bias.shape, samples), rate_hz, noise_dps_rts)
         rates += bias[..., None].astype(np.float32)
         return xr.Dataset(
-            {"angular_rate": (DIMENSIONS, rates)},
+            {
+                "angular_rate": (DIMENSIONS, rates),
+                "samples": (DIMENSIONS[:2], np.full(bias.shape[:2], samples)),
+            },
             coords={
                 "imu": np.arange(1, 1 + bias.shape[0]),
                 "recording": np.arange(1, 1 + bias.shape[1]),

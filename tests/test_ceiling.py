@@ -52,6 +52,7 @@ def recordings():
     return xr.Dataset(
         {
             "angular_rate": (DIMENSIONS, rates),
+            "samples": (DIMENSIONS[:2], np.full((2, numbers), SAMPLES)),
             "true_bias": (DIMENSIONS[:-1], bias),
             "true_unit_bias": (("imu", "axis"), unit),
         },

@@ -10,13 +10,13 @@ import yaml
 
 from gyro_pipeline.datasets.file_logs import FileLogs
 from gyro_pipeline.datasets.recordings import open_recordings
-from gyro_pipeline.parameters import Execution
-from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs
+from gyro_pipeline.physics.bias import recording_mean
+from gyro_pipeline.protocol.recordings import cut, one_by_one
 
 IMUS, RATE_HZ = (1, 2, 3, 4, 5), 120.0
 START, STOP = 1, 13_000
-"""Rows that are used of every file: from behind the row of zeros to the shortest one's end, which
-is the dropout of file 1 in rows 13000 and 13001."""
+"""From behind the row of zeros that each file begins with, to the dropout of file 1 in rows 13000
+and 13001."""
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_each_row_of_zeros_and_the_dropout_are_found_and_cut(ran):
     assert table.outcome.tolist() == ["repaired", "kept", "kept", "kept", "kept"]
     assert table.rows.tolist() == [14461, 14469, 14464, 14460, 14468]
     assert (table.start == START).all()
-    assert (table.stop == STOP).all()
+    assert table.stop[1:].tolist() == [14469, 14464, 14460, 14468]
     assert table.findings.str.contains("zero rows: row 0, cut").all()
     assert "non-finite values: axes x, y, z, row 13001, cut" in table.findings[0]
     assert "dropouts: row 13000, cut" in table.findings[0]
@@ -81,15 +81,27 @@ def test_rows_that_are_cut_are_what_they_are_called(rows):
 def test_the_rate_is_that_of_the_time_column(ran):
     recordings = open_recordings(ran[0].folder / "data/02_intermediate/dot_real/dot/recordings.nc")
     assert recordings.attrs["rate_hz"] == RATE_HZ
-    assert dict(recordings.sizes) == {"imu": 5, "recording": 1, "axis": 3, "sample": STOP - START}
+    assert recordings["samples"].values[1:].ravel().tolist() == [14468, 14463, 14459, 14467]
 
 
-def test_biases_and_noise_are_those_of_numpy_to_ten_digits(bias, rows):
-    for imu in IMUS:
-        used = rows[imu][START:STOP]
+def test_biases_and_noise_are_those_of_numpy_over_unmasked_rows_to_ten_digits(ran, bias, rows):
+    recordings = open_recordings(ran[0].folder / "data/02_intermediate/dot_real/dot/recordings.nc")
+    for imu, number, samples in one_by_one(recordings):
+        measured = ~np.isnan(samples).any(axis=0)
+        used = rows[imu][START : START + len(measured)][measured]
+        assert number == 1
+        assert len(used) >= STOP - START
         found = bias.loc[imu]
         np.testing.assert_allclose(found.bias_dps, used.mean(axis=0), rtol=5e-11)
         np.testing.assert_allclose(found.sample_sigma_dps, used.std(axis=0, ddof=1), rtol=5e-11)
+
+
+def test_over_the_rows_before_the_dropout_they_are_those_of_numpy(ran, rows):
+    recordings = open_recordings(ran[0].folder / "data/02_intermediate/dot_real/dot/recordings.nc")
+    cut_ones = cut(recordings, STOP - START)
+    for imu, _, samples in one_by_one(cut_ones):
+        means = rows[imu][START:STOP].mean(axis=0)
+        np.testing.assert_allclose(recording_mean(samples), means, rtol=5e-11)
 
 
 def as_rad_per_s(table, path):
@@ -134,7 +146,7 @@ def as_parquet(table, path):
     ],
 )
 def test_copies_in_other_formats_and_units_give_the_same_biases(
-    folder, bias, parameters, tmp_path, write, name, reader
+    folder, bias, parameters, read_logs, tmp_path, write, name, reader
 ):
     for imu in IMUS:
         table = pd.read_csv(
@@ -145,16 +157,14 @@ def test_copies_in_other_formats_and_units_give_the_same_biases(
     source = FileLogs(
         "dot",
         *("copies", str(tmp_path)),
-        sensors={"dot": sensors["sensors"]["dot"] | {"rate_hz": 120}},
+        sensors={"dot": sensors["sensors"]["dot"] | {"samples": 14448, "recording_s": 120.4}},
         pattern=name,
         reader=reader,
     )
     asked = parameters("dot_real").quality
-    serial = Execution(executor="serial", workers=None)
-    recordings, table = inspect_logs(source.load(), asked, serial)
+    recordings, table = read_logs(source.load(), asked, tmp_path)
     assert table.outcome.tolist() == ["repaired", "kept", "kept", "kept", "kept"]
-    assert recordings.sizes["sample"] == STOP - START
     assert recordings.attrs["rate_hz"] == pytest.approx(RATE_HZ, rel=1e-3)
-    means = recordings.angular_rate.squeeze("recording").mean("sample", dtype=np.float64)
+    means = [recording_mean(samples) for _, _, samples in one_by_one(recordings)]
     expected = bias.bias_dps.to_numpy().reshape(5, 3)
     np.testing.assert_allclose(means, expected, rtol=0, atol=1e-6)

@@ -100,10 +100,10 @@ def runs(process):
 
 
 @BOTH
-@pytest.mark.parametrize("short", [False, True], ids=["", "short"])
-def test_every_job_is_run_once_and_comes_back_with_its_result(here, execution, short):
+@pytest.mark.parametrize("at_once", [None, 1, 16])
+def test_every_job_is_run_once_and_comes_back_with_its_result(here, execution, at_once):
     jobs = [here.Job(f"job {i}", float(i)) for i in range(1, 20)]
-    results = dict(run_jobs(jobs, here.square, execution, "squares", short=short))
+    results = dict(run_jobs(jobs, here.square, execution, "squares", at_once=at_once))
     assert results == {job: job.work**2 for job in jobs}
 
 

@@ -14,8 +14,7 @@ import pytest
 from gyro_pipeline.conventions import LAST, TEST, TRAIN
 from gyro_pipeline.datasets.array_logs import ArrayLogs
 from gyro_pipeline.learning.jobs import NetworkEstimator, run_training
-from gyro_pipeline.parameters import Execution, VirtualGyros
-from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs
+from gyro_pipeline.parameters import VirtualGyros
 from gyro_pipeline.pipelines.training.nodes import Devices
 from gyro_pipeline.protocol.leaks import strided_errors
 from gyro_pipeline.protocol.scores import paired_difference, resampled_weights
@@ -72,15 +71,14 @@ def informative(make_recordings):
 
 
 @pytest.fixture(scope="module")
-def real(parameters):
+def real(parameters, read_logs, tmp_path_factory):
     folder = os.environ.get("GYRO_PIPELINE_REAL_DATA")
     if not folder or not Path(folder, REAL_FILE).is_file():
         pytest.skip(f"GYRO_PIPELINE_REAL_DATA names no folder with {REAL_FILE}")
     p = parameters("base")
     sensors = {name: one.model_dump() for name, one in p.sensors.items()}
     logs = ArrayLogs("memsense", sensors, "published", folder, {"all": REAL_FILE}).load()
-    serial = Execution(executor="serial", workers=None)
-    return inspect_logs(logs, p.quality, serial)[0]
+    return read_logs(logs, p.quality, tmp_path_factory.mktemp("recordings"))[0]
 
 
 def test_on_simulated_data_shuffled_labels_are_no_better_than_the_constant(

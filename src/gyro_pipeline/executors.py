@@ -26,8 +26,6 @@ _LOG_EVERY_S = 30
 _START = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
 _IMPORTED = "gyro_pipeline.learning.jobs"
 """By the server of processes, which forks them with it: they take milliseconds, not seconds."""
-_SHORT_AT_ONCE = 16
-"""Short jobs that are handed out together: what it costs to hand one out is as much as it takes."""
 _AHEAD = 4
 """So many jobs per worker are handed out before results are taken, which bounds both."""
 
@@ -59,7 +57,7 @@ def run_jobs(
     execution: Execution,
     label: str,
     what: str = "jobs",
-    short: bool = False,
+    at_once: int | None = None,
 ) -> Iterator[tuple[J, R]]:
     """Run ``function(job, report)`` for every job and yield results as they finish.
 
@@ -73,8 +71,9 @@ def run_jobs(
         execution: ``serial``, or else processes; how many workers.
         label: Names the work in progress lines.
         what: What the jobs are, for the same lines.
-        short: They take milliseconds and do without PyTorch: several at a time go to processes
-            that are spawned without it.
+        at_once: How many go to a process together, as handing out a short one costs as much as it
+            takes; to processes that are spawned without PyTorch. None: one by one, to such as have
+            it.
 
     Yields:
         A job and its result. However slowly they are asked for, no more than a few wait in memory.
@@ -89,7 +88,7 @@ def run_jobs(
     if serial:
         results = _run_serially(ordered, function, progress)
     else:
-        results = _run_in_processes(ordered, function, workers, progress, short)
+        results = _run_in_processes(ordered, function, workers, progress, at_once)
     yield from _watched(results, progress)
 
 
@@ -248,16 +247,16 @@ def _run_in_processes(
     function: Callable[[J, Report], R],
     workers: int,
     progress: _Progress,
-    short: bool,
+    at_once: int | None,
 ) -> Generator[tuple[J, R], None, None]:
-    context = multiprocessing.get_context("spawn" if short else _START)
+    context = multiprocessing.get_context("spawn" if at_once else _START)
     context.set_forkserver_preload([_IMPORTED])
     done, at_work = context.Value("d", 0.0), context.Value("i", 0)
     shared = (done, at_work)
     pool = ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=shared)
     try:
-        at_once = _SHORT_AT_ONCE if short else 1
-        parts = (jobs[first : first + at_once] for first in range(0, len(jobs), at_once))
+        count = at_once or 1
+        parts = (jobs[first : first + count] for first in range(0, len(jobs), count))
         pending = dict[Future[list[R]], Sequence[J]]()
         while True:
             for part in islice(parts, _AHEAD * workers - len(pending)):

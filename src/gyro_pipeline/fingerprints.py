@@ -2,8 +2,10 @@
 
 import ast
 import hashlib
+import importlib
 import inspect
 import json
+import pkgutil
 from collections.abc import Iterable
 from types import ModuleType
 from typing import Any
@@ -31,6 +33,12 @@ def code_hash(modules: Iterable[ModuleType]) -> str:
                 node.body = [statement for statement in node.body if not _is_text(statement)]
         digest.update(ast.dump(tree).encode())
     return digest.hexdigest()[:_DIGITS]
+
+
+def package_hash(package: ModuleType) -> str:
+    """Hash of what all modules of a package do."""
+    found = pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
+    return code_hash([package, *(importlib.import_module(module.name) for module in found)])
 
 
 def fingerprint(content: Any) -> str:

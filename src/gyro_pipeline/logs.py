@@ -1,10 +1,10 @@
 """Raw logs: the contract between the sources, the quality control and the raw-logs stage.
 
-A source lists its recordings without reading them; each is read where it is inspected, in whichever
-process that is, so that a few recordings are in memory at a time.
+A source lists its recordings without reading them. Each is read once, in whichever process inspects
+it, and what is kept of it is stored before others are read, so that few are in memory at a time.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -68,9 +68,9 @@ class LogEntry:
         imu: From 1.
         recording: From 1.
         where: For messages: the file, and where in it.
-        read: Reads it, the same each time; can be pickled. It is called to judge the recording,
-            and again if it is kept. Raises InputError where the file cannot be used.
+        read: Reads it; can be pickled. Raises InputError where the file cannot be used.
         size: Bytes to read, about: what reading and inspecting it costs.
+        key: Hash of all that ``read`` depends on: the file as it is now, and how it is read.
         split: ``train`` or ``test``, where the source came split.
     """
 
@@ -79,6 +79,7 @@ class LogEntry:
     where: str
     read: Callable[[], Log]
     size: int
+    key: str
     split: str | None = None
 
 
@@ -90,7 +91,7 @@ class Logs:
         sensor: Its name.
         source: Where the logs come from, as stored paths name it.
         simulated: Whether they are.
-        rate_hz: Expected; measured ones are compared with it. None: not known beforehand.
+        rate_hz: Expected; measured ones are compared with it. None where it is not known.
         entries: The recordings, by IMU and number.
         drawn: What was drawn for simulated recordings, to be stored with them.
     """
@@ -101,3 +102,56 @@ class Logs:
     rate_hz: float | None
     entries: Sequence[LogEntry]
     drawn: "xr.Dataset | None" = None
+
+
+@dataclass(frozen=True)
+class Listing:
+    """The recordings that are about to be read.
+
+    Attributes:
+        keys: By IMU and recording, a hash of all that a :class:`Recording` depends on.
+    """
+
+    keys: Mapping[tuple[int, int], str]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recording that was read and judged.
+
+    Attributes:
+        imu: From 1.
+        recording: From 1.
+        where: For messages: the file, and where in it.
+        key: As in :class:`Listing`; empty where reading it again may end otherwise.
+        outcome: KEPT, REPAIRED or REJECTED.
+        findings: Why.
+        rows: Rows of the file.
+        start: First row that is kept.
+        stop: The row after the last one that is kept.
+        masked: Rows between them that hold no measurement.
+        rate_hz: Measured from timestamps; None where there are none, or it cannot be read.
+        content: Hash of the samples that are kept; two recordings of one hash are one.
+        variables: What is kept, float32, by its name in the recordings: ``angular_rate``
+            (axis, sample), NaN where masked; ``temperature_c`` (sample) and ``acceleration_g``
+            (axis, sample) where the file has them. Empty for a rejected recording.
+    """
+
+    imu: int
+    recording: int
+    where: str
+    key: str
+    outcome: str
+    findings: tuple[Finding, ...]
+    rows: int = 0
+    start: int = 0
+    stop: int = 0
+    masked: int = 0
+    rate_hz: float | None = None
+    content: str = ""
+    variables: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+
+    @property
+    def place(self) -> tuple[int, int]:
+        """IMU and recording."""
+        return self.imu, self.recording

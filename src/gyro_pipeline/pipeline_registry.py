@@ -82,7 +82,8 @@ def _leakage(parameters: Parameters) -> Pipeline:
     sensors = leak_sensors(parameters.leakage, parameters.only)
     whole = Pipeline([])
     for sensor in sensors:
-        whole += _measured(sensor) + training.create_leakage_pipeline(sensor)
+        whole += _measured(sensor) + windowed_splits.create_cut_pipeline(sensor)
+        whole += training.create_leakage_pipeline(sensor)
         whole += evaluation.create_leakage_pipeline(sensor)
     # never without nodes, which Kedro refuses before our check can say why
     return whole + reporting.create_leakage_pipeline(sensors or parameters.leakage.sensors)

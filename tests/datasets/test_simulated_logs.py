@@ -13,8 +13,6 @@ from gyro_pipeline.datasets import simulated_logs
 from gyro_pipeline.datasets.recordings import Recordings
 from gyro_pipeline.datasets.simulated_logs import SimulatedLogs
 from gyro_pipeline.logs import Logs
-from gyro_pipeline.parameters import Execution
-from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs
 
 SENSORS = {
     "dot": {
@@ -180,13 +178,12 @@ def test_random_walk_and_warm_up_are_added_and_what_was_drawn_is_kept(tmp_path):
     np.testing.assert_allclose(ends, [10e-3, 20e-3], rtol=0.15)
 
 
-def test_what_was_drawn_stays_with_the_recordings_that_are_kept(tmp_path, parameters):
+def test_what_was_drawn_stays_with_the_recordings_that_are_kept(tmp_path, parameters, read_logs):
     sizes = {"recordings": 3, "train_recordings": 2, "samples": 1500, "recording_s": 15}
     warm_up = {"amplitude_mdps": 20, "spread_mdps": 5, "time_constant_s": 5}
     model = SENSORS["dot"]["simulated"] | {"warm_up": warm_up}
     source = simulated(tmp_path, simulated=model, **sizes)
-    serial = Execution(executor="serial", workers=None)
-    kept, _ = inspect_logs(source.load(), parameters("base").quality, serial)
+    kept, _ = read_logs(source.load(), parameters("base").quality, tmp_path)
     assert set(kept.dims) == set(DIMENSIONS)
     np.testing.assert_array_equal(kept.true_amplitude, source.load().drawn.true_amplitude)
     assert float(kept.true_amplitude_spread) == pytest.approx(5e-3)

@@ -20,7 +20,9 @@ def labelled(rates, rate_hz):
         "axis": list(AXES),
     }
     attrs = {"sensor": "test", "source": "test", "simulated": 0, "rate_hz": rate_hz}
-    return xr.Dataset({"angular_rate": (DIMENSIONS, rates)}, coords, attrs)
+    lengths = np.full(rates.shape[:2], rates.shape[-1])
+    data = {"angular_rate": (DIMENSIONS, rates), "samples": (DIMENSIONS[:2], lengths)}
+    return xr.Dataset(data, coords, attrs)
 
 
 @pytest.fixture(scope="session")

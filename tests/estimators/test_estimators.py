@@ -176,9 +176,19 @@ def test_pooled_empirical_bayes_has_one_spread(recordings):
     assert tau[0] == pytest.approx(TAU, rel=0.3)
 
 
+def test_masked_samples_hardly_matter_to_anyone(recordings, windows):
+    masked = recordings.copy(deep=True)
+    masked.angular_rate[:, :, :, [3, 100, 101]] = np.nan
+    for name, kind in ESTIMATORS.items():
+        bias, _ = kind().fit(recordings).estimate(windows)
+        np.testing.assert_allclose(
+            kind().fit(masked).estimate(windows)[0], bias, atol=0.5 * TAU, err_msg=name
+        )
+
+
 def test_recordings_that_a_device_lacks_are_left_out(recordings, windows):
     lacking = recordings.copy(deep=True)
-    lacking.angular_rate[0, [2, 5]] = np.nan
+    lacking.angular_rate[0, [2, 5]], lacking["samples"][0, [2, 5]] = np.nan, 0
     fewer = recordings.isel(recording=[0, 1, 3, 4, *range(6, 12)])
     for name in ("training_mean", "empirical_bayes", "best_linear", "ridge"):
         bias, _ = ESTIMATORS[name]().fit(lacking).estimate(windows)

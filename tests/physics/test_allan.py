@@ -12,6 +12,7 @@ from gyro_pipeline.physics.allan import (
     allan_variance,
     averaging_times_s,
     fit_noise,
+    mean_variance,
 )
 
 GOLDEN = json.loads((Path(__file__).parent / "golden" / "overlapping_allan.json").read_text())
@@ -28,21 +29,26 @@ def real_file(name):
     return Path(folder) / name
 
 
-def mean_variance(recordings, rate, times):
-    return np.mean([allan_variance(samples, rate, times) for samples in recordings], axis=0)
+def variance_of(samples, rate, times):
+    return allan_variance(samples, rate, times)[0]
+
+
+def mean_of(recordings, rate, times):
+    each = [allan_variance(samples, rate, times) for samples in recordings]
+    return mean_variance(*map(np.stack, zip(*each, strict=True)))
 
 
 def fit_mean(recordings, rate):
     length = recordings.shape[-1]
     times = averaging_times_s(length, rate)
-    variance = mean_variance(recordings, rate, times)
+    variance = mean_of(recordings, rate, times)
     return fit_noise(times, variance, length / rate, SHORTEST_FIT_SAMPLES / rate)
 
 
 def test_nbs14():
     golden = GOLDEN["nbs14"]
     frequency, factors = np.array(golden["frequency"]), np.array(golden["averaging_factors"])
-    deviation = np.sqrt(allan_variance(frequency, 1.0, factors))
+    deviation = np.sqrt(variance_of(frequency, 1.0, factors))
     np.testing.assert_allclose(deviation, golden["deviation"], atol=5.1e-6)
 
 
@@ -52,7 +58,7 @@ def test_nist_sp1065_thousand_points():
     for _ in range(999):
         numbers.append(golden["multiplier"] * numbers[-1] % golden["modulus"])
     samples = np.array(numbers) / golden["modulus"]
-    deviation = np.sqrt(allan_variance(samples, 1.0, np.array(golden["averaging_factors"])))
+    deviation = np.sqrt(variance_of(samples, 1.0, np.array(golden["averaging_factors"])))
     np.testing.assert_allclose(deviation, golden["deviation"], rtol=2e-7)
 
 
@@ -66,7 +72,7 @@ def test_averaging_times_are_whole_samples_up_to_a_fifth_and_all_usable(rate, n_
     assert (np.rint(factors[0]), np.rint(factors[-1])) == (1, n_samples // 5)
     assert times.size <= 20
     noise = np.random.default_rng(3).normal(size=n_samples)
-    assert np.all(allan_variance(noise, rate, times) > 0)
+    assert np.all(variance_of(noise, rate, times) > 0)
 
 
 def test_thirteen_thousand_samples_have_about_twenty_averaging_times():
@@ -75,8 +81,8 @@ def test_thirteen_thousand_samples_have_about_twenty_averaging_times():
 
 def test_variances_come_in_the_order_asked_for():
     samples = np.random.default_rng(4).normal(size=1000)
-    one_by_one = [allan_variance(samples, RATE, np.array([t]))[0] for t in (1.0, 0.02, 0.3, 0.02)]
-    together = allan_variance(samples, RATE, np.array([1.0, 0.02, 0.3, 0.02]))
+    one_by_one = [variance_of(samples, RATE, np.array([t]))[0] for t in (1.0, 0.02, 0.3, 0.02)]
+    together = variance_of(samples, RATE, np.array([1.0, 0.02, 0.3, 0.02]))
     np.testing.assert_array_equal(together, one_by_one)
 
 
@@ -86,32 +92,49 @@ def test_a_time_that_is_no_multiple_of_the_sample_period_is_refused(time):
         allan_variance(np.zeros(1000), RATE, np.array([0.02, time]))
 
 
-def test_a_time_too_long_for_the_recording_is_refused():
+def test_a_time_too_long_for_the_recording_has_no_variance():
     samples = np.random.default_rng(5).normal(size=101)
-    assert allan_variance(samples, RATE, np.array([0.5])) > 0
-    with pytest.raises(InputError, match="allows 0.5 s at most"):
-        allan_variance(samples, RATE, np.array([0.51]))
+    variance, counts = allan_variance(samples, RATE, np.array([0.5, 0.51]))
+    assert variance[0] > 0
+    assert np.isnan(variance[1])
+    assert counts.tolist() == [2, 0]
 
 
-def test_nan_is_not_cut_off():
-    samples = np.random.default_rng(6).normal(size=200)
-    samples[-1] = np.nan
-    assert np.isnan(allan_variance(samples, RATE, np.array([0.01, 0.1]))).all()
+def test_masked_samples_part_stretches_that_are_pooled_by_their_counts():
+    samples = np.random.default_rng(6).normal(size=400)
+    samples[150:170] = np.nan
+    factors = np.array([1, 8, 90, 200])
+    variance, counts = allan_variance(samples, 1.0, factors)
+    first, second = (allan_variance(part, 1.0, factors) for part in (samples[:150], samples[170:]))
+    expected = mean_variance(np.stack([first[0], second[0]]), np.stack([first[1], second[1]]))
+    np.testing.assert_allclose(variance[:3], expected[:3], rtol=1e-13)
+    assert np.isnan(first[0][2])  # too short
+    assert counts.tolist() == [150 - 1 + 230 - 1, 150 - 15 + 230 - 15, 230 - 179, 0]
+
+
+def test_a_few_masked_samples_do_not_cost_the_long_averaging_times():
+    samples = np.random.default_rng(6).normal(0, 0.05, (60, 4000))
+    times = averaging_times_s(4000, RATE)
+    whole = mean_of(samples, RATE, times)
+    samples[:, 37::100] = np.nan  # stretches of one second
+    _, counts = allan_variance(samples[0], RATE, times)
+    np.testing.assert_allclose(counts[times >= 0.1], 4000 - 40 - 2 * times[times >= 0.1] * RATE + 1)
+    np.testing.assert_allclose(mean_of(samples, RATE, times), whole, rtol=0.1)
 
 
 def test_a_constant_changes_nothing_even_in_float32():
     samples = np.random.default_rng(7).normal(0, 0.04, 5000)
     times = averaging_times_s(5000, RATE)
     shifted = (samples + 3.0).astype(np.float32)
-    expected = allan_variance(samples, RATE, times)
-    np.testing.assert_allclose(allan_variance(shifted, RATE, times), expected, rtol=1e-3)
+    expected = variance_of(samples, RATE, times)
+    np.testing.assert_allclose(variance_of(shifted, RATE, times), expected, rtol=1e-3)
 
 
 def test_white_noise_falls_with_slope_minus_one_half_and_gives_its_n():
     sigma = 0.05
     recordings = np.random.default_rng(8).normal(0, sigma, (40, SAMPLES))
     times = averaging_times_s(SAMPLES, RATE)
-    deviation = np.sqrt(mean_variance(recordings, RATE, times))
+    deviation = np.sqrt(mean_of(recordings, RATE, times))
     assert np.polyfit(np.log(times), np.log(deviation), 1)[0] == pytest.approx(-0.5, abs=0.02)
     fitted = fit_mean(recordings, RATE)
     assert fitted.white == pytest.approx(sigma / np.sqrt(RATE), rel=0.02)
@@ -150,11 +173,11 @@ def test_times_before_the_shortest_have_no_influence():
     assert fit_noise(times, curve, 100.0, shortest_s=0.0).white > 0.011
 
 
-@pytest.mark.parametrize("variance", [0.0, np.nan])
-def test_a_fit_without_positive_variances_is_refused(variance):
+@pytest.mark.parametrize("last", [[0.3, 0.0], [np.nan, np.nan]])
+def test_a_fit_without_positive_variances_is_refused(last):
     times = np.array([1.0, 2.0, 3.0, 4.0])
     with pytest.raises(InputError, match="positive Allan variance"):
-        fit_noise(times, np.array([1.0, 0.5, 0.3, variance]), 20.0, shortest_s=1.0)
+        fit_noise(times, np.array([1.0, 0.5, *last]), 20.0, shortest_s=1.0)
 
 
 def test_a_fit_needs_three_times_the_shortest_included():

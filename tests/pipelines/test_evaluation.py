@@ -278,6 +278,7 @@ def coloured(simulated, constants_s, count=200):
     )
     drawn = {
         "angular_rate": (("imu", "recording", "axis", "sample"), rates.astype(np.float32)),
+        "samples": (("imu", "recording"), np.full(rates.shape[:2], rates.shape[-1])),
         "true_bias": (("imu", "recording", "axis"), bias),
         "true_unit_bias": (("imu", "axis"), unit),
         "true_noise": ("axis", noise),
@@ -612,7 +613,7 @@ def test_an_estimator_never_sees_the_drawn_values(simulated, world, monkeypatch)
     monkeypatch.setitem(ESTIMATORS, "mean", Spy)
     Fitted(simulated, world.roles).estimator("mean", 1, 0)
     assert len(seen) == 1  # once for all recordings
-    assert set(seen[0].data_vars) == {"angular_rate"}
+    assert set(seen[0].data_vars) == {"angular_rate", "samples"}
     assert seen[0].recording.to_numpy().tolist() == list(range(1, 11))
 
 

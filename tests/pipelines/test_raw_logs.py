@@ -4,17 +4,21 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from gyro_pipeline.conventions import DIMENSIONS, InputError
-from gyro_pipeline.fingerprints import data_hash
+from gyro_pipeline.datasets.recordings import InspectedRecordings
 from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding, Log, LogEntry, Logs
 from gyro_pipeline.parameters import Execution
 from gyro_pipeline.pipelines.raw_logs import nodes
 from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs, require_enough
+from gyro_pipeline.protocol import inspection
+from gyro_pipeline.protocol.quality import Inspected
 
 RATE_HZ, SAMPLES = 100.0, 2000
 PAIR = Execution(executor="processes", workers=2)
+DEAD = Log(np.zeros((SAMPLES, 3)))
 
 
 def noise(seed, samples=SAMPLES):
@@ -34,6 +38,7 @@ def listed(logs, **changes):
             *(imu, recording, f"{imu}_{recording}.csv"),
             partial(copy.copy if isinstance(log, Log) else fail, log),
             size=len(log.samples) if isinstance(log, Log) else 0,
+            key=f"{imu} {recording} {hash(str(log))}",
         )
         for (imu, recording), log in logs.items()
     ]
@@ -49,19 +54,25 @@ def four(**changes):
 
 @pytest.fixture
 def quality(parameters):
-    return parameters("base").quality
+    return parameters("base").quality.model_copy(update={"needed_pct": 1.0})
 
 
 @pytest.fixture
-def inspected(quality):
-    """Recordings and table, the second with the index (imu, recording)."""
+def inspected(read_logs, quality, tmp_path):
+    """Recordings of a source, and their table by (imu, recording)."""
 
     def inspect(files, **changes):
         asked = quality.model_copy(update=changes)
-        recordings, table = inspect_logs(files, asked, PAIR)
+        recordings, table = read_logs(files, asked, tmp_path, workers=2)
         return recordings, table.set_index(["imu", "recording"])
 
     return inspect
+
+
+def samples_of(recordings, imu, recording):
+    """Of its own length."""
+    one = recordings.sel(imu=imu, recording=recording)
+    return one.angular_rate.to_numpy()[:, : int(one["samples"])]
 
 
 def test_recordings_are_labelled_as_the_conventions_say(inspected):
@@ -74,37 +85,52 @@ def test_recordings_are_labelled_as_the_conventions_say(inspected):
         recordings.angular_rate.sel(imu=2, recording=1), logs[2, 1].samples.T.astype(np.float32)
     )
     labels = {"imu": [1, 2], "recording": [1, 2], "axis": ["x", "y", "z"]}
-    attributes = {"sensor": "dot", "source": "mine", "simulated": 0, "rate_hz": RATE_HZ}
     assert {name: one.values.tolist() for name, one in recordings.coords.items()} == labels
-    digest = data_hash(recordings.angular_rate.values, [labels, attributes])
-    assert recordings.attrs == attributes | {"data_hash": digest}
+    digest = recordings.attrs.pop("data_hash")
+    assert len(digest) == 16
+    assert recordings.attrs == {
+        **{"sensor": "dot", "source": "mine", "simulated": 0, "rate_hz": RATE_HZ}
+    }
     assert table.outcome.tolist() == [KEPT] * 4
     assert table.loc[2, 1].to_dict() == {
         **{"sensor": "dot", "file": "2_1.csv", "outcome": KEPT, "rows": SAMPLES},
-        **{"start": 0, "stop": SAMPLES, "rate_hz": None, "findings": None},
+        **{"start": 0, "stop": SAMPLES, "masked": 0, "rate_hz": None, "findings": None},
     }
 
 
-def test_all_are_cut_to_the_shortest_that_is_kept_from_the_first_usable_row_on(inspected):
+def test_each_has_its_own_length_from_the_first_usable_row_on(inspected):
     started = noise(7)
     started[:3] = 0
-    logs = four(log_12=Log(started), log_21=Log(noise(8, 2500)), log_22=Log(noise(9, 1200)))
+    logs = four(log_12=Log(started), log_21=Log(noise(8, 2500)), log_22=Log(noise(9, 300)))
     recordings, table = inspected(listed(logs))
-    assert recordings.sizes["sample"] == 1200
-    for (imu, recording), first in {(1, 1): 0, (1, 2): 3, (2, 1): 0, (2, 2): 0}.items():
-        kept = logs[imu, recording].samples[first : first + 1200].T.astype(np.float32)
-        found = recordings.angular_rate.sel(imu=imu, recording=recording)
-        np.testing.assert_array_equal(found, kept)
-        assert table.loc[imu, recording][["start", "stop"]].tolist() == [first, first + 1200]
+    assert recordings["samples"].values.tolist() == [[2000, 1997], [2500, 0]]
+    for (imu, recording), first in {(1, 1): 0, (1, 2): 3, (2, 1): 0}.items():
+        kept = logs[imu, recording].samples[first:].T.astype(np.float32)
+        np.testing.assert_array_equal(samples_of(recordings, imu, recording), kept)
+        assert table.loc[imu, recording].start == first
+    assert np.isnan(recordings.angular_rate.sel(imu=1, recording=2)[:, 1997:]).all()
     assert "zero rows" in table.loc[1, 2].findings
-
-
-def test_a_rejected_recording_does_not_decide_the_length(inspected):
-    recordings, table = inspected(listed(four(log_22=Log(noise(9, 300)))))
-    assert recordings.sizes["sample"] == SAMPLES
-    assert table.loc[2, 2].outcome == REJECTED
     assert "too short" in table.loc[2, 2].findings
-    assert table.loc[2, 2][["start", "stop"]].isna().all()
+    assert table.loc[2, 2][["start", "stop", "masked"]].isna().all()
+
+
+def test_masked_samples_are_nan_and_counted(inspected, monkeypatch):
+    class Masking(Inspected):
+        @property
+        def masked(self):
+            return np.isin(np.arange(self.stop - self.start), [5, 1600])
+
+    monkeypatch.setattr(
+        inspection, "inspect", lambda log, *_: Masking(KEPT, 10, len(log.samples), ())
+    )
+    logs = four()
+    recordings, table = inspected(listed(logs), length_s=16.0)
+    samples = samples_of(recordings, 2, 1)
+    assert samples.shape == (3, 1600)
+    assert np.flatnonzero(np.isnan(samples).all(axis=0)).tolist() == [5]
+    assert np.isnan(samples).sum() == 3
+    assert table.masked.tolist() == [1] * 4
+    assert table.stop.tolist() == [1610] * 4
 
 
 def test_all_are_cut_to_a_stated_length_and_shorter_ones_rejected(inspected):
@@ -117,24 +143,18 @@ def test_all_are_cut_to_a_stated_length_and_shorter_ones_rejected(inspected):
     )
 
 
-def test_a_recording_that_is_rejected_is_nan_and_left_out_if_it_is_for_all_imus(inspected):
-    dead = Log(np.zeros((SAMPLES, 3)))
-    recordings, _ = inspected(listed(four(log_21=dead)))
-    assert np.isnan(recordings.angular_rate.sel(imu=2, recording=1)).all()
+def test_what_no_imu_has_is_left_out(inspected):
+    recordings, table = inspected(listed(four(log_21=DEAD)))
+    assert recordings["samples"].values.tolist() == [[SAMPLES] * 2, [0, SAMPLES]]
     assert int(np.isnan(recordings.angular_rate).sum()) == 3 * SAMPLES
-    recordings, table = inspected(listed(four(log_11=dead, log_21=dead)))
+    recordings, table = inspected(listed(four(log_11=DEAD, log_21=DEAD)))
     assert recordings.recording.values.tolist() == [2]
     assert not np.isnan(recordings.angular_rate).any()
     assert len(table) == 4
-    recordings, _ = inspected(listed(four(log_21=dead, log_22=dead)))
-    assert recordings.imu.values.tolist() == [1]
-
-
-def test_an_imu_may_lack_recordings_from_the_start(inspected):
-    logs = four()
-    del logs[2, 1]
+    logs = four(log_21=DEAD)
+    del logs[2, 2]
     recordings, table = inspected(listed(logs))
-    assert np.isnan(recordings.angular_rate.sel(imu=2, recording=1)).all()
+    assert recordings.imu.values.tolist() == [1]
     assert len(table) == 3
 
 
@@ -157,10 +177,7 @@ def test_the_longest_stretch_without_a_fault_is_kept(inspected, value):
     logs = four(log_12=Log(samples))
     recordings, table = inspected(listed(logs))
     assert table.loc[1, 2].outcome == REPAIRED
-    assert recordings.sizes["sample"] == SAMPLES - 201
-    np.testing.assert_array_equal(
-        recordings.angular_rate.sel(imu=1, recording=2), samples[201:].T.astype(np.float32)
-    )
+    np.testing.assert_array_equal(samples_of(recordings, 1, 2), samples[201:].T.astype(np.float32))
 
 
 def test_the_same_samples_twice_are_one_recording(inspected):
@@ -187,25 +204,33 @@ def test_the_rate_is_the_median_of_the_measured_ones(inspected):
     assert "sample rate: 99 Hz" in table.loc[2, 1].findings
 
 
-def test_a_temperature_is_kept_with_its_recording(inspected):
+def test_temperature_and_acceleration_are_kept_with_their_recording(inspected):
     warm = np.linspace(20, 30, SAMPLES)
     started = noise(7)
     started[:3] = 0
-    logs = four(log_11=Log(noise(1), temperature_c=warm), log_22=Log(started, temperature_c=warm))
+    acceleration = noise(3)
+    logs = four(
+        log_11=Log(noise(1), temperature_c=warm, acceleration_g=acceleration),
+        log_22=Log(started, temperature_c=warm),
+    )
     recordings, _ = inspected(listed(logs))
+    np.testing.assert_array_equal(
+        recordings.acceleration_g.sel(imu=1, recording=1), acceleration.T.astype(np.float32)
+    )
+    assert np.isnan(recordings.acceleration_g.sel(imu=2)).all()
     warmth = recordings.temperature_c
     assert warmth.dims == ("imu", "recording", "sample")
-    np.testing.assert_array_equal(warmth.sel(imu=1, recording=1), warm[:-3].astype(np.float32))
-    np.testing.assert_array_equal(warmth.sel(imu=2, recording=2), warm[3:].astype(np.float32))
+    np.testing.assert_array_equal(warmth.sel(imu=1, recording=1), warm.astype(np.float32))
+    np.testing.assert_array_equal(warmth.sel(imu=2, recording=2)[:-3], warm[3:].astype(np.float32))
     assert np.isnan(warmth.sel(imu=1, recording=2)).all()
     without, _ = inspected(listed(four(log_22=Log(started))))
     assert "temperature_c" not in without
 
 
 def test_splits_and_what_was_drawn_go_with_the_recordings(inspected, make_recordings):
-    drawn = make_recordings(np.zeros((2, 2, 3)), 20, 10, 0.1).drop_attrs()
+    drawn = make_recordings(np.zeros((2, 2, 3)), 20, 10, 0.1)[["angular_rate"]].drop_attrs()
     drawn = drawn.rename(angular_rate="true_bias").isel(sample=0)
-    logs = listed(four(log_11=Log(np.zeros((9, 3))), log_21=Log(np.zeros((9, 3)))))
+    logs = listed(four(log_11=DEAD, log_21=DEAD))
     entries = [
         replace(one, split="train" if one.recording == 1 else "test") for one in logs.entries
     ]
@@ -215,82 +240,161 @@ def test_splits_and_what_was_drawn_go_with_the_recordings(inspected, make_record
     np.testing.assert_array_equal(recordings.true_bias, drawn.true_bias.sel(recording=[2]))
 
 
-def test_processes_give_the_same_as_this_one(quality, monkeypatch, caplog):
+def test_without_timestamps_and_a_stated_rate_a_recording_is_rejected(inspected):
+    logs = four(log_11=Log(noise(1), rate_hz=99.0))
+    recordings, table = inspected(listed(logs, rate_hz=None))
+    assert recordings.rate_hz == 99.0
+    assert table.outcome.tolist() == [KEPT, *[REJECTED] * 3]
+    assert "rate_hz, samples a second, in the sensor's entry in globals.yml" in table.findings[1, 2]
+
+
+def test_processes_give_the_same_as_this_one(inspected, monkeypatch, caplog, tmp_path):
     started = noise(7)
     started[:3] = 0
-    files = listed(
-        four(log_12=Log(started), log_21=Log(noise(8, 2500)), log_22=Log(noise(9, 1700)))
-    )
-    here, table = inspect_logs(files, quality, PAIR)
+    files = listed(four(log_12=Log(started), log_21=Log(noise(8, 2500)), log_22=Log(started)))
+    here, table = inspected(files)
+    here = here.load()
+    (tmp_path / "recordings.nc").unlink()
     monkeypatch.setattr(nodes, "_WORTH_PROCESSES", 0)
     with caplog.at_level(logging.INFO, "gyro_pipeline"):
-        there, other = inspect_logs(files, quality, PAIR)
+        there, other = inspected(files)
     assert there.identical(here)
     assert other.equals(table)
-    assert caplog.messages[0] == "dot: 4 recordings on 2 processes"
-    assert caplog.messages[-1].startswith("dot: 4 recordings in ")
+    assert "dot: 4 recordings on 2 processes" in caplog.messages
 
 
-def test_counts_are_said_and_enough_recordings_go_on(inspected, quality, caplog):
-    started = noise(7)
-    started[200] = np.nan
-    recordings, table = inspected(listed(four(log_12=Log(started), log_21=Log(np.zeros((9, 3))))))
-    with caplog.at_level(logging.INFO, "gyro_pipeline"):
-        asked = quality.model_copy(update={"needed_pct": 75.0})
-        assert require_enough(recordings, table.reset_index(), asked) is recordings
-    assert caplog.messages == ["dot: 4 recordings, 2 kept, 1 repaired, 1 rejected"]
+# going on
 
 
-def test_a_much_shorter_recording_that_shortens_all_is_named(inspected, caplog):
-    recordings, _ = inspected(listed(four(log_12=Log(noise(7, 1100)))))
-    assert recordings.sizes["sample"] == 1100
-    assert caplog.messages == [
-        "dot: all recordings are cut to 11 s, as long as IMU 1 recording 2, 1_2.csv; half of them "
-        "have 20 s or more. Remove or repair it, or raise quality.least_s"
-    ]
-    caplog.clear()
-    inspected(listed(four(log_12=Log(noise(7, 1700)))))
-    assert caplog.messages == []
-
-
-def test_too_few_recordings_stop_and_the_rejected_ones_are_named(inspected, quality):
-    logs = {(1, number): Log(np.zeros((9, 3))) for number in range(1, 13)} | {(2, 1): Log(noise(1))}
-    logs[1, 3] = InputError("1_3.csv: is a zip")
-    recordings, table = inspected(listed(logs))
-    with pytest.raises(InputError) as caught:
-        require_enough(recordings, table.reset_index(), quality)
-    first, *lines = str(caught.value).splitlines()
-    assert first == (
-        "dot: 1 of 13 recordings can be used, quality.needed_pct asks for 90 %. Repair or remove "
-        "the others, or lower it:"
+def entries_that_count(monkeypatch):
+    """The recordings that are read."""
+    read = []
+    judge = nodes.judge
+    monkeypatch.setattr(
+        nodes, "judge", lambda job, report: read.append(job.entry.where) or judge(job, report)
     )
-    assert len(lines) == 11
-    assert lines[2] == "  IMU 1 recording 3, 1_3.csv: file: 1_3.csv: is a zip"
-    assert lines[-1] == "  and 2 more, in the table of their quality"
+    return read
 
 
-def test_the_tested_imu_must_be_among_them(inspected, quality):
-    logs = {(2, number): Log(noise(number)) for number in range(1, 12)} | {
-        (1, 1): Log(np.zeros((9, 3)))
+def test_an_interrupted_read_goes_on(quality, tmp_path, monkeypatch, inspected, caplog):
+    read = entries_that_count(monkeypatch)
+    logs = four(log_12=Log(noise(7, 2500)))
+    reading = InspectedRecordings(str(tmp_path / "recordings.nc"))
+    items = inspect_logs(listed(logs), [], quality, PAIR)
+    for _ in range(3):  # what is listed, and two recordings
+        reading.save(next(items))
+    with caplog.at_level(logging.INFO, "gyro_pipeline"):
+        recordings, _ = inspected(listed(logs))
+    assert read == ["1_1.csv", "1_2.csv", "2_1.csv", "2_2.csv"]
+    assert caplog.messages[0] == "dot: 2 of 4 recordings were read before"
+    assert [path.name for path in tmp_path.iterdir()] == ["recordings.nc"]
+    for place, log in logs.items():
+        np.testing.assert_array_equal(samples_of(recordings, *place), log.samples.T.astype("f4"))
+
+
+def test_only_what_changed_is_read_again(monkeypatch, inspected):
+    read = entries_that_count(monkeypatch)
+    inspected(listed(four()))
+    logs = four(log_12=Log(noise(9, 1500))) | {(3, 1): Log(noise(10))}
+    recordings, _ = inspected(listed(logs))
+    assert read[4:] == ["1_2.csv", "3_1.csv"]
+    assert recordings["samples"].values.tolist() == [[2000, 1500], [2000, 2000], [2000, 0]]
+    for place, log in logs.items():
+        np.testing.assert_array_equal(samples_of(recordings, *place), log.samples.T.astype("f4"))
+    inspected(listed(logs), drift_mdps=11.0)
+    assert len(read) == 6 + 5  # other settings judge anew
+
+
+def test_what_the_system_could_not_read_is_read_again(monkeypatch, inspected):
+    error = InputError("1_2.csv: cannot be read")
+    error.__cause__ = OSError(5, "Input/output error")
+    damaged = InputError("2_1.csv: truncated")
+    damaged.__cause__ = OSError("truncated file")  # as h5py says it
+    files = listed(four(log_12=error, log_21=damaged))
+    inspected(files)
+    read = entries_that_count(monkeypatch)
+    _, table = inspected(files)
+    assert read == ["1_2.csv"]
+    assert table.outcome.tolist() == [KEPT, REJECTED, REJECTED, KEPT]
+
+
+def test_a_copy_is_read_again_once_it_is_alone(monkeypatch, inspected):
+    logs = four()
+    logs[2, 2] = logs[1, 2]
+    inspected(listed(logs))
+    logs[1, 2] = Log(noise(11))
+    recordings, _ = inspected(listed(logs))
+    np.testing.assert_array_equal(
+        samples_of(recordings, 2, 2), logs[2, 2].samples.T.astype(np.float32)
+    )
+
+
+def test_too_few_leave_the_old_recordings_and_what_was_read(inspected, tmp_path, monkeypatch):
+    inspected(listed(four()))
+    before = (tmp_path / "recordings.nc").read_bytes()
+    worse = listed(four(log_11=DEAD))
+    with pytest.raises(InputError, match="3 of 4 recordings can be used"):
+        inspected(worse, needed_pct=90.0)
+    assert (tmp_path / "recordings.nc").read_bytes() == before
+    read = entries_that_count(monkeypatch)
+    recordings, _ = inspected(worse)
+    assert read == []
+    assert recordings["samples"].values.tolist() == [[0, SAMPLES], [SAMPLES, SAMPLES]]
+
+
+def test_the_hash_is_of_the_samples_that_are_used(inspected):
+    def hashed(**changes):
+        return inspected(listed(four(**changes)))[0].attrs["data_hash"]
+
+    first = hashed()
+    assert hashed(log_11=Log(noise(20))) != first
+    assert hashed() == first
+    masked = noise(0)
+    masked[-30:] = np.nan
+    assert hashed(log_11=Log(masked)) != first
+
+
+# how many must remain
+
+
+def row(imu, recording, outcome=KEPT, findings=None):
+    name = f"{imu}_{recording}.csv"
+    said = None if findings is None else f"file: /logs/{name}: {findings}"
+    return {"sensor": "dot", "imu": imu, "recording": recording, "file": name} | {
+        "outcome": outcome,
+        "findings": said,
     }
-    recordings, table = inspected(listed(logs))
-    with pytest.raises(InputError, match="dot, the tested IMU 1: 0 of 1 recordings") as caught:
-        require_enough(recordings, table.reset_index(), quality)
-    assert "IMU 1 recording 1, 1_1.csv" in str(caught.value)
 
 
-def test_an_imu_of_which_nothing_is_left_is_named(inspected, quality, caplog):
-    logs = {(1, number): Log(noise(number)) for number in range(1, 12)} | {
-        (2, 1): Log(np.zeros((9, 3)))
-    }
-    recordings, table = inspected(listed(logs))
-    assert require_enough(recordings, table.reset_index(), quality) is recordings
-    assert caplog.messages[-1] == "dot: no recording is left of IMU 2"
+def checked(rows, needed_pct, quality):
+    require_enough(pd.DataFrame(rows), quality.model_copy(update={"needed_pct": needed_pct}))
 
 
-def test_none_that_can_be_used_is_too_few_at_any_setting(inspected, quality):
-    recordings, table = inspected(listed({(1, 1): Log(np.zeros((9, 3)))}))
-    assert recordings.sizes == {"imu": 0, "recording": 0, "axis": 3, "sample": 0}
-    with pytest.raises(InputError, match="dot: 0 of 1 recordings can be used"):
-        asked = quality.model_copy(update={"needed_pct": 1.0})
-        require_enough(recordings, table.reset_index(), asked)
+def test_counts_are_said_and_enough_recordings_go_on(quality, caplog):
+    rows = [row(1, 1), row(1, 2, REPAIRED), row(1, 3), row(2, 1, REJECTED, "is a zip")]
+    with caplog.at_level(logging.INFO, "gyro_pipeline"):
+        checked(rows, 75.0, quality)
+    assert caplog.messages == [
+        "dot: 4 recordings, 2 kept, 1 repaired, 1 rejected",
+        "dot: no recording is left of IMU 2",
+    ]
+
+
+def test_too_few_recordings_stop_and_the_same_reason_is_given_once(quality):
+    rows = [row(1, number, REJECTED, "is a zip") for number in range(1, 13)]
+    rows += [row(1, 13), row(2, 1, REJECTED, "is empty")]
+    with pytest.raises(InputError) as caught:
+        checked(rows, 90.0, quality)
+    assert str(caught.value).splitlines() == [
+        "dot: 1 of 14 recordings can be used, quality.needed_pct asks for 90 %. Repair or remove "
+        "the others, or lower it:",
+        "  IMU 1 recording 1, 1_1.csv, and 11 more: file: the file: is a zip",
+        "  IMU 2 recording 1, 2_1.csv: file: the file: is empty",
+    ]
+
+
+def test_the_tested_imu_must_be_among_them(quality):
+    rows = [row(2, number) for number in range(1, 12)] + [row(1, 1, REJECTED, "is a zip")]
+    with pytest.raises(InputError, match="dot, the tested IMU 1: 0 of 1 recordings"):
+        checked(rows, 90.0, quality)
+    checked(rows[:-1], 90.0, quality)  # without any of it, studies say so

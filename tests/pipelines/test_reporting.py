@@ -594,7 +594,7 @@ def test_a_recording_less_is_hours_less(stored, published):
     assert after.loc["1", "Total h"] < before.loc["1", "Total h"]
     # a recording that one IMU lacks
     absent = stored["sparkfun_recordings"].copy(deep=True)
-    absent.angular_rate.loc[{"imu": 2, "recording": 1}] = np.nan
+    absent["samples"].loc[{"imu": 2, "recording": 1}] = 0
     after = hours(stored, published, sparkfun_recordings=absent)
     assert after.loc["1", "Training recordings"] == before.loc["1", "Training recordings"] - 3
 

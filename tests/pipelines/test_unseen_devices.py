@@ -105,7 +105,7 @@ def test_a_copy_of_a_devices_recording_under_another_devices_number_is_refused(s
 
 def test_what_an_imu_lacks_neither_trains_nor_tests(make_recordings, splits):
     recordings = make_recordings(np.zeros((3, 2, 3)), samples=4, rate_hz=1, noise_dps_rts=1.0)
-    recordings.angular_rate[1, 0] = np.nan
+    recordings.angular_rate[1, 0], recordings["samples"][1, 0] = np.nan, 0
     roles = split_devices(recordings, splits)
     assert used(roles, 2, TEST) == [(2, 2)]
     assert used(roles, 1, TRAIN) == [(2, 2), (3, 1), (3, 2)]
@@ -146,7 +146,7 @@ def four(make_recordings):
     generator = np.random.default_rng(2)
     bias = generator.uniform(-1, 1, (4, 1, 3)) + generator.normal(0, 1e-3, (4, 6, 3))
     recordings = make_recordings(bias, 1040, 20.0, 3e-3)
-    recordings.angular_rate[0, 4:] = np.nan
+    recordings.angular_rate[0, 4:], recordings["samples"][0, 4:] = np.nan, 0
     return recordings
 
 
@@ -205,7 +205,7 @@ def test_the_unseen_device_is_not_among_what_is_learned_from(four, splits, monke
         assert not training.seen
         assert training.known == training.imus == others
         assert training.recordings.imu.to_numpy().tolist() == others
-        assert set(training.recordings.data_vars) == {"angular_rate"}
+        assert set(training.recordings.data_vars) == {"angular_rate", "samples"}
         assert training.rates.shape == (18 if imu == 1 else 16, 3, 1040)
 
 
@@ -293,7 +293,9 @@ def dots():
     labels = {"imu": np.arange(1, 6), "recording": [1], "axis": list(AXES)}
     attrs = {"sensor": "dot", "source": "files", "simulated": 0, "rate_hz": 120.0}
     attrs["data_hash"] = data_hash(rates, [])
-    return xr.Dataset({"angular_rate": (DIMENSIONS, rates)}, labels, attrs)
+    lengths = np.full(rates.shape[:2], rates.shape[-1])
+    data = {"angular_rate": (DIMENSIONS, rates), "samples": (DIMENSIONS[:2], lengths)}
+    return xr.Dataset(data, labels, attrs)
 
 
 def test_on_real_unseen_devices_the_recommended_ones_are_no_worse_than_the_mean(

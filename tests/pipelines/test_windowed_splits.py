@@ -72,7 +72,7 @@ def test_a_recording_that_is_in_both_of_a_sources_files_is_refused(recordings, p
 def test_a_copy_under_another_imu_is_refused_and_absent_ones_are_no_copies(recordings, parameters):
     made, splits = recordings(30, given_test=(1, 5, 7)), parameters("base").splits
     absent = made.copy(deep=True)
-    absent.angular_rate.loc[{"imu": 2, "recording": [5, 9]}] = np.nan
+    absent["samples"].loc[{"imu": 2, "recording": [5, 9]}] = 0
     split_recordings(absent, splits)
     absent.angular_rate.loc[{"imu": 2, "recording": 12}] = made.angular_rate.sel(imu=1, recording=7)
     with pytest.raises(InputError, match=r"IMU 2 recording 12 .* IMU 1 recording 7"):

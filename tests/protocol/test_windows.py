@@ -2,7 +2,12 @@ import numpy as np
 import pytest
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.protocol.windows import cut_windows, window_size, window_starts
+from gyro_pipeline.protocol.windows import (
+    cut_windows,
+    usable_starts,
+    window_size,
+    window_starts,
+)
 
 
 @pytest.mark.parametrize(
@@ -58,6 +63,24 @@ def test_starts_a_window_apart_are_the_non_overlapping_windows():
     samples = np.random.default_rng(0).normal(size=(3, 23))
     starts = window_starts(23, size=5, stride=5)
     np.testing.assert_array_equal(cut_windows(samples, 5, starts), cut_windows(samples, 5))
+
+
+def test_masked_samples_are_the_mean_of_their_window_which_is_dropped_if_it_lost_too_many():
+    samples = np.random.default_rng(0).normal(3, 1, (2, 40)).astype(np.float32)
+    samples[:, [5, 20, 21]] = np.nan
+    assert usable_starts(np.isnan(samples[0]), 10).tolist() == [0, 10, 30]
+    assert usable_starts(np.isnan(samples[0]), 10, largest_masked_share=0.2).tolist() == [
+        *(0, 10, 20, 30)
+    ]
+    windows = cut_windows(samples, 10)
+    assert windows.shape == (2, 3, 10)
+    whole = [samples[:, 10:20], samples[:, 30:40]]
+    np.testing.assert_array_equal(windows[:, 1:], np.stack(whole, axis=1))
+    means = np.nanmean(samples[:, :10], axis=1)
+    np.testing.assert_allclose(windows[:, 0, 5], means, rtol=1e-6)
+    np.testing.assert_allclose(windows[:, 0].mean(axis=1), means, rtol=1e-6)
+    named = cut_windows(samples, 10, np.array([12, 6, 25]))  # the first lost two
+    np.testing.assert_array_equal(named, np.stack([samples[:, 6:16], samples[:, 25:35]], axis=1))
 
 
 def test_a_window_may_be_the_whole_recording():

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import AXES, InputError
 from gyro_pipeline.datasets.log_source import LogSource
+from gyro_pipeline.fingerprints import fingerprint
 from gyro_pipeline.logs import Log, LogEntry, Logs
 
 LAYOUT = ("recording", "gyroscope", "sample")
@@ -68,11 +69,6 @@ class ArrayLogs(LogSource):
         shapes = {name: self._open(name).shape for name in self._files.values()}
         order = self._order(shapes)
         counts = [dict(zip(order, shape, strict=True)) for shape in shapes.values()]
-        if len({count["sample"] for count in counts}) > 1:
-            raise InputError(
-                f"{self._sensor} {self._path}: expected as many samples in the test file as in the "
-                f"train file, got {' and '.join(_shapes(shapes))}; cut the longer one"
-            )
         entries, first = list[LogEntry](), 1
         for (split, name), count in zip(self._files.items(), counts, strict=True):
             entries += self._entries(split, name, order, count, first)
@@ -144,13 +140,16 @@ class ArrayLogs(LogSource):
     ) -> list[LogEntry]:
         """The recordings of one file, IMU by IMU, numbered from ``first`` on."""
         path, imus = self._path / name, count["gyroscope"] // len(AXES)
+        state = path.stat()
+        file = [str(path), state.st_size, state.st_mtime_ns, order]
         return [
             LogEntry(
                 imu + 1,
                 first + recording,
                 f"{name} recording {recording + 1}",
                 partial(_read, path, order, imu, recording),
-                size=path.stat().st_size // (imus * count["recording"]),
+                size=state.st_size // (imus * count["recording"]),
+                key=fingerprint([*file, imu, recording]),
                 split=None if split == WHOLE else split,
             )
             for imu in range(imus)

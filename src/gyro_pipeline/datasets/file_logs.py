@@ -1,45 +1,40 @@
 """Logs as loggers write them: a folder of files, one a recording."""
 
-import glob
-import importlib
 import logging
 import os
-import pkgutil
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from pydantic import ValidationError
 
 from gyro_pipeline import readers
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.datasets.atomic import check_writable
 from gyro_pipeline.datasets.log_source import LogSource
-from gyro_pipeline.datasets.parse_cache import Reading
-from gyro_pipeline.fingerprints import code_hash, fingerprint
-from gyro_pipeline.logs import Log, LogEntry, Logs
+from gyro_pipeline.fingerprints import fingerprint, package_hash
+from gyro_pipeline.logs import LogEntry, Logs
 from gyro_pipeline.parameters import ReaderOptions
 
 _LOG = logging.getLogger(__name__)
 
 _NAMED = 5
-"""So many files that do not match are named."""
-
-_KEPT = ".reading"
-"""Suffix of what is kept of a file; no logger's."""
+"""So many files are named in a message."""
 
 _HIDDEN = re.compile(r"(^|/)(\.|~\$)")  # the latter while Excel has a file open
-_DIGITS = 18  # of a number that fits an integer
+_LARGEST = 10**18 - 1  # of the numbers in names; fits an integer
 _PART = re.compile(r"\{(imu|recording)(:name)?\}|(\*)")
 
-Numbers = dict[str, tuple[int, int]]
+Matches = Mapping[str, re.Match[str]]
+"""By a file's path in the folder, what the pattern says of it."""
 
 
 class FileLogs(LogSource):
     """Lists the files of a folder that match a pattern, each one recording of one IMU.
+
+    Where ``columns`` of the reader are given for several IMUs, each file is one of each of them.
 
     Args:
         sensor, source, path, sensors, metadata: As :class:`~.log_source.LogSource` takes them.
@@ -48,12 +43,11 @@ class FileLogs(LogSource):
             names, which are numbered in their order; ``*`` for anything but a slash. Without an
             IMU all files are of IMU 1; without a recording the files of an IMU are numbered in
             their order.
-        cache: ``{"path": folder}`` for what was read of the files, which are then parsed once
-            only, also where a run was interrupted. (Kedro makes a ``path`` absolute.)
         reader: How the files are read (:class:`gyro_pipeline.parameters.ReaderOptions`).
+        cache: No longer needed; said once, and ignored.
 
     Raises:
-        InputError: An unknown sensor; a pattern, cache or reader options that are not usable.
+        InputError: An unknown sensor; a pattern or reader options that are not usable.
     """
 
     def __init__(
@@ -63,47 +57,55 @@ class FileLogs(LogSource):
         path: str,
         sensors: Mapping[str, Mapping[str, Any]] | None = None,
         pattern: str = "*",
-        cache: Mapping[str, str] | None = None,
         reader: Mapping[str, Any] | None = None,
+        cache: Any = None,
         metadata: dict[str, Any] | None = None,
     ) -> None:
         super().__init__(sensor, sensors, source, path, metadata)
         self._pattern = pattern
-        self._regex = _compiled(sensor, pattern)
+        self._regex = _compiled(f"{sensor}: pattern {pattern} in the catalog entry", pattern)
         try:
             self._options = ReaderOptions.model_validate(reader or {})
         except ValidationError as error:
             raise InputError(f"{sensor}: reader in the catalog entry: {error}") from error
         readers.check_format(self._options.format, f"{sensor}: reader in the catalog entry")
-        if cache is not None and not (
-            isinstance(cache, Mapping) and cache.get("path") and isinstance(cache["path"], str)
-        ):
+        columns = self._options.columns
+        self._side_by_side: list[int] = list(columns) if isinstance(columns, Mapping) else []
+        if self._side_by_side and "imu" in self._regex.groupindex:
             raise InputError(
-                f"{sensor}: cache in the catalog entry: expected {{path: a folder}}, got {cache!r}"
+                f"{sensor}: columns in the catalog entry's reader name IMUs "
+                f"{', '.join(map(str, self._side_by_side))} in each file, and {{imu}} in the "
+                f"pattern {pattern} says that a file is of one; leave one of the two out"
             )
-        self._cache = None if cache is None else Path(cache["path"])
+        if cache is not None:
+            _LOG.info("%s: cache in the catalog entry is no longer needed; remove it", sensor)
 
     def load(self) -> Logs:
         """List the recordings; their files are read later, one at a time.
 
         Raises:
             InputError: As the cause of Kedro's ``DatasetError``, no such folder, no file that
-                matches, two files of one recording, or a cache that cannot be written to.
+                matches, or two files of one recording.
         """
-        found = self._matching()
-        numbers = _numbered(self._sensor, self._pattern, found)
-        self._say_order(numbers)
-        imus = len({imu for imu, _ in numbers.values()})
+        places = self._places(self._matching())
+        settings = [self._options.model_dump(mode="json"), self.entry.rate_hz]
+        settings.append(package_hash(readers))
+        entries = [
+            self._listed(name, imu, recording, settings)
+            for name, (own, recording) in places.items()
+            for imu in self._side_by_side or [own]
+        ]
+        if "{recording" not in self._pattern and "*" in self._pattern:
+            _LOG.info(
+                "%s: recordings of each IMU are numbered in the order of the files' names: %s",
+                *(self._sensor, _shown([f"{name} is {n}" for name, (_, n) in places.items()])),
+            )
+        imus = len({entry.imu for entry in entries})
         if self.entry.imus not in (None, imus):
             _LOG.warning(
                 "%s: files of %d IMUs in %s, where globals.yml says imus: %d",
                 *(self._sensor, imus, self._path, self.entry.imus),
             )
-        readings = self._readings(found)
-        entries = [
-            LogEntry(*numbers[name], name, reading, (self._path / name).stat().st_size)
-            for name, reading in readings.items()
-        ]
         entries.sort(key=lambda entry: (entry.imu, entry.recording))
         return Logs(self._sensor, self._source, False, self.entry.rate_hz, entries)
 
@@ -114,73 +116,83 @@ class FileLogs(LogSource):
         reader = self._options.model_dump(exclude_defaults=True)
         return super()._describe() | {"pattern": self._pattern, "reader": reader}
 
-    def _matching(self) -> dict[str, re.Match[str]]:
-        """Paths in the folder that the pattern describes, in their order."""
-        where, names = f"{self._sensor} {self._path}", self._names()
-        matches = {name: match for name in names if (match := self._regex.fullmatch(name))}
-        others = [name for name in names if name not in matches]
-        if not matches:
+    def _listed(self, name: str, imu: int, recording: int, settings: Sequence[Any]) -> LogEntry:
+        """One IMU of one file."""
+        path = self._path / name
+        try:
+            state = path.stat()
+        except OSError as error:
             raise InputError(
-                f"{where}: expected files like {self._pattern}, got {_listed(others) or 'none'}; "
-                "correct the pattern in the catalog, or the files' names"
-            )
-        if others:
-            _LOG.info(
-                "%s: %d files are not like %s: %s",
-                *(where, len(others), self._pattern, _listed(others)),
-            )
-        return matches
+                f"{self._sensor} {path}: cannot be read: {error.strerror}; correct the link, or "
+                "remove it"
+            ) from error
+        which = {"imu": imu} if self._side_by_side else {}
+        return LogEntry(
+            *(imu, recording, name),
+            read=partial(readers.read_log, path, self._options, self.entry.rate_hz, **which),
+            size=state.st_size,
+            key=fingerprint([str(path), state.st_size, state.st_mtime_ns, which, settings]),
+        )
 
-    def _names(self) -> list[str]:
-        """Paths of all files in the folder but hidden ones, 2 before 10."""
+    def _matching(self) -> Matches:
+        """Paths in the folder that the pattern describes, 2 before 10."""
         if not self._path.is_dir():
             raise InputError(
                 f"{self._sensor} {self._path}: no such folder; put the files there, or name "
                 "another path in the catalog"
             )
-        names = (path.relative_to(self._path).as_posix() for path in _files(self._path))
-        return sorted((name for name in names if not _HIDDEN.search(name)), key=_natural)
-
-    def _say_order(self, numbers: Numbers) -> None:
-        """Say which file is which recording, where no number in its name does."""
-        if "{recording" not in self._pattern and "*" in self._pattern:
-            order = [f"{name} is {number}" for name, (_, number) in numbers.items()]
-            _LOG.info(
-                "%s: recordings of each IMU are numbered in the order of the files' names: %s",
-                *(self._sensor, _listed(order)),
+        paths = (path.relative_to(self._path).as_posix() for path in _files(self._path))
+        names = sorted((name for name in paths if not _HIDDEN.search(name)), key=_natural)
+        matches = {name: match for name in names if (match := self._regex.fullmatch(name))}
+        others = [name for name in names if name not in matches]
+        where = f"{self._sensor} {self._path}"
+        if not matches:
+            raise InputError(
+                f"{where}: expected files like {self._pattern}, got {_shown(others) or 'none'}; "
+                "correct the pattern in the catalog, or the files' names"
             )
+        if others:
+            _LOG.info(
+                "%s: %d files are not like %s: %s",
+                *(where, len(others), self._pattern, _shown(others)),
+            )
+        return matches
 
-    def _readings(self, names: Iterable[str]) -> dict[str, Callable[[], Log]]:
-        """How each file is read, and where its reading is kept."""
-        if self._cache is None:
-            given = self._options, self.entry.rate_hz
-            return {name: partial(readers.read_log, self._path / name, *given) for name in names}
-        check_writable(self._cache / _KEPT)
-        settings = [self._options.model_dump(mode="json"), self.entry.rate_hz, _readers_hash()]
-        found = {}
-        for name in names:
-            path = self._path / name
-            try:
-                state = path.stat()
-            except OSError as error:
+    def _places(self, matches: Matches) -> dict[str, tuple[int, int]]:
+        """IMU and recording of each path."""
+        imus, recordings = (self._numbers(part, matches) for part in ("imu", "recording"))
+        counts, taken = Counter[int](), dict[tuple[int, int], str]()
+        for name in matches:
+            imu = imus.get(name, 1)
+            counts[imu] += 1
+            place = imu, recordings.get(name, counts[imu] if "*" in self._pattern else 1)
+            other = taken.setdefault(place, name)
+            if other != name:
                 raise InputError(
-                    f"{self._sensor} {path}: cannot be read: {error.strerror}; correct the link, "
-                    "or remove it"
-                ) from error
-            key = fingerprint([str(path), state.st_size, state.st_mtime_ns, settings])
-            kept_as = self._cache / f"{self._sensor}.{key}{_KEPT}"
-            found[name] = Reading(path, self._options, self.entry.rate_hz, kept_as)
-        self._tidy(self._cache, [one.kept_as for one in found.values()])
-        return {**found}
+                    f"{self._sensor}: {other} and {name} are both recording {place[1]} of IMU "
+                    f"{imu} by the pattern {self._pattern}; remove one of them, or correct the "
+                    "pattern in the catalog"
+                )
+        return {name: place for place, name in taken.items()}
 
-    def _tidy(self, cache: Path, wanted: Sequence[Path]) -> None:
-        """Say what is there of an earlier run, and remove what is of other files."""
-        there = set(cache.glob(f"{glob.escape(self._sensor)}.*{_KEPT}"))  # and other files
-        for path in there.difference(wanted):
-            path.unlink(missing_ok=True)
-        before = len(there.intersection(wanted))
-        if before:
-            _LOG.info("%s: %d of %d files were read before", self._sensor, before, len(wanted))
+    def _numbers(self, part: str, matches: Matches) -> dict[str, int]:
+        """What one part of each path says, as a number; nothing where there is no such part."""
+        if part not in self._regex.groupindex:
+            return {}
+        texts = {name: match[part] for name, match in matches.items()}
+        if f"{{{part}:name}}" in self._pattern:
+            order = {text: number for number, text in enumerate(dict.fromkeys(texts.values()), 1)}
+            named = _shown([f"{text} is {number}" for text, number in order.items()])
+            _LOG.info("%s: %d %ss by name: %s", self._sensor, len(order), part, named)
+            return {name: order[text] for name, text in texts.items()}
+        numbers = {name: int(text[-4000:]) for name, text in texts.items()}
+        for name, number in numbers.items():
+            if not 1 <= number <= _LARGEST:
+                raise InputError(
+                    f"{self._sensor}: {name}: expected numbers from 1 to {_LARGEST:.0e} for "
+                    f"{{{part}}}; write {{{part}:name}} to have them numbered in their order"
+                )
+        return numbers
 
 
 def _files(folder: Path) -> Iterator[Path]:
@@ -191,100 +203,30 @@ def _files(folder: Path) -> Iterator[Path]:
         yield from (Path(here, name) for name in names)
 
 
-def _compiled(sensor: str, pattern: str) -> re.Pattern[str]:
+def _compiled(where: str, pattern: str) -> re.Pattern[str]:
     """The pattern as a regular expression."""
+
+    def refuse(problem: str) -> NoReturn:
+        raise InputError(f"{where}: {problem}")
+
     if not isinstance(pattern, str):
-        raise InputError(
-            f"{sensor}: pattern in the catalog entry: expected a text such as imu{{imu}}/*.csv, "
-            f"got {pattern!r}"
-        )
-    written, last, ends_in_digits = "", 0, False
+        refuse("expected a text such as imu{imu}/*.csv")
+    if set("{}") & set(_PART.sub("", pattern)):
+        refuse("expected {imu}, {recording}, {imu:name}, {recording:name} and * as its parts")
+    if touching := re.search(r"[}*](\{.*?\}|\*)", pattern):
+        refuse(f"expected a character before {touching[1]}, or it cannot be told where it begins")
+    if digit := re.search(r"\{(imu|recording)\}([0-9])", pattern):
+        refuse(f"expected no digit behind a number, which would belong to it, got {digit[2]}")
+    written, last = "", 0
     for part in _PART.finditer(pattern):
         name, named, _ = part.groups()
-        _refuse_digits(sensor, pattern, pattern[last : part.start()] if ends_in_digits else "")
-        ends_in_digits = bool(name) and not named
-        if written and part.start() == last:
-            raise InputError(
-                f"{sensor}: pattern {pattern}: expected a character of the names before {part[0]}, "
-                "or it cannot be told where it begins"
-            )
-        written += re.escape(pattern[last : part.start()])
-        last = part.end()
         if f"<{name}>" in written:
-            raise InputError(f"{sensor}: pattern {pattern}: {{{name}}} is there twice")
+            refuse(f"{{{name}}} is there twice")
         text = "[^/]+?" if named else "[0-9]+"
+        written += re.escape(pattern[last : part.start()])
         written += f"(?P<{name}>{text})" if name else "[^/]*"
-    rest = pattern[last:]
-    _refuse_digits(sensor, pattern, rest if ends_in_digits else "")
-    if set("{}") & set(_PART.sub("", pattern)):
-        raise InputError(
-            f"{sensor}: pattern {pattern}: expected {{imu}}, {{recording}}, {{imu:name}}, "
-            "{recording:name} and * as its parts"
-        )
-    return re.compile(written + re.escape(rest))
-
-
-def _refuse_digits(sensor: str, pattern: str, behind_number: str) -> None:
-    if behind_number[:1].isdigit():
-        raise InputError(
-            f"{sensor}: pattern {pattern}: expected no digit behind a number, got "
-            f"{behind_number[0]!r}, or it cannot be told where the number ends"
-        )
-
-
-def _numbered(sensor: str, pattern: str, found: Mapping[str, re.Match[str]]) -> Numbers:
-    """IMU and recording of each path."""
-    imus = _numbers(sensor, pattern, "imu", found)
-    recordings = _numbers(sensor, pattern, "recording", found)
-    counts, taken = Counter[int](), dict[tuple[int, int], str]()
-    for name in found:
-        imu = imus.get(name, 1)
-        counts[imu] += 1
-        number = imu, recordings.get(name, counts[imu] if "*" in pattern else 1)
-        other = taken.setdefault(number, name)
-        if other != name:
-            raise InputError(
-                f"{sensor}: {other} and {name} are both recording {number[1]} of IMU {imu} by the "
-                f"pattern {pattern}; remove one of them, or correct the pattern in the catalog"
-            )
-    _refuse_sparse(sensor, pattern, list(taken))
-    return {name: number for number, name in taken.items()}
-
-
-def _refuse_sparse(sensor: str, pattern: str, numbers: Sequence[tuple[int, int]]) -> None:
-    """Refuse IMUs of which hardly any have the same recordings: all are stored side by side."""
-    imus, recordings = (len({number[part] for number in numbers}) for part in (0, 1))
-    if 2 * len(numbers) < imus * recordings:
-        raise InputError(
-            f"{sensor}: expected recordings of the same numbers of most IMUs, got {len(numbers)} "
-            f"recordings of {imus} IMUs with {recordings} different numbers by the pattern "
-            f"{pattern}; write * for the recording, to have those of an IMU numbered in their order"
-        )
-
-
-def _numbers(
-    sensor: str, pattern: str, part: str, found: Mapping[str, re.Match[str]]
-) -> dict[str, int]:
-    """What one part of each path says, as a number; nothing where the pattern lacks the part."""
-    texts = {name: match[part] for name, match in found.items() if part in match.groupdict()}
-    if f"{{{part}:name}}" in pattern:
-        order = {text: place for place, text in enumerate(dict.fromkeys(texts.values()), 1)}
-        named = ", ".join(f"{text} is {place}" for text, place in list(order.items())[:_NAMED])
-        _LOG.info("%s: %d %ss by name: %s", sensor, len(order), part, named)
-        return {name: order[text] for name, text in texts.items()}
-    for name, text in texts.items():
-        if len(text.lstrip("0")) > _DIGITS:
-            raise InputError(
-                f"{sensor}: {name}: expected a number of at most {_DIGITS} digits for {{{part}}}; "
-                f"write {{{part}:name}} to have them numbered in their order"
-            )
-    numbers = {name: int(text) for name, text in texts.items()}
-    for name in (name for name, number in numbers.items() if number < 1):
-        raise InputError(
-            f"{sensor}: {name}: expected numbers from 1 on for {{{part}}}, got 0; write "
-            f"{{{part}:name}} to have them numbered in their order"
-        )
-    return numbers
+        last = part.end()
+    return re.compile(written + re.escape(pattern[last:]))
 
 
 def _natural(path: str) -> list[tuple[int, int | str]]:
@@ -294,14 +236,6 @@ def _natural(path: str) -> list[tuple[int, int | str]]:
     ]
 
 
-def _listed(names: Sequence[str]) -> str:
+def _shown(names: Sequence[str]) -> str:
     """The first of them."""
     return ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")
-
-
-def _readers_hash() -> str:
-    """Of the code that reads: what another version has read does not count."""
-    names = [
-        module.name for module in pkgutil.walk_packages(readers.__path__, f"{readers.__name__}.")
-    ]
-    return code_hash([readers, *map(importlib.import_module, names)])

@@ -1,16 +1,31 @@
-"""Labelled arrays as netCDF files."""
+"""Labelled arrays as netCDF files, and recordings that arrive one by one."""
 
+import json
+import os
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
+import h5netcdf
+import h5py
 import numpy as np
 import xarray as xr
 from kedro.io import AbstractDataset
 
-from gyro_pipeline.conventions import InputError, Missing
+from gyro_pipeline.conventions import AXES, InputError, Missing
 from gyro_pipeline.datasets.atomic import replacing
+from gyro_pipeline.logs import REJECTED, Finding, Listing, Recording
 
 _ENGINE: Final = "h5netcdf"
+
+_INSPECTION: Final = "inspection"
+"""The variable (imu, recording) with all of a :class:`Recording` but its samples, as JSON."""
+
+_PLACE: Final = ("imu", "recording")
+
+_UNITS: Final = {"angular_rate": "deg/s", "temperature_c": "degrees Celsius", "acceleration_g": "g"}
 
 
 class Recordings(AbstractDataset[xr.Dataset, xr.Dataset | Missing]):
@@ -65,8 +80,80 @@ class Recordings(AbstractDataset[xr.Dataset, xr.Dataset | Missing]):
         return {"filepath": str(self._filepath)}
 
 
+class InspectedRecordings(AbstractDataset[Listing | Recording, list[Recording]]):
+    """Keeps recordings one by one, as they are read, in a netCDF file beside the final one.
+
+    A :class:`Listing` begins the file with what is there already of the recordings that it lists,
+    from a reading that was interrupted or from the last complete one. A chunk holds a recording,
+    so rejected and absent ones take no space. :class:`CompletedRecordings` ends it.
+
+    Args:
+        filepath: The final netCDF file.
+        metadata: For other tools, such as Kedro-Viz.
+    """
+
+    def __init__(self, filepath: str, metadata: dict[str, Any] | None = None) -> None:
+        self._final = Path(filepath)
+        self._path = path_in_progress(self._final)
+        self.metadata = metadata
+
+    def load(self) -> list[Recording]:
+        """All recordings that are there, by IMU and number, without their samples."""
+        return list(_stored(self._source()))
+
+    def save(self, data: Listing | Recording) -> None:
+        """Begin a file for the recordings of a listing, or add one of them."""
+        if isinstance(data, Recording):
+            with h5netcdf.File(self._path, "r+") as file:
+                _append(file, data)
+            return
+        with replacing(self._path) as temporary, h5netcdf.File(temporary, "w") as file:
+            _begin(file, data.keys)
+            for recording in _stored(self._source(), data.keys):
+                if recording.key == data.keys.get(recording.place):
+                    _append(file, recording)
+
+    def _source(self) -> Path:
+        return self._path if self._path.is_file() else self._final
+
+    def _exists(self) -> bool:
+        return self._source().is_file()
+
+    def _describe(self) -> dict[str, Any]:
+        return {"filepath": str(self._path)}
+
+
+class CompletedRecordings(Recordings):
+    """The final file of :class:`InspectedRecordings`, whose ``save`` takes what is still missing.
+
+    Args:
+        filepath, made_by, metadata: As :class:`Recordings` takes them.
+    """
+
+    def save(self, data: xr.Dataset) -> None:
+        """Add labels to the recordings that were read, and rename their file.
+
+        Args:
+            data: ``samples`` (imu, recording), 0 for recordings that are not to be used, attributes
+                and all that is not measured.
+        """
+        path = path_in_progress(self._filepath)
+        _erase(path, data["samples"])
+        data.to_netcdf(path, mode="a", engine=_ENGINE)
+        os.replace(path, self._filepath)
+
+
+def path_in_progress(final: Path) -> Path:
+    """The file in which recordings are kept while others are still read."""
+    return final.with_suffix(f".unfinished{final.suffix}")
+
+
 def open_recordings(path: Path) -> xr.Dataset:
-    """Open a file that :class:`Recordings` wrote, with the values still in it.
+    """Open a file that :class:`Recordings` or :class:`CompletedRecordings` wrote.
+
+    Returns:
+        Its content, with the values still in the file. IMUs of which no recording can be used, and
+        recordings of which no IMU's can, are left out.
 
     Raises:
         InputError: A damaged file.
@@ -76,6 +163,7 @@ def open_recordings(path: Path) -> xr.Dataset:
             path,
             engine=_ENGINE,
             cache=False,  # values once read would be pickled, and kept in memory
+            drop_variables=[_INSPECTION],
         )
     except FileNotFoundError:
         raise
@@ -86,8 +174,81 @@ def open_recordings(path: Path) -> xr.Dataset:
         ) from error
     # netCDF gives NumPy numbers, which JSON does not take
     recordings.attrs = {name: _plain(value) for name, value in recordings.attrs.items()}
+    if "samples" not in recordings:
+        return recordings
+    there = recordings["samples"].load() > 0
+    for dimension, other in (("imu", "recording"), ("recording", "imu")):
+        used = there.any(other).to_numpy()
+        if not used.all():  # an index of single places makes reading slow
+            recordings = recordings.isel({dimension: np.flatnonzero(used)})
     return recordings
 
 
 def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
+
+
+def _begin(file: h5netcdf.File, places: Collection[tuple[int, int]]) -> None:
+    """Write the labels of all recordings that are listed."""
+    imus, numbers = (sorted(set(labels)) for labels in zip(*places, strict=True))
+    file.dimensions = {
+        "imu": len(imus),
+        "recording": len(numbers),
+        "axis": len(AXES),
+        "sample": None,
+    }
+    text = h5py.string_dtype()
+    file.create_variable("imu", ("imu",), np.int64, data=np.array(imus))
+    file.create_variable("recording", ("recording",), np.int64, data=np.array(numbers))
+    file.create_variable("axis", ("axis",), text, data=np.array(AXES, object))
+    file.create_variable(_INSPECTION, _PLACE, text)
+
+
+def _append(file: h5netcdf.File, recording: Recording) -> None:
+    """Write one recording to its place; last of all its description, which marks it as complete."""
+    imu, number = (
+        int(np.searchsorted(file[name][:], label))
+        for name, label in zip(_PLACE, recording.place, strict=True)
+    )
+    for name, values in recording.variables.items():
+        samples = values.shape[-1]
+        if samples > file.dimensions["sample"].size:
+            file.resize_dimension("sample", samples)
+        if name not in file.variables:
+            axis = ("axis",) if values.ndim > 1 else ()
+            layout = {"fillvalue": np.float32(np.nan), "chunks": (1, 1, *values.shape)}
+            variable = file.create_variable(name, (*_PLACE, *axis, "sample"), np.float32, **layout)
+            variable.attrs["units"] = _UNITS[name]
+        file[name][(imu, number, ..., slice(samples))] = values
+    described = asdict(recording) | {"variables": list(recording.variables)}
+    file[_INSPECTION][imu, number] = json.dumps(described)
+
+
+def _stored(path: Path, wanted: Mapping[tuple[int, int], str] | None = None) -> Iterator[Recording]:
+    """Recordings of a file by IMU and number; those whose key is wanted with their samples.
+
+    A file that is not there, or so far as it is damaged, has none.
+    """
+    with suppress(OSError, KeyError, ValueError), h5py.File(path) as file:
+        texts = file[_INSPECTION][:]
+        for imu, number in np.argwhere(texts != b"").tolist():
+            described = json.loads(texts[imu, number])
+            described["findings"] = tuple(Finding(**one) for one in described["findings"])
+            recording = Recording(**described | {"variables": {}})
+            if wanted and recording.key and recording.key == wanted.get(recording.place):
+                stretch = imu, number, ..., slice(recording.stop - recording.start)
+                read = {name: file[name][stretch] for name in described["variables"]}
+                recording = replace(recording, variables=read)
+            yield recording
+
+
+def _erase(path: Path, samples: xr.DataArray) -> None:
+    """Take back what was kept of recordings that are not to be used after all."""
+    with h5py.File(path, "r+") as file:
+        described = file[_INSPECTION]
+        for place in np.argwhere(samples.transpose(*_PLACE).to_numpy() == 0).tolist():
+            text = described[tuple(place)]
+            if text and json.loads(text)["outcome"] != REJECTED:
+                for name in json.loads(text)["variables"]:
+                    file[name][tuple(place)] = np.nan
+                described[tuple(place)] = ""  # to be read again, should it be used some day

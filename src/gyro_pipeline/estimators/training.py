@@ -13,14 +13,17 @@ from gyro_pipeline.physics.allan import (
     allan_variance,
     averaging_times_s,
     fit_noise,
+    mean_variance,
 )
+from gyro_pipeline.physics.bias import fill_masked
 
 
 class TrainingRecordings:
     """Recordings to learn about one device from. What several estimators need is worked out once.
 
     Args:
-        recordings: As in :mod:`gyro_pipeline.conventions`; not to be changed afterwards.
+        recordings: As in :mod:`gyro_pipeline.conventions`, all of one length; not to be changed
+            afterwards.
         imu: The device. If it is not among the recordings it is an unseen one, and the others tell
             what devices are like.
 
@@ -57,9 +60,12 @@ class TrainingRecordings:
 
     @property
     def rates(self) -> NDArray[np.floating]:
-        """Samples of all recordings of the known IMUs, (recordings, axes, samples), deg/s."""
+        """Samples of all recordings of the known IMUs, (recordings, axes, samples), deg/s.
+
+        Masked ones are the mean of the recording.
+        """
         if self.seen:
-            return self._own
+            return fill_masked(self._own)
         return np.concatenate([self.of(imu).rates for imu in self.known])
 
     @cached_property
@@ -79,9 +85,9 @@ class TrainingRecordings:
 
     @cached_property
     def noise_figures(self) -> list[NoiseFigures]:
-        """N, B and K of each axis, from the Allan variance averaged over recordings."""
+        """N, B and K of each axis, from the Allan variance of all recordings."""
         fitted = self.recording_s, SHORTEST_FIT_SAMPLES / self.rate_hz
-        return [fit_noise(self._times_s, one, *fitted) for one in self._variances.mean(axis=0)]
+        return [fit_noise(self._times_s, one, *fitted) for one in mean_variance(*self._variances)]
 
     @property
     def _times_s(self) -> NDArray[np.float64]:
@@ -90,13 +96,16 @@ class TrainingRecordings:
         return times[times * self.rate_hz >= SHORTEST_FIT_SAMPLES * (1 - 1e-9)]
 
     @cached_property
-    def _variances(self) -> NDArray[np.float64]:
-        """Allan variances, (recordings, axes, times)."""
+    def _variances(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Allan variances and their counts of differences, (recordings, axes, times)."""
         if not self.seen:
-            return np.concatenate([self.of(imu)._variances for imu in self.known])
-        rows = self.rates.reshape(-1, self.rates.shape[-1])
-        variances = [allan_variance(row, self.rate_hz, self._times_s) for row in rows]
-        return np.reshape(variances, (*self.rates.shape[:2], -1))
+            known = zip(*(self.of(imu)._variances for imu in self.known), strict=True)
+            variances, counts = (np.concatenate(part) for part in known)
+            return variances, counts
+        rows = self._own.reshape(-1, self._own.shape[-1])
+        both = zip(*(allan_variance(row, self.rate_hz, self._times_s) for row in rows), strict=True)
+        variances, counts = (np.reshape(part, (*self._own.shape[:2], -1)) for part in both)
+        return variances, counts
 
     @property
     def white_noise(self) -> NDArray[np.float64]:
@@ -105,6 +114,5 @@ class TrainingRecordings:
 
     @property
     def _present(self) -> NDArray[np.bool_]:
-        """Which recordings the device has; one that it lacks is NaN as a whole."""
-        first = self.recordings.angular_rate.sel(imu=self.imu).isel(sample=0)
-        return np.asarray(first.transpose("recording", "axis").notnull().all("axis").to_numpy())
+        """Which recordings the device has."""
+        return np.asarray(self.recordings["samples"].sel(imu=self.imu).to_numpy() > 0)

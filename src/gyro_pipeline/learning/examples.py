@@ -21,7 +21,8 @@ class Device:
     """IMUs seen side by side as one input of the network, and their recordings to use.
 
     Attributes:
-        recordings: ``angular_rate`` (imu, recording, axis, sample); may be backed by a file.
+        recordings: ``angular_rate`` (imu, recording, axis, sample), of one length, NaN where
+            masked; may be backed by a file.
         bias: Bias of each recording, (imu, recording, axis), deg/s.
         imus: The IMUs side by side, one for Method 2.
         numbers: Recording numbers to use.
@@ -36,7 +37,7 @@ class Device:
     starts: tuple[np.ndarray, ...] | None = None
 
     def windows(self, size: int) -> list[int]:
-        """How many windows of ``size`` samples each recording gives."""
+        """How many windows of ``size`` samples each recording gives, if none is masked."""
         if self.starts is not None:
             return [len(starts) for starts in self.starts]
         return [self.recordings.sizes["sample"] // size] * len(self.numbers)
@@ -158,17 +159,16 @@ def _centred(
     targets = np.empty((n, architecture.gyroscopes), np.float32)
     start = 0
     for device, centre in zip(devices, centres, strict=True):
-        counts = device.windows(architecture.window)
-        starts = device.starts or [None] * len(counts)
-        used = zip(device.samples(), device.biases(), counts, starts, strict=True)
-        for samples, bias, count, chosen in used:
-            rows = slice(start, start + count)
+        starts = device.starts or [None] * len(device.numbers)
+        used = zip(device.samples(), device.biases(), starts, strict=True)
+        for samples, bias, chosen in used:
             centred = samples - centre[:, None].astype(np.float32)
             windows = cut_windows(centred, architecture.window, chosen)
+            rows = slice(start, start + windows.shape[-2])
             pack(windows, architecture, out=inputs[rows])
             targets[rows] = bias - centre
             start = rows.stop
-    return Examples(inputs, targets)
+    return Examples(inputs[:start], targets[:start])
 
 
 def _around(positions: np.ndarray) -> slice:

@@ -10,6 +10,7 @@ N / sqrt(t), which is why N and not the sample sigma is used everywhere: the two
 as successive samples are correlated.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import allantools
@@ -30,6 +31,7 @@ FLICKER_FLOOR = 2 * np.log(2) / np.pi
 _POINTS = 20
 _LONGEST_FRACTION = 5  # of the recording: beyond, too few independent averages are left
 _TERMS = 3
+_CLOSED = 10  # a gap is closed at averaging times of so many times its length
 
 
 @dataclass(frozen=True)
@@ -62,35 +64,83 @@ def averaging_times_s(n_samples: int, rate_hz: float) -> NDArray[np.float64]:
 
 def allan_variance(
     samples: NDArray[np.floating], rate_hz: float, times_s: NDArray[np.floating]
-) -> NDArray[np.float64]:
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Overlapping Allan variance of one recording (NIST SP1065, equation 11).
 
+    It is the mean over the stretches between masked samples, by their counts of differences. A gap
+    of up to a tenth of an averaging time is closed, as it moves samples by less than the average
+    resolves; else a few masked samples would cost the long averaging times.
+
     Args:
-        samples: (n,), deg/s.
+        samples: (n,), deg/s; NaN where masked.
         rate_hz: Samples per second.
         times_s: (m,), s, whole multiples of the sample period, in any order.
 
     Returns:
-        (m,), (deg/s)^2, in the order of ``times_s``; NaN where the recording holds NaN.
+        The variance (m,), (deg/s)^2, in the order of ``times_s``, and of how many differences it is
+        the mean, (m,). It is NaN, of none, where every stretch is shorter than two averages.
 
     Raises:
-        InputError: An averaging time is no multiple of the sample period or too long. allantools
-            itself would move or drop it without a word.
+        InputError: An averaging time is no multiple of the sample period. allantools itself would
+            move it without a word.
     """
     factors = np.rint(times_s * rate_hz).astype(int)
-    longest = (samples.size - 1) // 2
     if not np.allclose(factors, times_s * rate_hz, rtol=1e-9) or factors.min() < 1:
         raise InputError(
             f"averaging times: expected whole multiples of the sample period {1 / rate_hz:g} s, "
             f"got {times_s}"
         )
-    if factors.max() > longest:
-        raise InputError(
-            f"averaging time {times_s.max():g} s: a recording of {samples.size / rate_hz:g} s "
-            f"allows {longest / rate_hz:g} s at most"
-        )
-    if np.isnan(samples).any():  # allantools cuts NaN off the ends
-        return np.full(factors.shape, np.nan)
+    squares, counts = np.zeros(factors.shape), np.zeros(factors.shape, np.int64)
+    gaps = _gaps(samples)
+    closed = np.searchsorted(np.sort(gaps[:, 1] - gaps[:, 0]), factors // _CLOSED, side="right")
+    for alike in (closed == number for number in np.unique(closed)):
+        for stretch in _stretches(samples, gaps, factors[alike].min() // _CLOSED):
+            fits = alike & (stretch.size > 2 * factors)
+            count = np.where(fits, stretch.size - 2 * factors + 1, 0)
+            squares[fits] += count[fits] * _overlapping(stretch, factors[fits], rate_hz)
+            counts += count
+    with np.errstate(invalid="ignore"):
+        return squares / counts, counts
+
+
+def mean_variance(
+    variances: NDArray[np.floating], counts: NDArray[np.integer]
+) -> NDArray[np.float64]:
+    """Mean of several recordings' Allan variances, by their counts of differences.
+
+    Args:
+        variances: (recordings, ..., m), (deg/s)^2.
+        counts: The same shape, or one that broadcasts to it; 0 where a variance is NaN.
+
+    Returns:
+        (..., m), (deg/s)^2; NaN where no recording is long enough.
+    """
+    weights = np.broadcast_to(counts, variances.shape)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.nansum(variances * weights, axis=0) / weights.sum(axis=0))
+
+
+def _gaps(samples: NDArray[np.floating]) -> NDArray[np.int64]:
+    """First masked sample of each gap and the sample after it, (gaps, 2)."""
+    masked = np.concatenate([[False], np.isnan(samples), [False]])
+    return np.flatnonzero(masked[1:] != masked[:-1]).reshape(-1, 2)
+
+
+def _stretches(
+    samples: NDArray[np.floating], gaps: NDArray[np.int64], longest: int
+) -> Iterator[NDArray[np.floating]]:
+    """Measured samples between gaps longer than so many samples; shorter ones are closed."""
+    ends = gaps[gaps[:, 1] - gaps[:, 0] > longest].ravel()
+    for part in np.split(samples, ends)[::2]:
+        yield part[~np.isnan(part)]
+
+
+def _overlapping(
+    samples: NDArray[np.floating], factors: NDArray[np.integer], rate_hz: float
+) -> NDArray[np.float64]:
+    """Overlapping Allan variance at averages of so many samples, in any order."""
+    if not factors.size:
+        return np.empty(0)
     unique, position = np.unique(factors, return_inverse=True)  # allantools sorts as well
     _, deviation, _, _ = allantools.oadev(
         samples.astype(np.float64), rate=rate_hz, data_type="freq", taus=unique / rate_hz
@@ -101,7 +151,7 @@ def allan_variance(
 def fit_noise(
     times_s: NDArray[np.floating],
     variance: NDArray[np.floating],
-    duration_s: float,
+    duration_s: float | NDArray[np.floating],
     shortest_s: float,
 ) -> NoiseFigures:
     """Fit N, B and K, none of them negative, to an Allan variance.
@@ -113,7 +163,8 @@ def fit_noise(
     Args:
         times_s: (m,), s, averaging times.
         variance: (m,), (deg/s)^2, usually the mean over many recordings.
-        duration_s: Length of one recording.
+        duration_s: Length of one recording; (m,) where not all are long enough for all averaging
+            times, then of those that are.
         shortest_s: Shorter averaging times are left out; ``SHORTEST_FIT_SAMPLES`` sample periods
             where successive samples may be correlated.
 
@@ -121,18 +172,20 @@ def fit_noise(
         The noise figures.
 
     Raises:
-        InputError: Fewer than three averaging times are left, or a variance is not positive.
+        InputError: Fewer than three averaging times have a variance, or one is not positive.
     """
     kept = times_s >= shortest_s * (1 - 1e-9)  # a time that is equal but for rounding is kept
+    kept = kept & ~np.isnan(variance)
     times, measured = times_s[kept].astype(np.float64), variance[kept].astype(np.float64)
     if times.size < _TERMS or not np.all(measured > 0):
         raise InputError(
             f"noise fit: expected at least {_TERMS} averaging times from {shortest_s:g} s on, each "
             f"with a positive Allan variance, got {measured} at {times} s; the recording must be "
-            "longer, without NaN and not constant"
+            "longer and not constant"
         )
     terms = np.stack([1 / times, np.full_like(times, FLICKER_FLOOR), times / 3], axis=1)
-    weight = np.sqrt(duration_s / times) / measured
+    durations_s = np.broadcast_to(duration_s, times_s.shape)[kept]
+    weight = np.sqrt(durations_s / times) / measured
     squares, _ = nnls(terms * weight[:, None], measured * weight)
     white, instability, random_walk = np.sqrt(squares)
     return NoiseFigures(float(white), float(instability), float(random_walk))

@@ -1,4 +1,7 @@
-"""Bias of a stationary recording: its mean, and how long the running mean takes to settle."""
+"""Bias of a stationary recording: its mean, and how long the running mean takes to settle.
+
+Samples that hold no measurement are NaN; they are in no sum and no count.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,12 +11,40 @@ def recording_mean(samples: NDArray[np.floating]) -> NDArray[np.float64]:
     """Mean of each recording, the paper's ground truth (Stolero & Klein, arXiv 2409.00488).
 
     Args:
-        samples: (..., n), deg/s.
+        samples: (..., n), deg/s; NaN where masked.
 
     Returns:
-        (...), deg/s; NaN for a recording that holds NaN.
+        (...), deg/s.
     """
-    return np.asarray(np.mean(samples, axis=-1, dtype=np.float64))
+    return np.asarray(np.nanmean(samples, axis=-1, dtype=np.float64))
+
+
+def sample_sigma(samples: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Standard deviation of the samples of each recording about its mean.
+
+    Args:
+        samples: (..., n), deg/s; NaN where masked.
+
+    Returns:
+        (...), deg/s.
+    """
+    return np.asarray(np.nanstd(samples, axis=-1, ddof=1, dtype=np.float64))
+
+
+def fill_masked(samples: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Replace masked samples by the mean of the others, which leaves that mean as it is.
+
+    Args:
+        samples: (..., n), deg/s; NaN where masked.
+
+    Returns:
+        (..., n); the samples themselves where none is masked.
+    """
+    masked = np.isnan(samples)
+    if not masked.any():
+        return samples
+    means = recording_mean(samples)[..., None].astype(samples.dtype)
+    return np.where(masked, means, samples)
 
 
 def settling_time_s(
@@ -22,27 +53,25 @@ def settling_time_s(
     """Earliest time from which the running mean stays within a band around the whole mean.
 
     Args:
-        samples: (..., n), deg/s.
+        samples: (..., n), deg/s; NaN where masked.
         rate_hz: Samples per second.
         tolerance_dps: Half width of the band, deg/s.
 
     Returns:
-        (...), s, between one sample period and the whole recording; NaN for a recording that
-        holds NaN.
+        (...), s, between one sample period and the whole recording.
     """
-    counts = np.arange(1, samples.shape[-1] + 1)
     recordings = samples.reshape(-1, samples.shape[-1])
     # one recording at a time: its running mean is float64, the whole set would be twice the input
-    times = [_settled_count(row, counts, tolerance_dps) / rate_hz for row in recordings]
+    times = [_settled_count(row, tolerance_dps) / rate_hz for row in recordings]
     return np.array(times, dtype=np.float64).reshape(samples.shape[:-1])
 
 
-def _settled_count(
-    recording: NDArray[np.floating], counts: NDArray[np.integer], tolerance_dps: float
-) -> float:
+def _settled_count(recording: NDArray[np.floating], tolerance_dps: float) -> float:
     """Number of samples after which the running mean no longer leaves the band."""
-    running_mean = np.cumsum(recording, dtype=np.float64) / counts
-    if np.isnan(running_mean[-1]):
+    measured = np.flatnonzero(~np.isnan(recording))
+    if not measured.size:
         return np.nan
+    sums = np.cumsum(recording[measured], dtype=np.float64)
+    running_mean = sums / np.arange(1, measured.size + 1)
     outside = np.flatnonzero(np.abs(running_mean - running_mean[-1]) > tolerance_dps)
-    return float(counts[outside[-1] + 1]) if outside.size else 1.0
+    return float(measured[outside[-1] + 1] + 1) if outside.size else 1.0

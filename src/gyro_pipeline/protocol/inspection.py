@@ -1,4 +1,4 @@
-"""One recording, read and judged; what a worker process does."""
+"""One recording, read once and judged; what a worker process does."""
 
 import hashlib
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.logs import REJECTED, Finding, Log, LogEntry
+from gyro_pipeline.logs import REJECTED, Finding, Log, LogEntry, Recording
 from gyro_pipeline.parameters import Quality
 from gyro_pipeline.quality import inspect
 
@@ -18,91 +18,111 @@ class Inspection:
 
     Attributes:
         entry: Where it comes from.
-        rate_hz: Expected.
+        rate_hz: Expected; None where it is not known.
         quality: How it is judged.
+        key: Hash of all that the result depends on.
     """
 
     entry: LogEntry
     rate_hz: float | None
     quality: Quality
+    key: str
 
     @property
     def work(self) -> float:
         """Estimated cost, in bytes."""
         return float(self.entry.size)
 
-    @property
-    def samples(self) -> int | None:
-        """That ``quality.length_s`` asks for, at the expected rate, if there is one."""
-        asked = self.quality.length_s
-        return None if asked is None or self.rate_hz is None else round(asked * self.rate_hz)
+    def rejected(self, check: str, problem: str) -> Recording:
+        """The recording as one of which nothing can be used."""
+        findings = (Finding(check, REJECTED, problem),)
+        entry = self.entry
+        return Recording(
+            entry.imu, entry.recording, entry.where, self.key, REJECTED, findings=findings
+        )
 
 
-@dataclass(frozen=True)
-class Judged:
-    """What is known of a recording after it was read; its samples are read again where needed.
-
-    Attributes:
-        outcome: KEPT, REPAIRED or REJECTED.
-        findings: Why.
-        rows: It has.
-        start: First row that is used.
-        stop: The row after the last one that can be used, or that ``quality.length_s`` asks for.
-        rate_hz: Measured from timestamps; None where there are none, or it cannot be read.
-        content: Hash of all its samples; two recordings of one hash are one.
-    """
-
-    outcome: str
-    findings: tuple[Finding, ...]
-    rows: int = 0
-    start: int = 0
-    stop: int = 0
-    rate_hz: float | None = None
-    content: str = ""
-
-    def rejected(self, finding: Finding) -> "Judged":
-        """The same recording with one more finding, for which it cannot be used."""
-        return replace(self, outcome=REJECTED, findings=(*self.findings, finding))
-
-
-def judge(job: Inspection, report: Callable[[float], None]) -> Judged:
-    """Read a recording and judge it by its samples as they are stored, in float32.
+def judge(job: Inspection, report: Callable[[float], None]) -> Recording:
+    """Read a recording, judge it by its samples as they are stored, in float32, and keep them.
 
     Args:
         job: The recording.
         report: Called with the work done.
 
     Returns:
-        What was found. A file that cannot be used is a rejected recording.
+        What is kept of it, and why. A file that cannot be used is a rejected recording; where the
+        system failed rather than the file, the result has no key.
     """
     try:
         log = job.entry.read()
     except InputError as error:
-        judged = Judged(REJECTED, (Finding("file", REJECTED, str(error)),))
+        recording = job.rejected("file", str(error))
+        if _of_the_system(error.__cause__):
+            recording = replace(recording, key="")
     else:
-        judged = _judged(log, job)
+        recording = _judged(log, job)
     report(job.work)
-    return judged
+    return recording
 
 
-def _judged(log: Log, job: Inspection) -> Judged:
-    with np.errstate(over="ignore"):  # becomes infinite, and is found as such
-        stored = np.ascontiguousarray(log.samples.T, dtype=np.float32)
-    rounded = replace(log, samples=stored.T.astype(np.float64))
+def _of_the_system(cause: BaseException | None) -> bool:
+    """Whether an error, or what it comes from, says nothing of the file.
+
+    Of a damaged file libraries raise OSError as well, but only the system's has a number.
+    """
+    if cause is None:
+        return False
+    of_system = isinstance(cause, OSError) and cause.errno is not None
+    return of_system or isinstance(cause, MemoryError) or _of_the_system(cause.__cause__)
+
+
+def _judged(log: Log, job: Inspection) -> Recording:
     rate_hz = log.rate_hz or job.rate_hz
     if rate_hz is None:
-        problem = "no timestamps, and none is expected; write rate_hz to the sensor in globals.yml"
-        return Judged(REJECTED, (*log.findings, Finding("sample rate", REJECTED, problem)))
-    found = inspect(rounded, rate_hz, job.quality)
-    usable = found.stop - found.start
-    stop = found.start + min(usable, job.samples or usable)
-    judged = Judged(
-        found.outcome,
-        found.findings,
-        *(len(log.samples), found.start, stop, log.rate_hz),
-        content=hashlib.sha256(stored.data).hexdigest(),
+        return job.rejected(
+            "sample rate",
+            "no times that can be read, and none stated; name the time column and its unit, "
+            "time_column and time_units, in `reader:` of the catalog entry in catalog.yml, or give "
+            "rate_hz, samples a second, in the sensor's entry in globals.yml",
+        )
+    with np.errstate(over="ignore"):  # becomes infinite, and is found as such
+        stored = np.asarray(log.samples, np.float32)
+    inspected = inspect(replace(log, samples=stored.astype(np.float64)), rate_hz, job.quality)
+    length_s, usable = job.quality.length_s, inspected.stop - inspected.start
+    asked = usable if length_s is None else round(length_s * rate_hz)
+    recording = replace(
+        job.rejected("", ""),
+        outcome=inspected.outcome,
+        findings=inspected.findings,
+        rows=len(stored),
+        rate_hz=log.rate_hz,
     )
-    if found.outcome != REJECTED and job.samples is not None and usable < job.samples:
-        problem = f"{usable} rows can be used, quality.length_s asks for {job.samples}"
-        return judged.rejected(Finding("too short", REJECTED, problem))
-    return judged
+    if inspected.outcome == REJECTED:
+        return recording
+    if usable < asked:
+        problem = f"{usable} rows can be used, quality.length_s asks for {asked}"
+        too_short = Finding("too short", REJECTED, problem)
+        return replace(recording, outcome=REJECTED, findings=(*recording.findings, too_short))
+    return _with_samples(recording, log, stored, inspected.start, inspected.masked[:asked])
+
+
+def _with_samples(
+    recording: Recording, log: Log, stored: np.ndarray, start: int, masked: np.ndarray
+) -> Recording:
+    """Keep the rows from ``start`` on, as many as ``masked`` (rows,) tells of."""
+    kept = slice(start, start + len(masked))
+    rates = np.ascontiguousarray(stored[kept].T)
+    rates[:, masked] = np.nan
+    variables = {"angular_rate": rates}
+    for name in ("temperature_c", "acceleration_g"):
+        values = getattr(log, name)
+        if values is not None:
+            variables[name] = np.ascontiguousarray(values[kept].T, dtype=np.float32)
+    return replace(
+        recording,
+        start=kept.start,
+        stop=kept.stop,
+        masked=int(masked.sum()),
+        content=hashlib.sha256(rates.data).hexdigest(),
+        variables=variables,
+    )

@@ -21,6 +21,7 @@ from gyro_pipeline.conventions import (
     InputError,
 )
 from gyro_pipeline.parameters import Leakage
+from gyro_pipeline.protocol.recordings import recordings_of_test_imu
 from gyro_pipeline.protocol.scores import Estimate, SquaredErrors, curve_errors, score
 from gyro_pipeline.protocol.splits import deal, refuse_two_roles
 from gyro_pipeline.protocol.windows import window_size, window_starts
@@ -61,7 +62,7 @@ def divide_windows(  # noqa: PLR0917 - what a division depends on
             f"{sensor}: a window stride of {stride_s:g} s is less than half a sample at "
             f"{rate_hz:.5g} Hz; choose leakage.strides_s above {0.5 / rate_hz:.2g}"
         )
-    numbers = recordings.recording.to_numpy()[: leakage.recordings].tolist()
+    numbers = used_recordings(recordings, leakage)
     if len(numbers) < leakage.folds:
         raise InputError(
             f"{sensor}: expected at least {leakage.folds} recordings, one for each of "
@@ -69,6 +70,12 @@ def divide_windows(  # noqa: PLR0917 - what a division depends on
         )
     starts = window_starts(samples, size, stride)
     return divide(leak, numbers, starts, leakage.folds, fold, seed)
+
+
+def used_recordings(recordings: xr.Dataset, leakage: Leakage) -> list[int]:
+    """Numbers of the first recordings of the tested IMU, as many as the study uses."""
+    numbers = recordings.recording.to_numpy()[recordings_of_test_imu(recordings)]
+    return numbers[: leakage.recordings].tolist()
 
 
 def divide(

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gyro_pipeline.conventions import ALL, AXES, DISJOINT, FIRST, PAPER, TEST_IMU, TRUE
 from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.recording_model import outside_noise
+from gyro_pipeline.protocol.windows import usable_starts
 
 CURVE_STEP_S = 0.25
 """Resolution of the running-mean curve; the equivalent time is interpolated between points."""
@@ -26,7 +27,7 @@ class TestRecording:
 
     Attributes:
         number: Recording number.
-        samples: Shape (3, n), deg/s.
+        samples: Shape (3, n), deg/s; NaN where masked.
         rate_hz: Sample rate, Hz.
         noise: N, B and K of each axis from training recordings, or as drawn if simulated.
         true_bias: Drawn bias, shape (3,), deg/s; None on measured data.
@@ -42,14 +43,40 @@ class TestRecording:
 
     @cached_property
     def running_sums(self) -> np.ndarray:
-        """Sum of the first i samples in float64, shape (3, n + 1)."""
-        sums = np.cumsum(self.samples, axis=-1, dtype=np.float64)
+        """Sum of the measured ones of the first i samples in float64, shape (3, n + 1)."""
+        sums = np.cumsum(np.where(self._masked, 0, self.samples), axis=-1, dtype=np.float64)
         return np.concatenate([np.zeros((len(AXES), 1)), sums], axis=-1)
 
-    def window_sums(self, size: int) -> np.ndarray:
-        """Sums of all non-overlapping windows, shape (windows, 3)."""
-        count = self.samples.shape[-1] // size
-        return np.diff(self.running_sums[:, ::size][:, : count + 1]).T
+    @cached_property
+    def running_counts(self) -> np.ndarray:
+        """How many of the first i samples are measured, shape (n + 1,)."""
+        return np.concatenate([[0], np.cumsum(~self._masked)])
+
+    @cached_property
+    def _masked(self) -> np.ndarray:
+        return np.isnan(self.samples).any(axis=0)
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Mean of the whole recording, shape (3,), deg/s."""
+        return self.running_sums[:, -1] / self.running_counts[-1]
+
+    def starts(self, size: int, starts: np.ndarray | None = None) -> np.ndarray:
+        """First samples of the windows that are used, of all non-overlapping ones or of others."""
+        return usable_starts(self._masked, size, starts)
+
+    def window_sums(self, starts: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+        """Sums of windows, shape (windows, 3), and counts of their samples, shape (windows, 1)."""
+        sums, counts = (
+            running[..., starts + size] - running[..., starts]
+            for running in (self.running_sums, self.running_counts)
+        )
+        return sums.T, counts[:, None]
+
+    def window_means(self, size: int, starts: np.ndarray | None = None) -> np.ndarray:
+        """Means of the windows that are used, shape (windows, 3), deg/s."""
+        sums, counts = self.window_sums(self.starts(size, starts), size)
+        return sums / counts
 
     def truths(self, size: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """The truth for every window, with that truth's own averaging variance.
@@ -66,17 +93,18 @@ class TestRecording:
         Returns:
             For each truth its value in deg/s and its variance, both of shape (windows, 3).
         """
-        n = self.samples.shape[-1]
-        sums, total = self.window_sums(size), self.running_sums[:, -1]
+        n, starts = self.samples.shape[-1], self.starts(size)
+        sums, counts = self.window_sums(starts, size)
         exact = np.zeros(sums.shape)
-        truths = {PAPER: (np.broadcast_to(total / n, sums.shape), exact)}
+        truths = {PAPER: (np.broadcast_to(self.mean, sums.shape), exact)}
         if size < n:
             white = not any(axis.instability or axis.random_walk for axis in self.noise)
             variance = [
-                [outside_noise(axis, n, self.rate_hz, window * size, size) for axis in self.noise]
-                for window in range(1 if white else len(sums))  # of white noise all are alike
-            ]
-            truths[DISJOINT] = ((total - sums) / (n - size), np.broadcast_to(variance, sums.shape))
+                [outside_noise(axis, n, self.rate_hz, start, size) for axis in self.noise]
+                for start in (starts[:1] if white else starts).tolist()  # of white all are alike
+            ] or exact
+            outside = (self.running_sums[:, -1] - sums) / (self.running_counts[-1] - counts)
+            truths[DISJOINT] = (outside, np.broadcast_to(variance, sums.shape))
         if self.true_bias is not None:
             truths[TRUE] = (np.broadcast_to(self.true_bias, sums.shape), exact)
         return truths
@@ -140,7 +168,7 @@ def running_mean_curve(recording: TestRecording, size: int) -> pd.DataFrame:
     step = max(1, round(CURVE_STEP_S * recording.rate_hz))
     rows = []
     for length in np.unique([*range(step, n, step), size, n]).tolist():
-        estimates = recording.window_sums(length) / length
+        estimates = recording.window_means(length)
         time_s = length / recording.rate_hz
         for truth, (value, variance) in recording.truths(length).items():
             if truth == DISJOINT and length > LAST_DISJOINT_FRACTION * n:

@@ -44,6 +44,7 @@ from gyro_pipeline.physics.recording_model import (
     mean_squares,
 )
 from gyro_pipeline.pipelines.evaluation.device import TestDevice
+from gyro_pipeline.protocol.recordings import present
 from gyro_pipeline.protocol.scores import (
     Estimate,
     ResampledCurve,
@@ -76,9 +77,9 @@ class Bench:
     """Test recordings of the test IMU, or of several unseen ones, cut into windows of one length.
 
     Attributes:
-        recordings: All recordings of the sensor.
+        recordings: All recordings of the sensor, of one length.
         device: From :func:`describe_device`, or from :func:`describe_unseen` of the same IMUs.
-        numbers: The test recordings; one of several IMUs may lack some.
+        numbers: The test recordings; an IMU may lack some.
         window_s: Calibration time T0, seconds.
         evaluation: Resamples and seed of the intervals.
         imus: Whose recordings test, in order.
@@ -106,9 +107,13 @@ class Bench:
     def tested(self) -> list[TestRecording]:
         """The test recordings with what is needed to judge an estimate."""
         known = "true_bias" in self.recordings
-        places = product(self.imus, self.numbers)
-        chosen = [self.recordings.sel(imu=imu, recording=number) for imu, number in places]
-        tested = [
+        places, there = product(self.imus, self.numbers), present(self.recordings)
+        chosen = [
+            self.recordings.sel(imu=imu, recording=number)
+            for imu, number in places
+            if there.sel(imu=imu, recording=number)
+        ]
+        return [
             TestRecording(
                 number=int(one.recording),
                 samples=one.angular_rate.to_numpy(),
@@ -119,8 +124,6 @@ class Bench:
             )
             for one in chosen
         ]
-        lacking = len(self.imus) > 1  # the plan has refused recordings that the test IMU lacks
-        return [one for one in tested if not (lacking and np.isnan(one.samples[0, 0]))]
 
     @cached_property
     def _truths(self) -> list[dict[str, tuple[np.ndarray, np.ndarray]]]:
@@ -145,7 +148,7 @@ class Bench:
         Raises:
             InputError: If it gives no estimate for some window.
         """
-        seen = self.recordings.angular_rate.sel(imu=slice(TEST_IMU, TEST_IMU + imus - 1))
+        seen = self.recordings.angular_rate.isel(imu=slice(imus))
         parts = []
         for recording, truths in zip(self.tested, self._truths, strict=True):
             own = estimator[recording.imu] if isinstance(estimator, Mapping) else estimator
@@ -154,9 +157,9 @@ class Bench:
                 if imus == 1
                 else np.concatenate(seen.sel(recording=recording.number).to_numpy())
             )
-            windows = cut_windows(samples, self.size)
-            windows = windows.transpose(1, 0, 2)
-            start_s = np.arange(len(windows)) * self.size / self.recordings.attrs["rate_hz"]
+            starts = recording.starts(self.size)
+            windows = cut_windows(samples, self.size, starts).transpose(1, 0, 2)
+            start_s = starts / self.recordings.attrs["rate_hz"]
             judged = {
                 target: [
                     values[:, : len(AXES)]
@@ -232,13 +235,17 @@ class Bench:
         device, size = self.device, self.size
         if device.models is None:
             assert device.unit_bias is not None
-            means = recording.window_sums(size) / size
+            means = recording.window_means(size)
             axes = self._axes(recording.imu)
             known = (device.unit_bias[axes], device.spread[0, axes], device.noise[0, axes])
             return oracle(means, *known, self.window_s, self.recording_s, truth)
-        windows = cut_windows(recording.samples, size)
+        starts = recording.starts(size)
+        windows = cut_windows(recording.samples, size, starts)
         estimates = [
-            [self._line(model, axis, i * size, truth)(one[None])[0] for i, one in enumerate(rows)]
+            [
+                self._line(model, axis, start, truth)(one[None])[0]
+                for start, one in zip(starts.tolist(), rows, strict=True)
+            ]
             for rows, (axis, model) in zip(windows, self._models(recording), strict=True)
         ]
         return np.stack(estimates, axis=-1)

@@ -8,7 +8,8 @@ import pandas as pd
 import xarray as xr
 
 from gyro_pipeline.conventions import AXES, TEST_IMU
-from gyro_pipeline.physics.allan import SHORTEST_FIT_SAMPLES, NoiseFigures, fit_noise
+from gyro_pipeline.physics.allan import SHORTEST_FIT_SAMPLES, NoiseFigures, fit_noise, mean_variance
+from gyro_pipeline.physics.bias import fill_masked
 from gyro_pipeline.physics.ceiling import turn_on_spread
 from gyro_pipeline.physics.recording_model import RecordingModel
 from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, fit_recording_model
@@ -79,9 +80,8 @@ def describe_unseen(
         drawn = [_drawn_models(recordings.sel(imu=imu)) or () for imu in imus]
         models = tuple(_with_prior(model, 0.0, UNIT_SPREAD) for own in drawn for model in own)
     else:
-        variances = [allan.allan_variance.sel(imu=imu, recording=number) for imu, number in places]
-        mean = np.mean([one.transpose("axis", "time_s").to_numpy() for one in variances], axis=0)
-        noise = np.array([figures.white for figures in _allan_fits(recordings, allan, mean)])
+        fits = _allan_fits(recordings, allan, [allan.sel(imu=i, recording=n) for i, n in places])
+        noise = np.array([figures.white for figures in fits])
         fitted = _fitted_models(recordings, places) or ()
         own = tuple(_with_prior(model, float(model.mean[0]), UNIT_SPREAD) for model in fitted)
         models = own * len(imus)
@@ -111,7 +111,7 @@ def describe_device(  # noqa: PLR0913, PLR0917 - what a device is described by
         recordings: With the drawn values on simulated data.
         bias: Ground truth.
         allan: Allan variances.
-        numbers: Recordings to learn from; none of a hold-out's test recordings.
+        numbers: Recordings to learn from, if the IMU has them; none of a hold-out's test ones.
         seed: Of the bootstrap.
         imu: Which.
     """
@@ -124,30 +124,39 @@ def describe_device(  # noqa: PLR0913, PLR0917 - what a device is described by
         )
     duration_s = recordings.sizes["sample"] / recordings.attrs["rate_hz"]
     means = bias[bias.imu == imu].pivot(index="recording", columns="axis", values="bias_dps")
-    variances = allan.allan_variance.sel(imu=imu, recording=list(numbers))
-    variances = variances.transpose("recording", "axis", "time_s").to_numpy()
+    numbers = [number for number in numbers if number in means.index]
+    allan = allan.sel(imu=imu, recording=numbers).load()
+    variances = [allan.sel(recording=number) for number in numbers]
     models = _fitted_models(recordings, [(imu, number) for number in numbers])
     beyond_white = _beyond_white(models, duration_s)
     generator = np.random.default_rng(seed)
     draws = generator.integers(len(numbers), size=(_CEILING_RESAMPLES, len(numbers)))
     noise, spread = [], []
     for chosen in [np.arange(len(numbers)), *draws]:
-        fits = _allan_fits(recordings, allan, variances[chosen].mean(axis=0))
+        fits = _allan_fits(recordings, allan, [variances[place] for place in chosen])
         noise.append([fit.white for fit in fits])
-        values = means.loc[list(numbers)].to_numpy()[chosen]
+        values = means.loc[numbers].to_numpy()[chosen]
         averaging = np.square(noise[-1]) / duration_s + beyond_white
         spread.append(turn_on_spread(values, averaging))
     return TestDevice(np.array(noise), np.array(spread), None, models)
 
 
 def _allan_fits(
-    recordings: xr.Dataset, allan: xr.Dataset, variances: np.ndarray
+    recordings: xr.Dataset, allan: xr.Dataset, chosen: Sequence[xr.Dataset]
 ) -> list[NoiseFigures]:
-    """N, B and K from Allan variances, one for each row (axes, times)."""
-    duration_s = recordings.sizes["sample"] / recordings.attrs["rate_hz"]
-    shortest_s = SHORTEST_FIT_SAMPLES / recordings.attrs["rate_hz"]
-    times_s = allan.time_s.to_numpy()
-    return [fit_noise(times_s, variance, duration_s, shortest_s) for variance in variances]
+    """N, B and K of each axis from the Allan variances of some recordings."""
+    variances, counts = (
+        np.stack([one[name].to_numpy() for one in chosen])
+        for name in ("allan_variance", "differences")
+    )
+    recording_s = recordings.sizes["sample"] / recordings.attrs["rate_hz"]
+    durations_s = recording_s * (counts > 0).mean(axis=0)
+    shortest_s, times_s = (
+        SHORTEST_FIT_SAMPLES / recordings.attrs["rate_hz"],
+        allan.time_s.to_numpy(),
+    )
+    mean = mean_variance(variances, counts[:, None])
+    return [fit_noise(times_s, variance, durations_s, shortest_s) for variance in mean]
 
 
 def _drawn_models(recordings: xr.Dataset) -> tuple[RecordingModel, ...] | None:
@@ -184,7 +193,9 @@ def _fitted_models(
     if len(places) < FEWEST_RECORDINGS:
         return None
     rates = [recordings.angular_rate.sel(imu=imu, recording=number) for imu, number in places]
-    samples = np.stack([one.transpose("axis", "sample").to_numpy() for one in rates], axis=1)
+    samples = np.stack(
+        [fill_masked(one.transpose("axis", "sample").to_numpy()) for one in rates], 1
+    )
     models = []
     for axis in samples:
         model = fit_recording_model(axis, float(recordings.attrs["rate_hz"]), warm_up=None)

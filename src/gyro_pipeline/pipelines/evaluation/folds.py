@@ -8,7 +8,7 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from gyro_pipeline.conventions import BIAS, TEST, TEST_IMU, TRAIN, InputError
+from gyro_pipeline.conventions import BIAS, TEST, TRAIN, InputError
 from gyro_pipeline.estimators import (
     ESTIMATORS,
     Estimates,
@@ -31,7 +31,11 @@ class Fitted:
     def __init__(
         self, recordings: xr.Dataset, roles: pd.DataFrame, virtual: xr.Dataset | None = None
     ) -> None:
-        self._recordings, self._roles, self._virtual = recordings[["angular_rate"]], roles, virtual
+        self._recordings, self._roles, self._virtual = (
+            recordings[["angular_rate", "samples"]],
+            roles,
+            virtual,
+        )
         self._training: dict[tuple[int, int, int], TrainingRecordings] = {}
         self._folds: dict[tuple[str, int, int, int], FittedEstimator] = {}
 
@@ -65,7 +69,7 @@ class Fitted:
             self._training = {k: known for k, known in self._training.items() if k[0] == fold}
             samples = self._recordings.sel(recording=numbers)
             if real_imus:
-                samples = samples.sel(imu=slice(TEST_IMU, TEST_IMU + real_imus - 1))
+                samples = samples.isel(imu=slice(real_imus))
             if virtual_imus:
                 samples = self._with_virtual(samples, virtual_imus)
             self._training[key] = TrainingRecordings(samples.load())
@@ -76,9 +80,12 @@ class Fitted:
         if self._virtual is None:
             raise InputError("virtual gyroscopes asked of a pipeline that makes none")
         last = self._virtual.attrs["train_recordings"]
-        drawn = self._virtual[["angular_rate"]].sel(imu=slice(1, imus), recording=slice(1, last))
+        drawn = self._virtual[["angular_rate", "samples"]].sel(
+            imu=slice(1, imus), recording=slice(1, last)
+        )
         drawn = drawn.assign_coords(imu=drawn.imu + int(self._recordings.imu.max()))
-        return xr.concat([samples, drawn], "imu", join="outer").assign_attrs(samples.attrs)
+        both = xr.concat([samples, drawn], "imu", join="outer")
+        return both.assign(samples=both["samples"].fillna(0)).assign_attrs(samples.attrs)
 
 
 class FittedToOthers:
@@ -92,7 +99,9 @@ class FittedToOthers:
     def __init__(self, recordings: xr.Dataset, roles: pd.DataFrame) -> None:
         train = roles[roles.role == TRAIN]
         numbers = sorted(train.recording.unique().tolist())
-        known = TrainingRecordings(recordings[["angular_rate"]].sel(recording=numbers).load())
+        known = TrainingRecordings(
+            recordings[["angular_rate", "samples"]].sel(recording=numbers).load()
+        )
         self._sensor = recordings.attrs["sensor"]
         self._training = {imu: known.unseen(imu) for imu in sorted(roles.fold.unique().tolist())}
         self._fitted: dict[str, dict[int, Estimator]] = {}

@@ -20,6 +20,7 @@ from gyro_pipeline.fingerprints import code_hash, fingerprint
 from gyro_pipeline.learning.jobs import NetworkEstimator
 from gyro_pipeline.parameters import Evaluation, Leakage, Splits
 from gyro_pipeline.physics import allan as allan_module
+from gyro_pipeline.physics import bias as bias_module
 from gyro_pipeline.physics import ceiling
 from gyro_pipeline.physics.ceiling import oracle
 from gyro_pipeline.pipelines.evaluation import bench as bench_module
@@ -30,7 +31,12 @@ from gyro_pipeline.pipelines.evaluation.waiting import waiting
 from gyro_pipeline.protocol import leaks, scores
 from gyro_pipeline.protocol import truths as truths_module
 from gyro_pipeline.protocol import windows as windows_module
-from gyro_pipeline.protocol.leaks import Division, divide_windows, strided_scores
+from gyro_pipeline.protocol.leaks import (
+    Division,
+    divide_windows,
+    strided_scores,
+    used_recordings,
+)
 from gyro_pipeline.protocol.scores import resampled_weights
 from gyro_pipeline.protocol.windows import cut_windows
 from gyro_pipeline.tracking import (
@@ -44,6 +50,7 @@ from gyro_pipeline.tracking import (
 
 _CODE = (
     allan_module,
+    bias_module,
     ceiling,
     bench_module,
     device_module,
@@ -81,7 +88,7 @@ def evaluate_leakage(  # noqa: PLR0917 - a node's arguments are its datasets
         The check against the oracle is not among them: a leak is meant to beat it.
     """
     judged_with = fingerprint([code_hash(_CODE), evaluation.model_dump()])
-    numbers = tuple(recordings.recording.to_numpy()[: leakage.recordings].tolist())
+    numbers = tuple(used_recordings(recordings, leakage))
     device = describe_device(recordings, bias, allan, numbers, evaluation.bootstrap_seed)
     bench = Bench(recordings, device, numbers, leakage.window_s, evaluation)
     label = f"leakage {recordings.attrs['sensor']}"
@@ -128,7 +135,7 @@ def strided_error_table(estimator: Estimator, bench: Bench, divided: Division) -
         ``mean_error_dps`` of the running mean, ``constant_error_dps`` of the mean of the training
         labels, and ``oracle_error_dps`` on simulated white noise.
     """
-    biases = {one.number: one.running_sums[:, -1] / one.samples.shape[-1] for one in bench.tested}
+    biases = {one.number: one.mean for one in bench.tested}
     labels = np.array([biases[number] for number in divided.training])
     windows = [len(starts) for starts in divided.training.values()]
     constant = np.average(labels, axis=0, weights=windows)
@@ -136,9 +143,8 @@ def strided_error_table(estimator: Estimator, bench: Bench, divided: Division) -
     for one in bench.tested:
         if one.number not in divided.test:
             continue
-        starts = divided.test[one.number]
-        sums = one.running_sums[:, starts + bench.size] - one.running_sums[:, starts]
-        means = sums.T / bench.size
+        starts = one.starts(bench.size, divided.test[one.number])
+        means = one.window_means(bench.size, starts)
         seen = cut_windows(one.samples, bench.size, starts).transpose(1, 0, 2)
         estimated, _ = estimator.estimate(seen, RECORDING_MEAN)
         estimates = {"": estimated, "mean_": means, "constant_": constant}

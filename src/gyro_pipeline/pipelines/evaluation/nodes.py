@@ -22,6 +22,7 @@ from gyro_pipeline.learning import perceptrons
 from gyro_pipeline.learning.jobs import NetworkEstimator
 from gyro_pipeline.parameters import Evaluation
 from gyro_pipeline.physics import allan as allan_module
+from gyro_pipeline.physics import bias as bias_module
 from gyro_pipeline.physics import ceiling, history, recording_model, reml
 from gyro_pipeline.pipelines.evaluation import bench as bench_module
 from gyro_pipeline.pipelines.evaluation import device as device_module
@@ -51,7 +52,7 @@ from gyro_pipeline.tracking import (
 logger = logging.getLogger(__name__)
 
 _CODE = (
-    *(allan_module, ceiling, recording_model, reml, history),
+    *(allan_module, bias_module, ceiling, recording_model, reml, history),
     *(averages, base, linear, networks, perceptrons, shrinkage, training),
     *(bench_module, device_module, folds, scores, truths, windows),
 )

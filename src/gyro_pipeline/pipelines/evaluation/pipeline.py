@@ -24,8 +24,8 @@ def create_pipeline(study: str, sensor: str, virtual: bool, roles: str = "roles"
                 {
                     "cells": f"{study}.{sensor}.training.cells",
                     "runs": f"{study}.{sensor}.training.runs",
-                    "recordings": f"{sensor}.raw_logs.recordings",
-                    "bias": f"{sensor}.ground_truth.bias",
+                    "recordings": f"{sensor}.windowed_splits.recordings",
+                    "bias": f"{sensor}.windowed_splits.bias",
                     "allan": f"{sensor}.ground_truth.allan",
                     "roles": f"{sensor}.windowed_splits.{roles}",
                     "evaluation": "params:evaluation",
@@ -50,8 +50,8 @@ def create_leakage_pipeline(sensor: str) -> Pipeline:
                 | {
                     "cells": f"{LEAKAGE}.{sensor}.training.cells",
                     "runs": f"{LEAKAGE}.{sensor}.training.runs",
-                    "recordings": f"{sensor}.raw_logs.recordings",
-                    "bias": f"{sensor}.ground_truth.bias",
+                    "recordings": f"{sensor}.windowed_splits.recordings",
+                    "bias": f"{sensor}.windowed_splits.bias",
                     "allan": f"{sensor}.ground_truth.allan",
                 },
                 f"{LEAKAGE}.{sensor}.evaluation.runs",

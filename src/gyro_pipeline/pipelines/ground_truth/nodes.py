@@ -1,13 +1,13 @@
-"""Nodes of the ground-truth stage."""
+"""Nodes of the ground-truth stage. Recordings may differ in length; samples may be masked."""
 
 import logging
-from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
 import xarray as xr
+from numpy.typing import NDArray
 
-from gyro_pipeline.conventions import AXES, MDPS
+from gyro_pipeline.conventions import AXES, MDPS, InputError
 from gyro_pipeline.logs import REJECTED
 from gyro_pipeline.parameters import GroundTruth
 from gyro_pipeline.physics.allan import (
@@ -15,12 +15,15 @@ from gyro_pipeline.physics.allan import (
     allan_variance,
     averaging_times_s,
     fit_noise,
+    mean_variance,
 )
-from gyro_pipeline.physics.bias import recording_mean, settling_time_s
+from gyro_pipeline.physics.bias import recording_mean, sample_sigma, settling_time_s
+from gyro_pipeline.protocol.recordings import one_by_one
 
 logger = logging.getLogger(__name__)
 
 _KEYS = ["imu", "recording", "axis"]
+_FIGURES = ["white_dps_rts", "instability_dps", "random_walk_dps_per_rts"]
 
 
 def measure_allan_variance(recordings: xr.Dataset) -> xr.Dataset:
@@ -30,18 +33,30 @@ def measure_allan_variance(recordings: xr.Dataset) -> xr.Dataset:
         recordings: Angular rates, deg/s.
 
     Returns:
-        ``allan_variance`` (imu, recording, axis, time_s), (deg/s)^2; NaN for absent recordings.
+        ``allan_variance`` (imu, recording, axis, time_s), (deg/s)^2, up to a fifth of the longest
+        recording, and ``differences`` (imu, recording, time_s), of how many it is the mean; NaN
+        and 0 for recordings that are absent or too short.
     """
     rate_hz = recordings.attrs["rate_hz"]
-    times_s = averaging_times_s(recordings.sizes["sample"], rate_hz)
-    variance = xr.apply_ufunc(
-        lambda samples: allan_variance(samples, rate_hz, times_s),
-        recordings.angular_rate,
-        input_core_dims=[["sample"]],
-        output_core_dims=[["time_s"]],
-        vectorize=True,
+    times_s = averaging_times_s(int(recordings["samples"].max()), rate_hz)
+    labels = {name: recordings[name] for name in ("imu", "recording", "axis")}
+    shape = [len(label) for label in labels.values()]
+    variance = np.full((*shape, len(times_s)), np.nan)
+    counts = np.zeros((*shape[:2], len(times_s)), np.int64)
+    for imu, number, samples in one_by_one(recordings):
+        place = (
+            labels["imu"].to_index().get_loc(imu),
+            labels["recording"].to_index().get_loc(number),
+        )
+        for axis, row in enumerate(samples):  # masked alike, so all have the same counts
+            variance[*place, axis], counts[place] = allan_variance(row, rate_hz, times_s)
+    return xr.Dataset(
+        {
+            "allan_variance": (("imu", "recording", "axis", "time_s"), variance),
+            "differences": (("imu", "recording", "time_s"), counts),
+        },
+        coords=labels | {"time_s": times_s},
     )
-    return variance.assign_coords(time_s=times_s).to_dataset(name="allan_variance")
 
 
 def measure_bias(
@@ -56,37 +71,37 @@ def measure_bias(
 
     Returns:
         A row per present sensor, imu, recording and axis: ``bias_dps``; its standard error
-        N / sqrt(T), ``standard_error_dps``; ``sample_sigma_dps``; and ``settling_time_s``, after
-        which the running mean stays within the tolerance.
+        N / sqrt(T), ``standard_error_dps``, where T is the time of all samples that are not masked;
+        ``sample_sigma_dps``; and ``settling_time_s``, after which the running mean stays within the
+        tolerance.
     """
-    samples, rate_hz = recordings.angular_rate, recordings.attrs["rate_hz"]
-    duration_s = recordings.sizes["sample"] / rate_hz
-    tolerance_dps = ground_truth.tolerance_mdps * MDPS
-    white = _noise_figures(allan, duration_s, rate_hz).white
-    measured = xr.Dataset(
-        {
-            "bias_dps": _per_recording(recording_mean, samples),
-            "standard_error_dps": white / np.sqrt(duration_s),
-            # xarray's own would skip NaN, and round deviations to float32 on the way
-            "sample_sigma_dps": _per_recording(
-                lambda x: x.std(-1, ddof=1, dtype=np.float64), samples
-            ),
-            "settling_time_s": _per_recording(
-                lambda x: settling_time_s(x, rate_hz, tolerance_dps), samples
-            ),
-        }
-    )
-    table = measured.to_dataframe(dim_order=_KEYS).reset_index().dropna(subset="bias_dps")
-    columns = ["bias_dps", "standard_error_dps", "sample_sigma_dps", "settling_time_s"]
-    table.insert(0, "sensor", recordings.attrs["sensor"])
-    return table[["sensor", *_KEYS, *columns]].reset_index(drop=True)
+    rate_hz, tolerance_dps = recordings.attrs["rate_hz"], ground_truth.tolerance_mdps * MDPS
+    white = {imu: figures[:, 0] for imu, (figures, _) in _noise_figures(recordings, allan).items()}
+    tables = [
+        pd.DataFrame(
+            {
+                "sensor": recordings.attrs["sensor"],
+                "imu": imu,
+                "recording": number,
+                "axis": list(AXES),
+                "bias_dps": recording_mean(samples),
+                "standard_error_dps": white[imu] / np.sqrt(_measured(samples) / rate_hz),
+                "sample_sigma_dps": sample_sigma(samples),
+                "settling_time_s": settling_time_s(samples, rate_hz, tolerance_dps),
+            }
+        )
+        for imu, number, samples in one_by_one(recordings)
+    ]
+    return pd.concat(tables, ignore_index=True)
 
 
 def measure_noise(recordings: xr.Dataset, allan: xr.Dataset, bias: pd.DataFrame) -> pd.DataFrame:
     """Noise of every gyroscope, over all its recordings.
 
+    Where their Allan variances allow no fit, the log says so once and the figures are NaN.
+
     Args:
-        recordings: For their duration.
+        recordings: For their lengths.
         allan: From :func:`measure_allan_variance`.
         bias: From :func:`measure_bias`.
 
@@ -94,18 +109,44 @@ def measure_noise(recordings: xr.Dataset, allan: xr.Dataset, bias: pd.DataFrame)
         A row per sensor, imu and axis: ``sample_sigma_dps``, ``white_dps_rts`` (N),
         ``instability_dps`` (B) and ``random_walk_dps_per_rts`` (K), by IEEE Std 952.
     """
-    rate_hz = recordings.attrs["rate_hz"]
-    fitted = _noise_figures(allan, recordings.sizes["sample"] / rate_hz, rate_hz)
-    names = {
-        "white": "white_dps_rts",
-        "instability": "instability_dps",
-        "random_walk": "random_walk_dps_per_rts",
-    }
-    figures = fitted.rename(names).to_dataframe(dim_order=["imu", "axis"])
+    sensor, fitted = recordings.attrs["sensor"], _noise_figures(recordings, allan)
+    problems = {imu: problem for imu, (_, problem) in fitted.items() if problem}
+    if problems:
+        logger.warning(
+            "%s: N, B and K of IMU %s are left empty, and with them the standard errors of the "
+            "biases: %s",
+            *(sensor, ", ".join(map(str, problems)), next(iter(problems.values()))),
+        )
+    index = pd.MultiIndex.from_product([[*fitted], AXES], names=["imu", "axis"])
+    rows = np.concatenate([figures for figures, _ in fitted.values()])
+    table = pd.DataFrame(rows, index, _FIGURES)
     squares = bias.assign(square=bias.sample_sigma_dps**2).groupby(["imu", "axis"])["square"]
-    figures.insert(0, "sample_sigma_dps", np.sqrt(squares.mean()))
-    figures = figures.reset_index()
-    figures.insert(0, "sensor", recordings.attrs["sensor"])
+    table.insert(0, "sample_sigma_dps", np.sqrt(squares.mean()))
+    table = table.reset_index()
+    table.insert(0, "sensor", sensor)
+    return table
+
+
+def _noise_figures(
+    recordings: xr.Dataset, allan: xr.Dataset
+) -> dict[int, tuple[NDArray[np.float64], str]]:
+    """N, B and K of each IMU, (axes, 3), from all its recordings, or NaN and why."""
+    rate_hz, times_s = recordings.attrs["rate_hz"], allan.time_s.to_numpy()
+    shortest_s, figures = SHORTEST_FIT_SAMPLES / rate_hz, {}
+    for imu in recordings.imu.to_numpy().tolist():
+        one = allan.sel(imu=imu).transpose("recording", "axis", "time_s")
+        counts = one.differences.to_numpy()
+        durations_s = recordings["samples"].sel(imu=imu).to_numpy() / rate_hz
+        variances = mean_variance(one.allan_variance.to_numpy(), counts[:, None])
+        try:
+            fitted = [
+                fit_noise(times_s, v, durations_s @ (counts > 0), shortest_s) for v in variances
+            ]
+        except InputError as error:
+            figures[imu] = np.full((len(AXES), len(_FIGURES)), np.nan), str(error)
+        else:
+            rows = [(axis.white, axis.instability, axis.random_walk) for axis in fitted]
+            figures[imu] = np.array(rows), ""
     return figures
 
 
@@ -145,32 +186,6 @@ def _with_error(value: float, error: float) -> str:
     return f"{value:.{digits}f} ± {error:.{digits}f}"
 
 
-def _noise_figures(allan: xr.Dataset, duration_s: float, rate_hz: float) -> xr.Dataset:
-    """N, B and K by imu and axis, fitted to the mean variance of the recordings."""
-    times_s = allan.time_s.to_numpy()
-
-    def fit(variance: np.ndarray) -> tuple[float, float, float]:
-        figures = fit_noise(times_s, variance, duration_s, SHORTEST_FIT_SAMPLES / rate_hz)
-        return figures.white, figures.instability, figures.random_walk
-
-    fitted = xr.apply_ufunc(
-        fit,
-        allan.allan_variance.mean("recording"),
-        input_core_dims=[["time_s"]],
-        output_core_dims=[[], [], []],
-        vectorize=True,
-    )
-    return xr.Dataset(dict(zip(["white", "instability", "random_walk"], fitted, strict=True)))
-
-
-def _per_recording(
-    function: Callable[[np.ndarray], np.ndarray], samples: xr.DataArray
-) -> xr.DataArray:
-    """Apply a function of (..., samples) to one recording at a time, to bound memory."""
-    return xr.concat(
-        [
-            xr.apply_ufunc(function, one.load(), input_core_dims=[["sample"]])
-            for _, one in samples.groupby("recording", squeeze=False)
-        ],
-        "recording",
-    ).transpose(*_KEYS)
+def _measured(samples: NDArray[np.floating]) -> int:
+    """Samples of a recording (axes, n) that are not masked."""
+    return int(np.isfinite(samples[0]).sum())

@@ -1,225 +1,224 @@
 """Nodes of the raw-logs stage."""
 
 import logging
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import xarray as xr
-from numpy.typing import NDArray
 
-from gyro_pipeline.conventions import AXES, DIMENSIONS, TEST_IMU, InputError
+from gyro_pipeline.conventions import AXES, TEST_IMU, InputError
 from gyro_pipeline.executors import run_jobs
-from gyro_pipeline.fingerprints import data_hash
-from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding, LogEntry, Logs
+from gyro_pipeline.fingerprints import code_hash, fingerprint
+from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding, Listing, Logs, Recording
 from gyro_pipeline.parameters import Execution, Quality
-from gyro_pipeline.protocol.inspection import Inspection, Judged, judge
+from gyro_pipeline.physics import damage, stationarity
+from gyro_pipeline.protocol import inspection
+from gyro_pipeline.protocol import quality as checks
+from gyro_pipeline.protocol.inspection import Inspection, judge
 
 logger = logging.getLogger(__name__)
 
 _WORTH_PROCESSES = 10**8
 """Bytes to read; fewer are read by this process before others have started."""
 
+_AT_ONCE, _BYTES_AT_ONCE = 16, 16 * 10**6
+"""Recordings, and bytes of them, that go to a process together, and come back so."""
+
 _NAMED = 10
 """So many are named in a message; all are in the table."""
 
-Row = tuple[LogEntry, Judged]
-
 
 def inspect_logs(
-    files: Logs, quality: Quality, execution: Execution
-) -> tuple[xr.Dataset, pd.DataFrame]:
-    """Read and judge all recordings of a sensor, one at a time in each process.
+    files: Logs, earlier: Sequence[Recording], quality: Quality, execution: Execution
+) -> Iterator[Listing | Recording]:
+    """Read and judge all recordings of a sensor, each of them once.
 
     Args:
         files: The recordings that the source lists.
-        quality: How they are judged, and to what length they are cut.
+        earlier: Those that were read before, and are there to go on from.
+        quality: How they are judged.
         execution: In how many processes.
 
-    Returns:
-        Recordings as :mod:`gyro_pipeline.conventions` describes them. All are cut to the shortest
-        one that is kept, or to ``quality.length_s``, from the first row that can be used on; none
-        is padded. One that is rejected for some IMUs is NaN for these, one that is rejected for
-        all is left out. The rate is the median of those measured from timestamps, or the expected
-        one where there are none.
-
-        And a row per IMU and recording: ``sensor, imu, recording, file, outcome``; ``rows`` of the
-        file; the rows that are used, from ``start`` to before ``stop``; ``rate_hz``, measured;
-        ``findings``.
+    Yields:
+        What there is to read, then the recordings that were not read before, as they are done.
     """
-    rows = sorted(_judge(files, quality, execution), key=lambda row: _place(row[0]))
-    rows = _without_copies(rows)
-    used = [row for row in rows if row[1].outcome != REJECTED]
-    length = _common_length(files, used, quality)
-    table = pd.DataFrame(_described(files.sensor, row, length) for row in rows)
-    return _labelled(files, used, length), table.astype({"start": "Int64", "stop": "Int64"})
+    code = code_hash([checks, damage, stationarity, inspection])
+    judged_by = quality.model_dump(mode="json", exclude={"needed_pct"})  # which is of all together
+    settings = [judged_by, files.rate_hz, code]
+    jobs = {
+        (entry.imu, entry.recording): Inspection(
+            entry, files.rate_hz, quality, fingerprint([entry.key, settings])
+        )
+        for entry in files.entries
+    }
+    yield Listing({place: job.key for place, job in jobs.items()})
+    there = {recording.place: recording.key for recording in earlier}
+    missing = [job for place, job in jobs.items() if there.get(place) != job.key]
+    if len(missing) < len(jobs):
+        before = len(jobs) - len(missing)
+        logger.info("%s: %d of %d recordings were read before", files.sensor, before, len(jobs))
+    yield from _read(files.sensor, missing, execution)
 
 
-def require_enough(recordings: xr.Dataset, table: pd.DataFrame, quality: Quality) -> xr.Dataset:
-    """Stop where too many recordings were rejected, so that a study never shrinks unseen.
+def _read(sensor: str, jobs: Sequence[Inspection], execution: Execution) -> Iterator[Recording]:
+    """Recordings in any order, read here or in several processes."""
+    sizes = [job.entry.size for job in jobs]
+    if sum(sizes) < _WORTH_PROCESSES:
+        return (judge(job, lambda work: None) for job in jobs)
+    at_once = int(np.clip(_BYTES_AT_ONCE // max(sizes), 1, _AT_ONCE))
+    read = run_jobs(jobs, judge, execution, sensor, "recordings", at_once)
+    return (recording for _, recording in read)
+
+
+def quality_table(files: Logs, inspected: Sequence[Recording]) -> pd.DataFrame:
+    """How each recording was found; one that is there under two numbers is rejected once.
 
     Args:
-        recordings: From :func:`inspect_logs`.
-        table: Likewise.
+        files: For the sensor's name.
+        inspected: All recordings, by IMU and number.
+
+    Returns:
+        A row per IMU and recording: ``sensor, imu, recording, file, outcome``; ``rows`` of the
+        file; the rows that are used, from ``start`` to before ``stop``, and of these ``masked``;
+        ``rate_hz``, measured; ``findings``.
+    """
+    table = pd.DataFrame(_described(files.sensor, one) for one in _without_copies(inspected))
+    return table.astype({"start": "Int64", "stop": "Int64", "masked": "Int64"})
+
+
+def label_recordings(
+    files: Logs, inspected: Sequence[Recording], table: pd.DataFrame, quality: Quality
+) -> xr.Dataset:
+    """Labels of the recordings that are used, once enough of them remain.
+
+    Args:
+        files: The source.
+        inspected: All recordings, by IMU and number.
+        table: From :func:`quality_table`.
         quality: How many of those listed must remain.
 
     Returns:
-        The recordings.
+        What :mod:`gyro_pipeline.conventions` describes, but what was measured. The rate is the
+        median of those measured from timestamps, or the expected one where there are none.
 
     Raises:
         InputError: Fewer than ``quality.needed_pct`` percent remain, of all or of the tested IMU.
     """
-    sensor = recordings.attrs["sensor"]
-    counts = Counter(table.outcome)
+    require_enough(table, quality)
+    used = table[table.outcome != REJECTED].set_index(["imu", "recording"])
+    imus, numbers = (sorted(table[name].unique().tolist()) for name in ("imu", "recording"))
+    lengths = (used["stop"] - used["start"]).unstack(fill_value=0)
+    samples = lengths.reindex(index=imus, columns=numbers, fill_value=0).to_numpy(np.int64)
+    coordinates: dict[str, Any] = {"imu": imus, "recording": numbers, "axis": list(AXES)}
+    splits = {entry.recording: entry.split for entry in files.entries}
+    if any(splits.values()):
+        coordinates["given_split"] = ("recording", [splits[number] for number in numbers])
+    attributes = {
+        "sensor": files.sensor,
+        "source": files.source,
+        "simulated": int(files.simulated),
+        "rate_hz": _agreed_rate(used, files.rate_hz),
+    }
+    contents = [[*one.place, one.content] for one in inspected if one.place in used.index]
+    attributes["data_hash"] = fingerprint([attributes, sorted(splits.items()), contents])
+    labels = xr.Dataset({"samples": (("imu", "recording"), samples)}, coordinates, attributes)
+    if files.drawn is not None:
+        labels = labels.assign(files.drawn.sel(imu=imus, recording=numbers).data_vars)
+    return labels
+
+
+def require_enough(table: pd.DataFrame, quality: Quality) -> None:
+    """Stop where too many recordings were rejected, so that a study never shrinks unseen.
+
+    Args:
+        table: From :func:`quality_table`.
+        quality: How many of those listed must remain.
+
+    Raises:
+        InputError: Fewer than ``quality.needed_pct`` percent remain, of all or of the tested IMU.
+    """
+    sensor, counts = table.sensor.iloc[0], Counter(table.outcome)
     logger.info(
         "%s: %d recordings, %s",
         *(sensor, len(table)),
         ", ".join(f"{counts[outcome]} {outcome}" for outcome in (KEPT, REPAIRED, REJECTED)),
     )
-    lost = sorted(set(table.imu) - set(recordings.imu.values.tolist()))
-    if lost:
-        shown = ", ".join(map(str, lost[:_NAMED])) + (", …" if len(lost) > _NAMED else "")
-        logger.warning("%s: no recording is left of IMU %s", sensor, shown)
-    tested = table.imu == TEST_IMU
-    for label, listed in ((sensor, table), (f"{sensor}, the tested IMU {TEST_IMU}", table[tested])):
-        bad = listed[listed.outcome == REJECTED]
+    rejected = table.outcome == REJECTED
+    tested = table[table.imu == TEST_IMU]
+    for label, listed in ((sensor, table), (f"{sensor}, the tested IMU {TEST_IMU}", tested)):
+        bad = listed[rejected[listed.index]]
         remain = len(listed) - len(bad)
         if 100 * remain < quality.needed_pct * len(listed):
             raise InputError(
                 f"{label}: {remain} of {len(listed)} recordings can be used, quality.needed_pct "
                 f"asks for {quality.needed_pct:g} %. Repair or remove the others, or lower it:\n  "
-                + "\n  ".join(_named(bad))
+                + "\n  ".join(_reasons(bad))
             )
-    return recordings
+    lost = sorted(set(table.imu) - set(table.imu[~rejected]))
+    if lost:
+        shown = ", ".join(map(str, lost[:_NAMED])) + (", …" if len(lost) > _NAMED else "")
+        logger.warning("%s: no recording is left of IMU %s", sensor, shown)
 
 
-def _place(entry: LogEntry) -> tuple[int, int]:
-    return entry.imu, entry.recording
-
-
-def _judge(files: Logs, quality: Quality, execution: Execution) -> Iterator[Row]:
-    """All recordings, in any order, here or in several processes."""
-    jobs = [Inspection(entry, files.rate_hz, quality) for entry in files.entries]
-    if sum(entry.size for entry in files.entries) < _WORTH_PROCESSES:
-        return ((job.entry, judge(job, lambda work: None)) for job in jobs)
-    judged = run_jobs(jobs, judge, execution, files.sensor, "recordings", short=True)
-    return ((job.entry, one) for job, one in judged)
-
-
-def _without_copies(rows: Sequence[Row]) -> list[Row]:
+def _without_copies(inspected: Sequence[Recording]) -> Iterator[Recording]:
     """Reject recordings that are there before under another number."""
-    first, found = dict[str, LogEntry](), list[Row]()
-    for entry, judged in rows:
-        if judged.outcome == REJECTED:
-            found.append((entry, judged))
+    first = dict[str, Recording]()
+    for recording in inspected:
+        if recording.outcome == REJECTED:
+            yield recording
             continue
-        same = first.setdefault(judged.content, entry)
+        same = first.setdefault(recording.content, recording)
         problem = f"the same samples as {same.where}, so one of the two is not what its name says"
-        copy = Finding("duplicate", REJECTED, problem)
-        found.append((entry, judged if same is entry else judged.rejected(copy)))
-    return found
+        copy = (*recording.findings, Finding("duplicate", REJECTED, problem))
+        alone = same is recording
+        yield recording if alone else replace(recording, outcome=REJECTED, findings=copy)
 
 
-def _common_length(files: Logs, used: Sequence[Row], quality: Quality) -> int:
-    """Rows of the shortest recording; a warning where it costs the others much."""
-    if not used:
-        return 0
-    lengths = [judged.stop - judged.start for _, judged in used]
-    shortest = int(np.argmin(lengths))
-    length, usual = lengths[shortest], float(np.median(lengths))
-    rate_hz = _agreed_rate(used, files.rate_hz)
-    if length < quality.least_share * usual:
-        logger.warning(
-            "%s: all recordings are cut to %.4g s, as long as IMU %d recording %d, %s; half of "
-            "them have %.4g s or more. Remove or repair it, or raise quality.least_s",
-            *(files.sensor, length / rate_hz, used[shortest][0].imu),
-            *(used[shortest][0].recording, used[shortest][0].where, usual / rate_hz),
-        )
-    return length
-
-
-def _read(
-    used: Sequence[Row], imus: Sequence[int], recordings: Sequence[int], length: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Samples, (imu, recording, axis, sample), and temperatures, without axis, if there are any."""
-    there = np.zeros((len(imus), len(recordings)), bool)
-    rates = np.empty((*there.shape, len(AXES), length), np.float32)
-    warmth = None
-    for entry, judged in used:
-        log, rows = entry.read(), slice(judged.start, judged.start + length)
-        place = imus.index(entry.imu), recordings.index(entry.recording)
-        there[place], rates[place] = True, log.samples[rows].T
-        if log.temperature_c is not None:
-            if warmth is None:
-                warmth = np.full((*there.shape, length), np.nan, np.float32)
-            warmth[place] = log.temperature_c[rows]
-    rates[~there] = np.nan
-    return rates, warmth
-
-
-def _labelled(files: Logs, used: Sequence[Row], length: int) -> xr.Dataset:
-    """The recordings, with names of their dimensions and where they come from."""
-    imus = sorted({entry.imu for entry, _ in used})
-    recordings = sorted({entry.recording for entry, _ in used})
-    rates, warmth = _read(used, imus, recordings, length)
-    coordinates: dict[str, Any] = {"imu": imus, "recording": recordings, "axis": list(AXES)}
-    splits = {entry.recording: entry.split for entry, _ in used}
-    if any(splits.values()):
-        coordinates["given_split"] = ("recording", [splits[number] for number in recordings])
-    logs = xr.Dataset({"angular_rate": (DIMENSIONS, rates, {"units": "deg/s"})}, coordinates)
-    logs.attrs = {
-        "sensor": files.sensor,
-        "source": files.source,
-        "simulated": 0,
-        "rate_hz": _agreed_rate(used, files.rate_hz),
-    }
-    labels = {str(name): label.values.tolist() for name, label in logs.coords.items()}
-    # of the measured samples alone, as runs in the store know it
-    logs.attrs["data_hash"] = data_hash(rates, [labels, logs.attrs])
-    if warmth is not None:
-        units = {"units": "degrees Celsius"}
-        logs["temperature_c"] = (("imu", "recording", "sample"), warmth, units)
-    if files.drawn is not None:
-        logs = logs.assign(files.drawn.sel(imu=imus, recording=recordings).data_vars)
-    return logs.assign_attrs(simulated=int(files.simulated))
-
-
-def _described(sensor: str, row: Row, length: int) -> dict[str, Any]:
+def _described(sensor: str, recording: Recording) -> dict[str, Any]:
     """A row of the table."""
-    entry, judged = row
-    used = judged.outcome != REJECTED
+    used, rate_hz = recording.outcome != REJECTED, recording.rate_hz
     return {
         "sensor": sensor,
-        "imu": entry.imu,
-        "recording": entry.recording,
-        "file": entry.where,
-        "outcome": judged.outcome,
-        "rows": judged.rows,
-        "start": judged.start if used else None,
-        "stop": judged.start + length if used else None,
-        "rate_hz": None if judged.rate_hz is None else _rounded(judged.rate_hz),
-        "findings": "; ".join(f"{one.check}: {one.detail}" for one in judged.findings) or None,
+        "imu": recording.imu,
+        "recording": recording.recording,
+        "file": recording.where,
+        "outcome": recording.outcome,
+        "rows": recording.rows,
+        "start": recording.start if used else None,
+        "stop": recording.stop if used else None,
+        "masked": recording.masked if used else None,
+        "rate_hz": None if rate_hz is None else _rounded(rate_hz),
+        "findings": "; ".join(f"{one.check}: {one.detail}" for one in recording.findings) or None,
     }
 
 
-def _agreed_rate(used: Sequence[Row], expected_hz: float | None) -> float:
+def _agreed_rate(used: pd.DataFrame, expected_hz: float | None) -> float | None:
     """The median of the measured rates; the reader has rejected those far from the expected one."""
-    measured = [judged.rate_hz for _, judged in used if judged.rate_hz is not None]
-    return _rounded(np.median(measured)) if measured else expected_hz or np.nan
+    measured = used.rate_hz.dropna()
+    return _rounded(measured.median()) if len(measured) else expected_hz
 
 
-def _rounded(rate_hz: np.floating | float) -> float:
+def _rounded(rate_hz: float) -> float:
     """To a millionth, which is better than any logger's clock."""
     return float(f"{rate_hz:.6g}")
 
 
-def _named(rejected: pd.DataFrame) -> list[str]:
-    """The first rejected recordings, and why."""
-    lines = [
-        f"IMU {row.imu} recording {row.recording}, {row.file}: {row.findings}"
-        for row in rejected.head(_NAMED).itertuples()
-    ]
-    further = len(rejected) - len(lines)
-    return [*lines, f"and {further} more, in the table of their quality"] if further else lines
+def _reasons(rejected: pd.DataFrame) -> list[str]:
+    """Why recordings were rejected, each reason once, with the recordings that it is of."""
+    alike: dict[str, list[Any]] = {}
+    for row in rejected.itertuples():
+        reason = re.sub(rf"\S*{re.escape(str(row.file))}", "the file", str(row.findings))
+        alike.setdefault(reason, []).append(row)
+    lines = []
+    for reason, rows in alike.items():
+        which = f"IMU {rows[0].imu} recording {rows[0].recording}, {rows[0].file}"
+        which += f", and {len(rows) - 1} more" if len(rows) > 1 else ""
+        lines.append(f"{which}: {reason}")
+    further = len(lines) - _NAMED
+    more = [f"and {further} other reasons, in the table of their quality"] if further > 0 else []
+    return lines[:_NAMED] + more

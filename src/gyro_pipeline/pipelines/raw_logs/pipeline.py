@@ -2,7 +2,7 @@
 
 from kedro.pipeline import Node, Pipeline
 
-from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs, require_enough
+from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs, label_recordings, quality_table
 
 
 def create_pipeline(sensor: str) -> Pipeline:
@@ -12,16 +12,23 @@ def create_pipeline(sensor: str) -> Pipeline:
         [
             Node(
                 inspect_logs,
-                [f"{stage}.files", "params:quality", "params:execution"],
-                [f"{stage}.inspected", f"{stage}.quality"],
+                [f"{stage}.files", f"{stage}.earlier", "params:quality", "params:execution"],
+                f"{stage}.inspected",
                 name=f"inspect_{sensor}",
                 namespace="raw_logs",
             ),
             Node(
-                require_enough,
-                [f"{stage}.inspected", f"{stage}.quality", "params:quality"],
+                quality_table,
+                [f"{stage}.files", f"{stage}.inspected"],
+                f"{stage}.quality",
+                name=f"quality_table_{sensor}",
+                namespace="raw_logs",
+            ),
+            Node(
+                label_recordings,
+                [f"{stage}.files", f"{stage}.inspected", f"{stage}.quality", "params:quality"],
                 f"{stage}.recordings",
-                name=f"require_enough_{sensor}",
+                name=f"label_{sensor}",
                 namespace="raw_logs",
             ),
         ]

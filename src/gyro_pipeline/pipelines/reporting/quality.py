@@ -41,7 +41,7 @@ def _of_sensor(table: pd.DataFrame) -> list[dict[str, Any]]:
             "Recording": f"all {len(table)}",
             "File": None,
             "Outcome": ", ".join(f"{counts[outcome]} {outcome}" for outcome in _WORST_FIRST[::-1]),
-            "Rows used": f"{used.min():.0f} of each" if len(used) else "none",
+            "Rows used": _range(used) if len(used) else "none",
             "Findings": f"in {len(noted)} recordings" if len(noted) else "none",
         }
     ]
@@ -50,6 +50,12 @@ def _of_sensor(table: pd.DataFrame) -> list[dict[str, Any]]:
         rest = {name: None for name in rows[0]} | {"Sensor": rows[0]["Sensor"]}
         rows.append(rest | {"Findings": f"in {len(noted) - _SHOWN} further recordings"})
     return rows
+
+
+def _range(rows: pd.Series) -> str:
+    """How many rows the shortest and the longest recording have."""
+    lowest, highest = f"{rows.min():.0f}", f"{rows.max():.0f}"
+    return f"{lowest} of each" if lowest == highest else f"{lowest} to {highest}"
 
 
 def _of_recording(row: pd.Series) -> dict[str, Any]:

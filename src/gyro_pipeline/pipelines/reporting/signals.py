@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gyro_pipeline.conventions import AXES, MDPS, TEST_IMU
 from gyro_pipeline.parameters import GroundTruth, Published
 from gyro_pipeline.physics.allan import FLICKER_FLOOR, SHORTEST_FIT_SAMPLES
-from gyro_pipeline.physics.bias import settling_time_s
+from gyro_pipeline.physics.bias import fill_masked, settling_time_s
 from gyro_pipeline.pipelines.reporting.style import CEILING, COLOURS, LOOK, share_legend
 from gyro_pipeline.pipelines.reporting.tables import source_name
 
@@ -106,8 +106,9 @@ def mg_convergence(recordings: xr.Dataset, bias: pd.DataFrame, ground_truth: Gro
     """
     one, rate_hz = _first(bias), recordings.attrs["rate_hz"]
     rates = recordings.angular_rate.sel(recording=one.recording).transpose("imu", "axis", "sample")
-    samples = rates.to_numpy().astype(np.float64).reshape(-1, rates.sizes["sample"])
-    samples = samples[~np.isnan(samples[:, 0])]
+    lengths = recordings["samples"].sel(recording=one.recording).to_numpy()
+    samples = rates.to_numpy()[lengths > 0, :, : lengths[lengths > 0].min()].astype(np.float64)
+    samples = fill_masked(samples.reshape(-1, samples.shape[-1]))
     centred = samples - samples.mean(axis=1, keepdims=True)
     counts = [count for count in _GYROSCOPES if count <= len(centred)]
     tolerance = ground_truth.tolerance_mdps
@@ -183,9 +184,10 @@ def allan_deviation(published: Published, **stored: Any) -> Figure:
 
 def _draw_allan(ax: Axes, allan: xr.Dataset, noise: pd.DataFrame) -> None:
     times_s = allan.time_s.to_numpy()
-    variance = allan.allan_variance.mean("recording").stack(gyroscope=("imu", "axis"))
-    for _, one in variance.groupby("gyroscope"):
-        deviation = np.sqrt(one.squeeze().to_numpy()) / MDPS
+    counts = allan.differences.fillna(0)
+    variance = allan.allan_variance.weighted(counts).mean("recording")
+    for one in variance.stack(gyroscope=("imu", "axis")).transpose("gyroscope", "time_s"):
+        deviation = np.sqrt(one.to_numpy()) / MDPS
         ax.plot(times_s, deviation, color=COLOURS[0], lw=0.7, alpha=0.6, label="each gyroscope")
     columns = ["white_dps_rts", "instability_dps", "random_walk_dps_per_rts"]
     squares = (noise[columns] ** 2).mean()
@@ -208,13 +210,16 @@ def _draw_allan(ax: Axes, allan: xr.Dataset, noise: pd.DataFrame) -> None:
 
 
 def _first(bias: pd.DataFrame) -> pd.Series:
-    """The first axis of IMU 1 in its first recording."""
-    return bias[(bias.imu == TEST_IMU) & (bias.axis == AXES[0])].sort_values("recording").iloc[0]
+    """The first axis of IMU 1, or of the first one there is, in its first recording."""
+    imu = TEST_IMU if (bias.imu == TEST_IMU).any() else bias.imu.min()
+    return bias[(bias.imu == imu) & (bias.axis == AXES[0])].sort_values("recording").iloc[0]
 
 
 def _samples(recordings: xr.Dataset, one: pd.Series) -> NDArray[np.float64]:
-    chosen = recordings.angular_rate.sel(imu=one.imu, recording=one.recording, axis=one.axis)
-    return chosen.to_numpy().astype(np.float64)
+    """All samples of its own length; masked ones are their mean."""
+    chosen = recordings.sel(imu=one.imu, recording=one.recording, axis=one.axis)
+    samples = chosen.angular_rate.to_numpy()[: int(chosen["samples"])]
+    return fill_masked(samples).astype(np.float64)
 
 
 def _running_mean(

@@ -425,11 +425,13 @@ def _hours(
     else:
         recordings = stored[f"{sensor}_recordings"]
         train, test = _counted(recordings, stored[f"{sensor}_roles"])
-    samples, used_hz = recordings.sizes["sample"], recordings.attrs["rate_hz"]
+    samples, used_hz = recordings["samples"].load(), recordings.attrs["rate_hz"]
     source = source_name(recordings.attrs["source"], bool(recordings.attrs["simulated"]))
-    counts = [int(part.sum()) for part in (train, test, train | test)]
-    hours = [count * samples / used_hz / _HOUR_S for count in counts]
-    fast, slow = (counts[2] * samples / rate / _HOUR_S for rate in reversed(rate_hz))
+    parts = (train, test, train | test)
+    counts = [int(part.sum()) for part in parts]
+    totals = [int((samples * part).sum()) for part in parts]
+    hours = [total / used_hz / _HOUR_S for total in totals]
+    fast, slow = (totals[2] / rate / _HOUR_S for rate in reversed(rate_hz))
     return {
         "Dataset": str(published.dataset),
         "Sensor": sensor,
@@ -437,7 +439,7 @@ def _hours(
         "Gyroscopes": int(train.any("recording").sum()),
         "Training recordings": counts[0],
         "Test recordings": counts[1],
-        "T s": round(samples / used_hz, 2),
+        "T s": round(float(samples.where(samples > 0).median()) / used_hz, 2),
         "Train h": round(hours[0], 2),
         "Test h": round(hours[1], 2),
         "Total h": round(hours[2], 2),
@@ -465,7 +467,8 @@ def _train_recordings(virtual: xr.Dataset, sensor: str) -> int:
 
 def _gyroscope_recordings(recordings: xr.Dataset) -> xr.DataArray:
     """Whether a gyroscope has a recording: (imu, recording, axis)."""
-    return recordings.angular_rate.isel(sample=0).notnull().load()
+    there = recordings["samples"].load() > 0
+    return there.expand_dims({"axis": recordings.axis.to_numpy()}).transpose("imu", "recording", "axis")
 
 
 def _counted(recordings: xr.Dataset, roles: pd.DataFrame) -> tuple[xr.DataArray, xr.DataArray]:

@@ -27,6 +27,8 @@ from gyro_pipeline.learning.examples import Device, with_shuffled_labels
 from gyro_pipeline.learning.jobs import TrainingJob
 from gyro_pipeline.learning.trainings import run_trainings
 from gyro_pipeline.parameters import Execution, Only, Splits, Study, Training, VirtualGyros
+from gyro_pipeline.protocol import windows
+from gyro_pipeline.protocol.recordings import present
 from gyro_pipeline.protocol.splits import check_devices, check_roles, refuse_two_roles, with_role
 from gyro_pipeline.protocol.windows import window_size
 from gyro_pipeline.studies import (
@@ -142,7 +144,7 @@ def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
 
 def training_code() -> list[str]:
     """What the results of a training depend on beside its settings and data."""
-    modules = [batched, examples, fused, jobs, network, packing, trainer, trainings]
+    modules = [batched, examples, fused, jobs, network, packing, trainer, trainings, windows]
     return [code_hash(modules), *(path.read_text() for path in fused.SOURCES)]
 
 
@@ -229,7 +231,7 @@ class Devices:
             InputError: If a recording would be used in two roles, be it by different IMUs.
         """
         samples, rate_hz = self._recordings.sizes["sample"], self._recordings.attrs["rate_hz"]
-        imus = tuple(range(TEST_IMU, TEST_IMU + cell.real_imus))
+        imus = tuple(self._recordings.imu.to_numpy()[: cell.real_imus].tolist())
         inputs = [imus] if cell.method == 1 else [(imu,) for imu in imus]
         devices = [self._real(side_by_side, cell.fold, TRAIN) for side_by_side in inputs]
         validation = self._real(inputs[0], cell.fold, VALIDATION)
@@ -252,10 +254,10 @@ class Devices:
         )
 
     def _real(self, imus: tuple[int, ...], fold: int, role: str) -> Device:
-        rates, numbers = self._recordings.angular_rate, with_role(self._roles, fold, role)
-        present = ~rates.isel(sample=0).sel(imu=list(imus)).isnull().any(["imu", "axis"])
-        with_data = set(rates.recording[present.to_numpy()].to_numpy().tolist())
-        return Device(rates, self._bias, imus, tuple(n for n in numbers if n in with_data))
+        numbers = with_role(self._roles, fold, role)
+        there = present(self._recordings).sel(imu=list(imus), recording=numbers).all("imu")
+        numbers = np.array(numbers)[there.to_numpy()].tolist()
+        return Device(self._recordings.angular_rate, self._bias, imus, tuple(numbers))
 
     def _virtual_imu(self, imu: int) -> Device:
         if self._virtual is None:
@@ -295,17 +297,18 @@ def check_cell(cell: Cell, recordings: xr.Dataset, training: Training) -> None:
 
 
 def check_present(cell: Cell, recordings: xr.Dataset) -> None:
-    """Refuse a recording that the test IMU, or one seen beside it, lacks.
+    """Refuse a recording that one of the IMUs that are seen side by side lacks.
 
     Raises:
         InputError: Naming the recording.
     """
-    side_by_side = recordings.imu <= (cell.real_imus if cell.method == 1 else TEST_IMU)
-    absent = recordings.angular_rate.isel(sample=0, imu=side_by_side.to_numpy()).isnull()
-    for number in recordings.recording[absent.any(["imu", "axis"]).to_numpy()].to_numpy():
+    if cell.method != 1 or cell.real_imus == 1:
+        return  # a recording that an IMU lacks is not used for it
+    there = present(recordings).isel(imu=slice(cell.real_imus))
+    for number in recordings.recording[~there.all("imu").to_numpy()].to_numpy():
         raise InputError(
-            f"{cell.sensor} recording {number}: expected IMUs 1 to {max(cell.real_imus, 1)} side "
-            f"by side for {cell.study} (method {cell.method}), not all are there"
+            f"{cell.sensor} recording {number}: expected {cell.real_imus} IMUs side by side for "
+            f"{cell.study} (method 1), not all are there"
         )
 
 

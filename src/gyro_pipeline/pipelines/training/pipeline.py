@@ -18,7 +18,7 @@ def create_pipeline(study: str, sensor: str, virtual: bool, roles: str = "roles"
     """
     stage = f"{study}.{sensor}.training"
     data = {
-        "recordings": f"{sensor}.raw_logs.recordings",
+        "recordings": f"{sensor}.windowed_splits.recordings",
         "roles": f"{sensor}.windowed_splits.{roles}",
         "training": "params:training",
     }
@@ -45,7 +45,7 @@ def create_pipeline(study: str, sensor: str, virtual: bool, roles: str = "roles"
                 | {
                     "cells": f"{stage}.cells",
                     "tracked": f"{sensor}.training.tracked",
-                    "bias": f"{sensor}.ground_truth.bias",
+                    "bias": f"{sensor}.windowed_splits.bias",
                     "splits": "params:splits",
                     "virtual_gyros": "params:virtual_gyros",
                     "execution": "params:execution",
@@ -62,7 +62,7 @@ def create_leakage_pipeline(sensor: str) -> Pipeline:
     """Trainings of the leak study on one sensor."""
     stage = f"{LEAKAGE}.{sensor}.training"
     settings = {name: f"params:{name}" for name in ("leakage", "training", "splits")}
-    data = {"recordings": f"{sensor}.raw_logs.recordings"} | settings
+    data = {"recordings": f"{sensor}.windowed_splits.recordings"} | settings
     return Pipeline(
         [
             Node(
@@ -78,7 +78,7 @@ def create_leakage_pipeline(sensor: str) -> Pipeline:
                 | {
                     "cells": f"{stage}.cells",
                     "tracked": f"{sensor}.training.tracked",
-                    "bias": f"{sensor}.ground_truth.bias",
+                    "bias": f"{sensor}.windowed_splits.bias",
                     "execution": "params:execution",
                 },
                 f"{stage}.runs",

@@ -22,7 +22,7 @@ def synthesise(
     white noise of the real gyroscopes' sample sigma around it, in every recording.
 
     Args:
-        recordings: The real ones, for their rate and length.
+        recordings: The real ones, for their rate and length, which all have.
         bias: Their ground truth; only training recordings are used.
         roles: Which recordings train.
         virtual_gyros: Counts, turn-on jitter and seed.
@@ -55,6 +55,7 @@ def synthesise(
     return xr.Dataset(
         {
             "angular_rate": (DIMENSIONS, samples),
+            "samples": (DIMENSIONS[:2], np.full(shape[:2], samples.shape[-1])),
             "recording_mean": (DIMENSIONS[:-1], recording_mean(samples)),
         },
         coords=labels | {"axis": list(AXES)},

@@ -12,8 +12,8 @@ def create_pipeline(sensor: str) -> Pipeline:
             Node(
                 synthesise,
                 [
-                    f"{sensor}.raw_logs.recordings",
-                    f"{sensor}.ground_truth.bias",
+                    f"{sensor}.windowed_splits.recordings",
+                    f"{sensor}.windowed_splits.bias",
                     f"{sensor}.windowed_splits.roles",
                     "params:virtual_gyros",
                 ],
