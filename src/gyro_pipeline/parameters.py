@@ -170,7 +170,7 @@ class ReaderOptions(Parameter):
     repeats: Literal["drop"] | None = Field(
         None, description="drop: rows whose rates are those of the row before are no samples"
     )
-    topic: str | None = Field(None, description="of a log with several (ulg, bin, bag)")
+    topic: str | None = Field(None, description="of a flight log or a bag, that with the rates")
     instance: int | None = Field(None, ge=0, description="of several sensors in such a log, from 0")
     columns: Triple | dict[int, Triple] | None = Field(
         None, description="of the angular rates about x, y, z; or these of each IMU, by number"
@@ -203,12 +203,6 @@ class ReaderOptions(Parameter):
     counter_column: Column | None = Field(None, description="counts packets, one a row")
     counter_bits: int | None = Field(
         None, ge=2, le=32, description="it starts anew after 2 to this; null: the format's, or 16"
-    )
-    topic: str | None = Field(
-        None, description="of a flight log or a bag, the message or topic with the angular rates"
-    )
-    instance: int | None = Field(
-        None, ge=0, description="of a flight log, the number of the device among those of a topic"
     )
     rate_tolerance_pct: float = Field(
         2.0, gt=0, description="that a measured sample rate may differ from the expected one"

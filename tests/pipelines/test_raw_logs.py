@@ -14,7 +14,7 @@ from gyro_pipeline.parameters import Execution
 from gyro_pipeline.pipelines.raw_logs import nodes
 from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs, require_enough
 from gyro_pipeline.protocol import inspection
-from gyro_pipeline.protocol.quality import Inspected
+from gyro_pipeline.quality import Inspected
 
 RATE_HZ, SAMPLES = 100.0, 2000
 PAIR = Execution(executor="processes", workers=2)

@@ -88,7 +88,7 @@ class FileLogs(LogSource):
                 matches, or two files of one recording.
         """
         places = self._places(self._matching())
-        settings = [self._options.model_dump(mode="json"), self.entry.rate_hz]
+        settings: list[Any] = [self._options.model_dump(mode="json"), self.entry.rate_hz]
         settings.append(package_hash(readers))
         entries = [
             self._listed(name, imu, recording, settings)
