@@ -100,6 +100,8 @@ def test_a_rate_above_the_header_is_compared_with_the_measured_one(preamble, out
     log = read(f"time (s),{RATES}", S, X, preamble=preamble)
     found = [finding for finding in log.findings if finding.check == "stated rate"]
     assert tuple(finding.outcome for finding in found) == outcome
+    trusted = read(f"time (s),{RATES}", S, X, preamble=preamble, trust="options")
+    assert {finding.outcome for finding in trusted.findings} <= {"kept"}
     if not outcome:
         assert not read(RATES, X, preamble=preamble, rate_hz=100).findings[1:]
 

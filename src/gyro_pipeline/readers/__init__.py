@@ -80,7 +80,8 @@ def log_of(
     overruled = _settled(file)
     counted = _counted(file, counter, keep)
     celsius = temperature.read(table, keep)
-    compared = _compared(timing.rate_hz, expected_rate_hz, table.preamble, options)
+    stated_in = table.preamble if keep.all() else ""  # of the file's rows, not of the samples
+    compared = _compared(timing.rate_hz, expected_rate_hz, stated_in, options)
     return Log(
         samples=values,
         rate_hz=timing.rate_hz,
@@ -153,12 +154,11 @@ def _rate_of_increments(file: File, rate_hz: float | None) -> float:
 
 def _contradict_by_values(file: File, raw: Floats, rates: Floats, raw_counts: bool) -> None:
     """Values that no gyroscope at rest gives, unless the options explain them."""
-    if file.options.offset is not None or file.options.signed_bits is not None:
-        return
+    from_zero, of_sign = file.options.offset is not None, file.options.signed_bits is not None
     for text in (
-        counts.wrapped(raw),
+        "" if from_zero or of_sign else counts.wrapped(raw),
         "" if raw_counts else counts.lost_decimal_points(raw),
-        counts.implausible_level(rates),
+        "" if from_zero else counts.implausible_level(rates),
     ):
         if text:
             file.contradictions.append(text)
@@ -189,7 +189,7 @@ def _counted(file: File, counter: tuple[int, int] | None, keep: Mask) -> Timing:
 
 _STATED_RATE = re.compile(
     r"(?i)\b(?:(?:sampl\w*|output|update|data)[ _-]?(?:rate|freq\w*)|odr|fs)\b"
-    r"[^\w\n]*(?:hz)?[^\w\n.]*(\d+(?:\.\d+)?)[ ]*(k?)(?:hz|\s|$|[,;\"])"
+    r"[^\w\n]{0,20}(?:hz)?[^\w\n.]{0,20}(\d+(?:\.\d+)?)[ ]{0,3}(k?)(?:hz|\s|$|[,;\"])"
 )
 
 
@@ -206,8 +206,8 @@ def _compared(
     if stated_hz and other_hz and check_rate(other_hz, stated_hz, options.rate_tolerance_pct):
         what = "measured" if rate_hz else "expected"
         text = (
-            f"lines above the header state {stated_hz:g} Hz, {what} is {other_hz:.6g} Hz; check "
-            f"time_units {IN_READER}"
+            f"lines above the header state {stated_hz:g} Hz, {what} is {other_hz:.6g} Hz; give "
+            f"time_units, or, if it is right, trust: options {IN_READER}"
         )
-        findings.append(Finding("stated rate", REJECTED, text))
+        findings.append(Finding("stated rate", KEPT if options.trust else REJECTED, text))
     return findings

@@ -30,6 +30,7 @@ _BRACKETS = re.compile(r"\s*[(\[]((?:[^()\[\]]|[(\[][^()\[\]]*[)\]])*)[)\]]")
 _BEHIND = re.compile(r"(?!.*\b(?:per|times|in|over|sqrt|integrated|squared)\b)[a-zA-Z_ ]*")
 _ARRAY = re.compile(r"\.[xyz]$", re.IGNORECASE)
 _INDEX = re.compile(r"[\[.](\d+)\]?$")
+_LONGEST = 200  # characters of a name that is looked into
 _CLOCK_UNITS = {1.0, 1e-3, 1e-6, 1e-9, 60.0, 3600.0}
 _BROWSER = {"alpha": "z", "beta": "x", "gamma": "y"}
 """Axes of a browser's ``rotationRate``. Source: W3C DeviceOrientation Event Specification, 2016."""
@@ -72,6 +73,8 @@ def read_header(header: str) -> Header:
 
     A unit is in brackets, or behind a separator, or it is all of the header.
     """
+    if len(header) > _LONGEST:
+        return Header(header, "", None)
     array = match[0] if (match := _ARRAY.search(header)) else ""
     text = header.removesuffix(array)
     brackets = [m for m in _BRACKETS.finditer(text) if not re.fullmatch(r"\d*|[xyzXYZ]", m[1])]
@@ -106,7 +109,7 @@ def triples(headers: Sequence[Header]) -> list[tuple[int, ...]]:
     """
     groups: dict[str, dict[str, list[int]]] = {}
     for number, header in enumerate(headers):
-        for stem, axis in _axes_in(header.name):
+        for stem, axis in _axes_in(header.name) if len(header.name) <= _LONGEST else ():
             groups.setdefault(stem, {}).setdefault(axis, []).append(number)
     return [
         triple
