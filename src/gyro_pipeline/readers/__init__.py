@@ -20,7 +20,7 @@ from gyro_pipeline.readers.beside import acceleration_of, counter_of, named_cels
 from gyro_pipeline.readers.clock import Timing, check_rate, from_counter
 from gyro_pipeline.readers.columns import rate_columns
 from gyro_pipeline.readers.formats import FORMATS, check_format, format_of
-from gyro_pipeline.readers.names import File, read_header
+from gyro_pipeline.readers.names import File, read_header, triples
 from gyro_pipeline.readers.scales import scale_of
 from gyro_pipeline.readers.stamps import names_time, timing_of
 from gyro_pipeline.readers.table import IN_READER, Table, read_table
@@ -167,8 +167,10 @@ def _contradict_by_values(file: File, raw: Floats, rates: Floats, raw_counts: bo
 
 def _contradict_by_turns(file: File, used: set[int], keep: Mask, rates: Floats) -> None:
     """Columns that nobody asked for and that say what a row is."""
+    of_axes = {number for triple in triples(file.headers) for number in triple}
     for number, header in enumerate(file.headers):
-        measures = header.quantity or header.has_unit or named_celsius(header)[0]
+        named = number in of_axes and header.quantity
+        measures = named or header.has_unit or named_celsius(header)[0]
         is_number = file.table.columns[number].dtype.kind == "f"
         if number in used or (is_number and (measures or names_time(header))):
             continue
