@@ -157,12 +157,12 @@ class ReaderOptions(Parameter):
     trust: Literal["options"] | None = Field(
         None, description="options: these options overrule what the file says of itself"
     )
-    encoding: str | None = Field(None, description="of a text; null: told")
-    delimiter: str | None = Field(None, min_length=1, description="of a text's fields; null: told")
+    encoding: str | None = Field(None, description="of a text; null: UTF-8 or UTF-16")
+    delimiter: str | None = Field(
+        None, min_length=1, max_length=1, description="of a text; a blank: runs of them; null: told"
+    )
     row: str | None = Field(
-        None,
-        description="regular expression of a line that holds a sample, with a named group for each "
-        "column; other lines are skipped",
+        None, description="expression with named groups; each line that it matches is a row"
     )
     rows: dict[Column, str | float] = Field(
         {}, description="only rows with these values in these columns, such as {sensor: 1}"
@@ -216,16 +216,6 @@ class ReaderOptions(Parameter):
         quantity = "time" if info.field_name == "time_units" else "acceleration"
         if isinstance(value, str):
             _check_unit(str(info.field_name), value, quantity)
-        return value
-
-    @field_validator("row")
-    @classmethod
-    def _an_expression_has_named_groups(cls, value: str | None) -> str | None:
-        try:
-            if value is not None and not re.compile(value).groupindex:
-                raise ValueError(f"row: expected named groups such as (?P<gx>…), got {value}")
-        except re.error as error:
-            raise ValueError(f"row: expected a regular expression, got {value}: {error}") from error
         return value
 
     @model_validator(mode="after")

@@ -81,10 +81,9 @@ def read_unit(text: str) -> Unit | None:
     """
     expression = _spelled_for_pint(text)
     written, small = _parsed(expression), _parsed(expression.lower())
-    # DPS, Deg/Sec, °/S; as written where that says something, for mG is not mg
-    unclear = written is None or (
-        written.quantity == "other" and small and small.quantity == "rate"
-    )
+    # DPS, Deg/Sec, MS; as written where that says something else, for mG is not mg
+    small_is_usual = small is not None and small.quantity in ("rate", "time")
+    unclear = written is None or (written.quantity == "other" and small_is_usual)
     return small if unclear else written
 
 

@@ -17,6 +17,9 @@ def test_signed_counts_that_were_written_as_unsigned_ones(bits, bias):
     counts = np.round(still(bias=bias) / RAW["scale_dps"])
     with pytest.raises(InputError, match=f"if they are signed counts.*signed_bits: {bits};.*trust"):
         read("gx,gy,gz", counts % 2**bits, **RAW)
+    damaged = counts % 2**bits
+    damaged[[10, 20, 30]] = [[-1, 5, 5], [1e12, 5, 5], [0.5, 0.5, 0.5]]
+    assert f"signed_bits: {bits}" in wrapped(damaged)
     log = read("gx,gy,gz", counts % 2**bits, signed_bits=bits, **RAW)
     np.testing.assert_allclose(log.samples, counts * RAW["scale_dps"])
     assert read("gx,gy,gz", counts, **RAW).samples.shape == (6000, 3)

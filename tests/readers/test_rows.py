@@ -24,7 +24,7 @@ def devices(numbers):
     return np.random.default_rng(0).normal(BIASES[numbers], 0.05)
 
 
-@pytest.mark.parametrize("name", ["sensor", "k", ""])
+@pytest.mark.parametrize("name", ["sensor", "k", "gyro", ""])
 @pytest.mark.parametrize(
     "numbers",
     [

@@ -20,7 +20,7 @@ from gyro_pipeline.readers.beside import acceleration_of, counter_of, named_cels
 from gyro_pipeline.readers.clock import Timing, check_rate, from_counter
 from gyro_pipeline.readers.columns import rate_columns
 from gyro_pipeline.readers.formats import FORMATS, check_format, format_of
-from gyro_pipeline.readers.names import File, read_header
+from gyro_pipeline.readers.names import File, read_header, triples
 from gyro_pipeline.readers.scales import scale_of
 from gyro_pipeline.readers.stamps import names_time, timing_of
 from gyro_pipeline.readers.table import IN_READER, Table, read_table
@@ -69,33 +69,25 @@ def log_of(
     raw = _stacked(file, columns)
     keep = _samples(file, raw)
     timing = timing_of(file, keep)
-    values = _from_zero(file, raw[keep]) * scale
-    if options.increments:
-        values *= _rate_of_increments(file, timing.rate_hz or expected_rate_hz)
+    rates = _in_dps(file, raw[keep], scale, timing.rate_hz or expected_rate_hz)
     temperature, acceleration = temperature_of(file), acceleration_of(file, columns)
     counter = counter_of(file)
     used = {*columns, *temperature.columns, *acceleration.columns, *(counter or ())[:1]}
-    _contradict_by_values(file, raw[keep], values, raw_counts)
-    _contradict_by_turns(file, used, keep, values)
+    _contradict_by_values(file, raw[keep], rates, raw_counts)
+    _contradict_by_turns(file, used, keep, rates)
     overruled = _settled(file)
     counted = _counted(file, counter, keep)
+    compared = _compared(file, timing.rate_hz, expected_rate_hz, keep)
     celsius = temperature.read(table, keep)
-    compared = _compared(timing.rate_hz, expected_rate_hz, table.preamble, options)
+    findings = *table.findings, *file.findings, *overruled, *timing.findings, *counted.findings
     return Log(
-        samples=values,
+        samples=rates,
         rate_hz=timing.rate_hz,
         gap_rows=np.union1d(timing.gap_rows, counted.gap_rows).astype(np.intp),
         temperature_c=None if celsius is None else celsius[:, 0],
         acceleration_g=acceleration.read(table, keep),
         rows=None if keep.all() else np.flatnonzero(keep),
-        findings=(
-            *table.findings,
-            *file.findings,
-            *overruled,
-            *timing.findings,
-            *counted.findings,
-            *compared,
-        ),
+        findings=(*findings, *compared),
     )
 
 
@@ -135,30 +127,27 @@ def _samples(file: File, raw: Floats) -> Mask:
     return keep
 
 
-def _from_zero(file: File, raw: Floats) -> Floats:
-    """The file's numbers; signed, and from the offset, where the options say so."""
+def _in_dps(file: File, raw: Floats, scale: float, rate_hz: float | None) -> Floats:
+    """Rates of the file's numbers; of increments, the angle of a sample over its step."""
     options = file.options
     if options.signed_bits is not None:
         raw = counts.signed(raw, options.signed_bits, file.table.where)
-    return raw - (options.offset or 0.0)
-
-
-def _rate_of_increments(file: File, rate_hz: float | None) -> float:
-    """The rate that divides the angle of a sample by its step."""
+    rates = (raw - (options.offset or 0.0)) * scale
+    if not options.increments:
+        return rates
     if rate_hz is None:
         text = "increments: true: the step between samples is not known; give time_column"
         raise file.refusal(text)
-    return rate_hz
+    return rates * rate_hz
 
 
 def _contradict_by_values(file: File, raw: Floats, rates: Floats, raw_counts: bool) -> None:
     """Values that no gyroscope at rest gives, unless the options explain them."""
-    if file.options.offset is not None or file.options.signed_bits is not None:
-        return
+    from_zero, of_sign = file.options.offset is not None, file.options.signed_bits is not None
     for text in (
-        counts.wrapped(raw),
+        "" if from_zero or of_sign else counts.wrapped(raw),
         "" if raw_counts else counts.lost_decimal_points(raw),
-        counts.implausible_level(rates),
+        "" if from_zero else counts.implausible_level(rates),
     ):
         if text:
             file.contradictions.append(text)
@@ -167,8 +156,10 @@ def _contradict_by_values(file: File, raw: Floats, rates: Floats, raw_counts: bo
 
 def _contradict_by_turns(file: File, used: set[int], keep: Mask, rates: Floats) -> None:
     """Columns that nobody asked for and that say what a row is."""
+    of_axes = {number for triple in triples(file.headers) for number in triple}
     for number, header in enumerate(file.headers):
-        measures = header.quantity or header.has_unit or named_celsius(header)[0]
+        named = number in of_axes and header.quantity
+        measures = named or header.has_unit or named_celsius(header)[0]
         is_number = file.table.columns[number].dtype.kind == "f"
         if number in used or (is_number and (measures or names_time(header))):
             continue
@@ -189,25 +180,27 @@ def _counted(file: File, counter: tuple[int, int] | None, keep: Mask) -> Timing:
 
 _STATED_RATE = re.compile(
     r"(?i)\b(?:(?:sampl\w*|output|update|data)[ _-]?(?:rate|freq\w*)|odr|fs)\b"
-    r"[^\w\n]*(?:hz)?[^\w\n.]*(\d+(?:\.\d+)?)[ ]*(k?)(?:hz|\s|$|[,;\"])"
+    r"[^\w\n]{0,20}(?:hz)?[^\w\n.]{0,20}(\d+(?:\.\d+)?)[ ]{0,3}(k?)(?:hz|\s|$|[,;\"])"
 )
 
 
 def _compared(
-    rate_hz: float | None, expected_hz: float | None, preamble: str, options: ReaderOptions
+    file: File, rate_hz: float | None, expected_hz: float | None, keep: Mask
 ) -> list[Finding]:
     """The measured rate with the expected one, and with that of the lines above the header."""
     findings: list[Finding] = []
+    tolerance_pct = file.options.rate_tolerance_pct
     if rate_hz is not None and expected_hz is not None:
-        findings += check_rate(rate_hz, expected_hz, options.rate_tolerance_pct)
-    match = _STATED_RATE.search(preamble)
+        findings += check_rate(rate_hz, expected_hz, tolerance_pct)
+    # it is stated of the file's rows, not of those that are left of them
+    match = _STATED_RATE.search(file.table.preamble) if keep.all() else None
     stated_hz = float(match[1]) * (1e3 if match[2] else 1) if match else 0.0
     other_hz = rate_hz or expected_hz
-    if stated_hz and other_hz and check_rate(other_hz, stated_hz, options.rate_tolerance_pct):
+    if stated_hz and other_hz and check_rate(other_hz, stated_hz, tolerance_pct):
         what = "measured" if rate_hz else "expected"
         text = (
-            f"lines above the header state {stated_hz:g} Hz, {what} is {other_hz:.6g} Hz; check "
-            f"time_units {IN_READER}"
+            f"lines above the header state {stated_hz:g} Hz, {what} is {other_hz:.6g} Hz; give "
+            f"time_units, or, if it is right, trust: options {IN_READER}"
         )
-        findings.append(Finding("stated rate", REJECTED, text))
+        findings.append(Finding("stated rate", KEPT if file.options.trust else REJECTED, text))
     return findings

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from gyro_pipeline.conventions import AXES, InputError
 from gyro_pipeline.parameters import Column
 from gyro_pipeline.readers.formats import BIAS_TAKEN_OFF, find_all
-from gyro_pipeline.readers.names import RATE, File, samples_a_row, triples
+from gyro_pipeline.readers.names import ATTITUDE, RATE, File, Header, samples_a_row, triples
 from gyro_pipeline.readers.scales import RATE_UNITS
 
 Columns = Sequence[int]
@@ -52,13 +52,21 @@ def _given(file: File, given: Sequence[Column]) -> Columns:
             f"columns of the options are {file.listed(rates)}, but by their names "
             f"{file.listed((same or others)[0])} belong {together}; give these, or no columns"
         )
-    strange = [n for n in rates if file.headers[n].quantity not in ("", RATE)]
-    if strange and not file.options.increments:
+    strange = [n for n in rates if not _may_be_rate(file, file.headers[n])]
+    if strange:
         file.contradictions.append(
             f"columns of the options name {file.listed(strange)}, by name no angular rate; give "
             "columns of angular rates"
         )
     return rates
+
+
+def _may_be_rate(file: File, header: Header) -> bool:
+    """Whether a name allows it; that of an angle does, of increments or with a unit of rates."""
+    of_angle = header.quantity == ATTITUDE
+    return header.quantity in ("", RATE) or (
+        of_angle and (file.options.increments or header.measures("rate"))
+    )
 
 
 def _named(file: File) -> Columns:

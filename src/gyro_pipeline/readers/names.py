@@ -30,9 +30,14 @@ _BRACKETS = re.compile(r"\s*[(\[]((?:[^()\[\]]|[(\[][^()\[\]]*[)\]])*)[)\]]")
 _BEHIND = re.compile(r"(?!.*\b(?:per|times|in|over|sqrt|integrated|squared)\b)[a-zA-Z_ ]*")
 _ARRAY = re.compile(r"\.[xyz]$", re.IGNORECASE)
 _INDEX = re.compile(r"[\[.](\d+)\]?$")
+_LONGEST = 200  # characters of a name that is looked into
 _CLOCK_UNITS = {1.0, 1e-3, 1e-6, 1e-9, 60.0, 3600.0}
-_BROWSER = {"alpha": "z", "beta": "x", "gamma": "y"}
-"""Axes of a browser's ``rotationRate``. Source: W3C DeviceOrientation Event Specification, 2016."""
+_AXES = [
+    {axis: axis for axis in AXES},
+    {"alpha": "z", "beta": "x", "gamma": "y"},  # W3C DeviceOrientation Event Specification, 2016
+    {"roll": "x", "pitch": "y", "yaw": "z"},
+]
+"""Words for the axes."""
 
 
 class Header(NamedTuple):
@@ -44,16 +49,13 @@ class Header(NamedTuple):
 
     @property
     def quantity(self) -> str:
-        """``rate``, ``attitude``, ``other``, or an empty text, by the words of the name.
-
-        An angle or a velocity in a unit of angular rate is named by half: an empty text.
-        """
+        """``rate``, ``attitude``, ``other``, or an empty text, by the words of the name."""
         words = [w.lower() for w in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", self.name)]
         stems = {*words, *(w[:-1] for w in words if w[-1] in AXES)}
         stems |= {w[1:] for w in words if w[0] in AXES}
         for quantity, pattern in _QUANTITIES.items():
             if any(re.fullmatch(pattern, stem) for stem in stems):
-                return "" if quantity == ATTITUDE and self.measures("rate") else quantity
+                return quantity
         letters = re.search(r"\b(a|ac|m|q|f|v|g|w) ?[xyz]\b", " ".join(words))
         return _LETTERS.get(letters[1], OTHER) if letters else ""
 
@@ -72,6 +74,8 @@ def read_header(header: str) -> Header:
 
     A unit is in brackets, or behind a separator, or it is all of the header.
     """
+    if len(header) > _LONGEST:
+        return Header(header, "", None)
     array = match[0] if (match := _ARRAY.search(header)) else ""
     text = header.removesuffix(array)
     brackets = [m for m in _BRACKETS.finditer(text) if not re.fullmatch(r"\d*|[xyzXYZ]", m[1])]
@@ -102,11 +106,11 @@ def _stands_without_brackets(unit: Unit, text: str, alone: bool) -> bool:
 def triples(headers: Sequence[Header]) -> list[tuple[int, ...]]:
     """Numbers of columns (x, y, z) whose names differ in nothing but the axis.
 
-    Axes are x, y, z, a browser's alpha, beta, gamma, or [0], [1], [2].
+    Axes are x, y, z, a browser's alpha, beta, gamma, roll, pitch, yaw, or [0], [1], [2].
     """
     groups: dict[str, dict[str, list[int]]] = {}
     for number, header in enumerate(headers):
-        for stem, axis in _axes_in(header.name):
+        for stem, axis in _axes_in(header.name) if len(header.name) <= _LONGEST else ():
             groups.setdefault(stem, {}).setdefault(axis, []).append(number)
     return [
         triple
@@ -118,10 +122,9 @@ def triples(headers: Sequence[Header]) -> list[tuple[int, ...]]:
 
 def _axes_in(name: str) -> Iterator[tuple[str, str]]:
     """Each way in which a name names an axis: the name without it, and the axis."""
-    for match in re.finditer("[xyz]|alpha|beta|gamma", name.lower()):
-        star = "*" * min(len(match[0]), 2)  # of one kind or the other
-        axis = _BROWSER.get(match[0], match[0])
-        yield f"{name[: match.start()]}{star}{name[match.end() :]}", axis
+    for kind, words in enumerate(_AXES):
+        for match in re.finditer("|".join(words), name.lower()):
+            yield f"{name[: match.start()]}*{kind}{name[match.end() :]}", words[match[0]]
     if index := _INDEX.search(name):
         number = int(index[1])
         yield f"{name[: index.start()]}[*]", AXES[number] if number < len(AXES) else index[1]

@@ -107,7 +107,7 @@ def takes_turns(table: Table, number: int, keep: Mask, rates: Floats, most_value
     evidence = _evidence(name, [_as_text(value) for value in values], codes, rates)
     if not evidence:
         return ""
-    pick = f"{{{name or number}: {_as_text(values[0])}}}"
+    pick = f"{{{name or number}: {next(filter(None, map(_as_text, values)))}}}"
     return (
         f"{name or f'column {number}'!r} takes turns among {_counted(column[keep])}, {evidence}, "
         f"but a recording is of one device; pick its rows, such as rows: {pick}"

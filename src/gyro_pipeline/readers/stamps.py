@@ -6,6 +6,7 @@ What is not known of the time is said in one finding.
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from math import isclose
 from typing import NamedTuple
 
 import numpy as np
@@ -28,19 +29,22 @@ _DURATION = re.compile(
 _STEPS = re.compile(r"dt\b|delta|step|interval|period")
 
 
+Floats = NDArray[np.float64]
+
+
 class Candidate(NamedTuple):
     """A column that may be one of times.
 
     Attributes:
         number: Of the column.
         said_s, asked_s: Its unit in seconds, by the file and by the options.
-        only_steps: Whether its name allows nothing but the time since the last row.
+        named: Whether its name allows it; if not, its unit does, and its values must increase.
     """
 
     number: int
     said_s: float | None
     asked_s: float | None
-    only_steps: bool = False
+    named: bool = True
 
 
 def names_time(header: Header) -> bool:
@@ -58,21 +62,22 @@ def timing_of(file: File, keep: NDArray[np.bool_]) -> Timing:
     """
     steps, options = [], file.options
     for candidate in _candidates(file):
-        stamps = _stamps(file, candidate, keep)
+        stamps = _stamps(file, candidate, len(keep))
         if stamps is None:
             continue
+        name = file.listed([candidate.number])
         stepwise = are_steps(stamps)
-        if options.time_is == "steps" and (stepwise or options.time_column is not None):
-            stamps = np.cumsum(np.nan_to_num(stamps))
-        elif stepwise:
-            name = file.listed([candidate.number])
+        if stepwise and not (candidate.named or _STEPS.search(name.lower())):
+            continue
+        if stepwise and options.time_is is None:
             steps.append(f"{name} holds the time since the last row; give time_is: steps")
             continue
-        elif candidate.only_steps or options.time_is == "steps":
-            continue
-        known = stamps[np.isfinite(stamps)]
-        if len(known) >= len(stamps) / 2 and known[-1] > known[0]:
-            return _measured(file, candidate, stamps)
+        if options.time_is == "steps":
+            if not (stepwise or options.time_column):
+                continue
+            stamps = np.cumsum(np.nan_to_num(stamps))  # of all rows, also of those left out
+        if _increase(stamps[keep], 0.0 if candidate.named else 0.95):
+            return _measured(file, candidate, stamps[keep])
     if options.time_column is not None:
         problem = steps or [f"{options.time_column!r} holds no times that can be read"]
         raise file.refusal(f"{problem[0]}, or correct time_column")
@@ -80,46 +85,51 @@ def timing_of(file: File, keep: NDArray[np.bool_]) -> Timing:
     return Timing(findings=(Finding("timestamps", KEPT, text),))
 
 
+def _increase(stamps: Floats, share: float) -> bool:
+    """Whether most stamps (n,) are there and increase, in more than a share of the rows."""
+    known = stamps[np.isfinite(stamps)]
+    if len(known) < max(len(stamps) / 2, 2) or known[-1] <= known[0]:
+        return False
+    return bool((np.diff(known) >= 0).mean() > share)
+
+
 def _candidates(file: File) -> Sequence[Candidate]:
-    """Columns that may be of times: those that say their unit or are no numbers come first."""
+    """Columns that may be of times; the first are those whose unit is known, or that are texts."""
     units, form = file.options.time_units, file.form
     asked_s = (read_unit(units) or Unit("time")).factor if isinstance(units, str) else units
-    if file.options.time_column is not None:
-        number = file.find(file.options.time_column)
-        return [Candidate(number, _said_s(file.headers[number]), asked_s)]
-    first: list[Candidate] = []
-    later: list[Candidate] = []
-    steps: list[Candidate] = []
+    by_format: dict[int, float | None] = {}
     for name, unit_s in form.times if form else ():
         scale = above_header(file.table.preamble, form.time_scale) if form else 1.0
-        numbers = find_all(file.table, name)
-        first += [Candidate(n, unit_s and unit_s * scale, asked_s) for n in numbers]
-    for number, header in enumerate(file.headers):
-        is_text = file.table.columns[number].dtype.kind != "f"
-        candidate = Candidate(number, _said_s(header), asked_s)
-        if is_text or names_time(header):
-            (first if is_text or candidate.said_s or asked_s else later).append(candidate)
-        elif candidate.said_s and _STEPS.search(header.name.lower()):
-            steps.append(candidate._replace(only_steps=True))
-    return [*first, *later, *steps]
+        by_format |= {n: unit_s and unit_s * scale for n in find_all(file.table, name)}
+    order = [*by_format, *(n for n in range(len(file.headers)) if n not in by_format)]
+    asked = file.options.time_column
+    ranked = []
+    for number in order if asked is None else [file.find(asked)]:
+        header = file.headers[number]
+        name, is_text = header.name.lower(), file.table.columns[number].dtype.kind != "f"
+        said_s = header.unit.factor if header.unit and header.measures("time") else None
+        said_s = said_s or by_format.get(number)
+        named = is_text or asked is not None or number in by_format or names_time(header)
+        differs = bool(said_s and asked_s and not _same(said_s, asked_s)) and not is_text
+        rank = 2 if differs else 0 if is_text or said_s or asked_s else 1
+        if named or (said_s and (_STEPS.search(name) or not _DURATION.search(name))):
+            ranked.append((rank if named else 3, Candidate(number, said_s, asked_s, named)))
+    return [candidate for _, candidate in sorted(ranked, key=lambda pair: pair[0])]
 
 
-def _said_s(header: Header) -> float | None:
-    return header.unit.factor if header.unit and header.measures("time") else None
+def _same(one_s: float, other_s: float) -> bool:
+    return isclose(one_s, other_s, rel_tol=1e-9)
 
 
-def _stamps(
-    file: File, candidate: Candidate, keep: NDArray[np.bool_]
-) -> NDArray[np.float64] | None:
-    """Times, (n,), numbers in the column's own unit, others in seconds."""
+def _stamps(file: File, candidate: Candidate, count: int) -> Floats | None:
+    """Times (count,), numbers in the column's own unit, others in seconds."""
     values = file.table.columns[candidate.number]
-    if len(values) != len(keep):
+    if len(values) != count:
         return None
-    times = values if values.dtype.kind == "f" else seconds(values, None)
-    return None if times is None else np.asarray(times, np.float64)[keep]
+    return values if values.dtype.kind == "f" else seconds(values, None)
 
 
-def _measured(file: File, candidate: Candidate, stamps: NDArray[np.float64]) -> Timing:
+def _measured(file: File, candidate: Candidate, stamps: Floats) -> Timing:
     """Rate and gaps; the unit of the options contradicts another one of the file."""
     said_s, asked_s = candidate.said_s, candidate.asked_s
     if file.table.columns[candidate.number].dtype.kind != "f":
@@ -131,7 +141,7 @@ def _measured(file: File, candidate: Candidate, stamps: NDArray[np.float64]) -> 
         if file.options.time_column is not None:
             raise file.refusal(text)
         return replace(timing, findings=(*timing.findings, Finding("timestamps", KEPT, text)))
-    if asked_s and said_s and timing.rate_hz and not np.isclose(asked_s, said_s, 1e-9, 0):
+    if asked_s and said_s and timing.rate_hz and not _same(asked_s, said_s):
         said_hz = timing.rate_hz * asked_s / said_s
         file.contradictions.append(
             f"{name} has a unit of {said_s:g} s, which makes {said_hz:.6g} Hz, but time_units of "
