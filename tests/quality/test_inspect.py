@@ -250,6 +250,14 @@ def test_the_short_recordings_of_the_smoke_environment_are_kept(parameters):
             assert inspect(Log(rates + BIAS), sensor.rate_hz, p.quality).outcome == KEPT
 
 
+def test_a_bias_that_wanders_slowly_is_at_rest_and_said(quality):
+    rates = np.random.default_rng(1).normal(BIAS, 0.02, (36_000, 3))
+    rates[:, 1] += 0.1 * np.sin(2 * np.pi * np.arange(36_000) / 18_000)
+    inspected = inspect(Log(rates), 10.0, quality)
+    assert checks(inspected) == {"drift": KEPT}
+    assert "axis y wanders by 19" in detail(inspected, "drift")
+
+
 @needs_real_data
 def test_all_real_recordings_are_kept_but_for_two_rows(quality):
     for rates in np.load(Path(REAL_DATA) / "memsense_test_real.npy"):

@@ -198,7 +198,8 @@ class _Recording:
         """Motion, a bias that is taken off, and a drift."""
         blocks, q = self.blocks, self.quality
         if blocks.starts.size < LEAST_BLOCKS:
-            return []  # too short
+            detail = f"{blocks.starts.size} blocks of {q.block_s:g} s hold rows enough; expected"
+            return [Finding("too short", REJECTED, f"{detail} at least {LEAST_BLOCKS}")]
         times = blocks.starts / self.size + 0.5
         drift, fast = fit_drift(blocks.means, times, blocks.noise, q.false_alarm)
         # a smaller start harms nothing
@@ -220,14 +221,28 @@ class _Recording:
             return [Finding("motion", REJECTED, motion)]
         start = np.arange(self.masked.size) < rest.starts[0]
         findings = self._mask("start", start, "settles at once, ") if first else []
-        for name, axis in zip(AXES, drift, strict=True):
-            if np.ptp(axis) > q.drift_mdps * MDPS:
-                constant_s = time_constant(axis, times[first:] * self.size / self.rate_hz)
-                check, end = "warm-up", f"time constant about {constant_s:.2g} s"
-                if np.isinf(constant_s):
-                    check, end = "drift", "not settled at the end"
-                change = f"axis {name} by {(axis[-1] - axis[0]) / MDPS:+.3g} mdps"
-                findings.append(Finding(check, KEPT, f"{change}, {end}"))
+        return findings + self._drifts(rest, drift, times[first:] * self.size / self.rate_hz)
+
+    def _drifts(self, blocks: Blocks, drift: Array, times_s: Array) -> list[Finding]:
+        """Drifts that settle or not, and what moves from twentieth to twentieth beside them."""
+        findings, least = [], self.quality.drift_mdps * MDPS
+        parts = np.array_split(blocks.means - drift, 20, axis=1)
+        wander = np.ptp([part.mean(axis=1) for part in parts], axis=0)
+        chance = 8 * blocks.noise / np.sqrt(parts[-1].shape[1])  # the range of so many, at most
+        for axis, name in enumerate(AXES):
+            change, constant_s = (
+                drift[axis, -1] - drift[axis, 0],
+                time_constant(drift[axis], times_s),
+            )
+            size = f"axis {name} by {change / MDPS:+.3g} mdps"
+            if abs(change) > least and np.isfinite(constant_s):
+                detail = f"{size}, time constant about {constant_s:.2g} s"
+                findings.append(Finding("warm-up", KEPT, detail))
+            elif abs(change) > least:
+                findings.append(Finding("drift", KEPT, f"{size}, not settled at the end"))
+            if wander[axis] > max(least, chance[axis]):
+                detail = f"axis {name} wanders by {wander[axis] / MDPS:.3g} mdps"
+                findings.append(Finding("drift", KEPT, detail))
         return findings
 
     def _alarms(self, blocks: Blocks, drift: Array) -> tuple[Mask, Mask]:
@@ -275,12 +290,12 @@ class _Recording:
 
     def _where(self, rows: Mask, most: int = 5) -> str:
         """Rows of the log, for a person; long runs with their times."""
-        texts = []
-        for first, last in self.start + runs(rows) - [0, 1]:
+        spans, texts = self.start + runs(rows) - [0, 1], []
+        for first, last in spans[:most]:
             text = f"row {first}" if first == last else f"rows {first} to {last}"
             times = f" ({first / self.rate_hz:.4g} to {last / self.rate_hz:.4g} s)"
             texts.append(text + times * int(last - first >= self.size))
-        return ", ".join(texts[:most]) + f" and {len(texts) - most} more" * (len(texts) > most)
+        return ", ".join(texts) + f" and {len(spans) - most} more" * (len(spans) > most)
 
 
 def _made(*findings: Finding | None) -> list[Finding]:
