@@ -226,21 +226,21 @@ class _Recording:
     def _drifts(self, blocks: Blocks, drift: Array, times_s: Array) -> list[Finding]:
         """Drifts that settle or not, and what moves from twentieth to twentieth beside them."""
         findings, least = [], self.quality.drift_mdps * MDPS
-        parts = np.array_split(blocks.means - drift, 20, axis=1)
-        wander = np.ptp([part.mean(axis=1) for part in parts], axis=0)
-        chance = 8 * blocks.noise / np.sqrt(parts[-1].shape[1])  # the range of so many, at most
+        edges = np.linspace(0, times_s.size, 21).astype(np.intp)
+        lengths = np.maximum(np.diff(edges), 1)
+        parts = np.add.reduceat(blocks.means - drift, edges[:-1], axis=1) / lengths
+        wander = np.ptp(parts, axis=1)
+        chance = 8 * blocks.noise / np.sqrt(lengths.min())  # the range of so many, at most
         for axis, name in enumerate(AXES):
-            change, constant_s = (
-                drift[axis, -1] - drift[axis, 0],
-                time_constant(drift[axis], times_s),
-            )
-            size = f"axis {name} by {change / MDPS:+.3g} mdps"
-            if abs(change) > least and np.isfinite(constant_s):
-                detail = f"{size}, time constant about {constant_s:.2g} s"
-                findings.append(Finding("warm-up", KEPT, detail))
-            elif abs(change) > least:
-                findings.append(Finding("drift", KEPT, f"{size}, not settled at the end"))
-            if wander[axis] > max(least, chance[axis]):
+            change = drift[axis, -1] - drift[axis, 0]
+            if abs(change) > least:
+                constant_s = time_constant(drift[axis], times_s)
+                check, end = "warm-up", f"time constant about {constant_s:.2g} s"
+                if np.isinf(constant_s):
+                    check, end = "drift", "not settled at the end"
+                detail = f"axis {name} by {change / MDPS:+.3g} mdps, {end}"
+                findings.append(Finding(check, KEPT, detail))
+            if wander[axis] > max(least, self.quality.least_change_dps, chance[axis]):
                 detail = f"axis {name} wanders by {wander[axis] / MDPS:.3g} mdps"
                 findings.append(Finding("drift", KEPT, detail))
         return findings
