@@ -157,6 +157,13 @@ def test_what_is_brief_is_masked_and_does_not_end_the_recording(quality):
     assert np.flatnonzero(inspected.masked).tolist() == [7000]
 
 
+def test_rows_are_named_as_the_file_has_them(still, quality):
+    still[10] += 9
+    inspected = inspect(Log(still, rows=2 * np.arange(ROWS) + 1), RATE_HZ, quality)
+    assert "row 21, masked" in detail(inspected, "spikes")
+    assert np.flatnonzero(inspected.masked).tolist() == [10]
+
+
 def test_what_is_masked_at_the_ends_is_cut(still, quality):
     still[:3] = still[-1] = 0
     still[3] = np.nan

@@ -86,7 +86,7 @@ def inspect(log: Log, rate_hz: float, quality: Quality) -> Inspected:
             f"expected samples of {len(AXES)} axes, (n, {len(AXES)}), got shape {log.samples.shape}"
         )
     rates = np.ascontiguousarray(log.samples.T, dtype=np.float64)  # an axis at a time is 20x faster
-    recording = _Recording(rates, log.gap_rows, rate_hz, quality)
+    recording = _Recording(rates, log, rate_hz, quality)
     checks = (
         recording.mask_values,
         recording.check_length,
@@ -112,11 +112,9 @@ def inspect(log: Log, rate_hz: float, quality: Quality) -> Inspected:
 class _Recording:
     """The rows of a log that are being judged: checks mask some and return their findings."""
 
-    def __init__(
-        self, rates: Array, gap_rows: NDArray[np.integer], rate_hz: float, quality: Quality
-    ) -> None:
+    def __init__(self, rates: Array, log: Log, rate_hz: float, quality: Quality) -> None:
         self.rates, self.masked = rates, np.zeros(rates.shape[1], bool)
-        self.start, self.total, self.gap_rows = 0, rates.shape[1], gap_rows
+        self.start, self.total, self.log = 0, rates.shape[1], log
         self.rate_hz, self.quality = rate_hz, quality
         self.size = max(round(quality.block_s * rate_hz), LEAST_BLOCK)
 
@@ -132,10 +130,10 @@ class _Recording:
             rows = samples.any(axis=0) & ~self.masked
             axes = ", ".join(np.array(AXES)[samples[:, rows].any(axis=1)])
             findings += self._mask(check, rows, f"{'axes' if ',' in axes else 'axis'} {axes}, ")
-        start, stop = longest_stretch(self.masked, self.gap_rows)
+        start, stop = longest_stretch(self.masked, self.log.gap_rows)
         self.rates, self.masked = self.rates[:, start:stop], self.masked[start:stop]
         self.start = start
-        if self.gap_rows.size and start < stop:
+        if self.log.gap_rows.size and start < stop:
             detail = f"rows {start} to {stop - 1}, of {self.total}, are the longest stretch"
             findings.append(Finding("gaps", REPAIRED, detail))
         return findings
@@ -159,7 +157,7 @@ class _Recording:
         rates, sigma = self.used, self.blocks.sigma
         steps = values.check_steps(rates, sigma, self.quality.largest_step)
         turns = values.check_turns(rates, sigma)
-        return _made(values.check_axes(rates), values.check_repeats(rates), turns, steps)
+        return values.check_axes(rates) + values.check_repeats(rates) + turns + steps
 
     def mask_bursts(self, few: int = 3) -> list[Finding]:
         """Spikes of fewer than ``few`` rows; shocks, with a block about where it may still ring."""
@@ -192,7 +190,7 @@ class _Recording:
         noise = np.array([self.blocks.sigma, self.blocks.noise])  # a filter leaves N to the means
         density = (noise * np.sqrt(seconds)).max(axis=0)
         level = values.check_noise(rates, density, self.quality.largest_noise_dps)
-        return _made(values.check_zeros(rates), values.check_tops(rates), level)
+        return values.check_zeros(rates) + values.check_tops(rates) + level
 
     def check_rest(self) -> list[Finding]:
         """Motion, a bias that is taken off, and a drift."""
@@ -289,14 +287,11 @@ class _Recording:
         return [Finding(check, outcome, f"{what}{self._where(rows)}, {done}")] * int(rows.any())
 
     def _where(self, rows: Mask, most: int = 5) -> str:
-        """Rows of the log, for a person; long runs with their times."""
+        """Rows of the file, for a person; long runs with their times."""
         spans, texts = self.start + runs(rows) - [0, 1], []
         for first, last in spans[:most]:
-            text = f"row {first}" if first == last else f"rows {first} to {last}"
+            a, b = (first, last) if self.log.rows is None else self.log.rows[[first, last]]
+            text = f"row {a}" if a == b else f"rows {a} to {b}"
             times = f" ({first / self.rate_hz:.4g} to {last / self.rate_hz:.4g} s)"
             texts.append(text + times * int(last - first >= self.size))
         return ", ".join(texts) + f" and {len(spans) - most} more" * (len(spans) > most)
-
-
-def _made(*findings: Finding | None) -> list[Finding]:
-    return [finding for finding in findings if finding is not None]
