@@ -3,8 +3,8 @@
     python benchmarks/quality.py                # everything, some five minutes
     python benchmarks/quality.py --repeat 10    # a tenth of the recordings
 
-Disturbances and warm-ups are added to the noise of the four embedded sensors, conf/base/globals.yml,
-at their rates, 13,000 samples a recording. Its last results: benchmarks/README.md.
+Disturbances and warm-ups are added to the noise of the four sensors of conf/base/globals.yml at
+their rates, 13,000 samples a recording. Its last results: benchmarks/README.md.
 """
 
 import argparse

@@ -157,6 +157,13 @@ def test_what_is_brief_is_masked_and_does_not_end_the_recording(quality):
     assert np.flatnonzero(inspected.masked).tolist() == [7000]
 
 
+def test_rows_are_named_as_the_file_has_them(still, quality):
+    still[10] += 9
+    inspected = inspect(Log(still, rows=2 * np.arange(ROWS) + 1), RATE_HZ, quality)
+    assert "row 21, masked" in detail(inspected, "spikes")
+    assert np.flatnonzero(inspected.masked).tolist() == [10]
+
+
 def test_what_is_masked_at_the_ends_is_cut(still, quality):
     still[:3] = still[-1] = 0
     still[3] = np.nan
@@ -248,6 +255,14 @@ def test_the_short_recordings_of_the_smoke_environment_are_kept(parameters):
         for _ in range(25):
             rates = simulate_noise(generator, (3, sensor.samples), sensor.rate_hz, noise).T
             assert inspect(Log(rates + BIAS), sensor.rate_hz, p.quality).outcome == KEPT
+
+
+def test_a_bias_that_wanders_slowly_is_at_rest_and_said(quality):
+    rates = np.random.default_rng(1).normal(BIAS, 0.02, (36_000, 3))
+    rates[:, 1] += 0.1 * np.sin(2 * np.pi * np.arange(36_000) / 18_000)
+    inspected = inspect(Log(rates), 10.0, quality)
+    assert checks(inspected) == {"drift": KEPT}
+    assert "axis y wanders by 19" in detail(inspected, "drift")
 
 
 @needs_real_data

@@ -86,7 +86,7 @@ def inspect(log: Log, rate_hz: float, quality: Quality) -> Inspected:
             f"expected samples of {len(AXES)} axes, (n, {len(AXES)}), got shape {log.samples.shape}"
         )
     rates = np.ascontiguousarray(log.samples.T, dtype=np.float64)  # an axis at a time is 20x faster
-    recording = _Recording(rates, log.gap_rows, rate_hz, quality)
+    recording = _Recording(rates, log, rate_hz, quality)
     checks = (
         recording.mask_values,
         recording.check_length,
@@ -112,11 +112,9 @@ def inspect(log: Log, rate_hz: float, quality: Quality) -> Inspected:
 class _Recording:
     """The rows of a log that are being judged: checks mask some and return their findings."""
 
-    def __init__(
-        self, rates: Array, gap_rows: NDArray[np.integer], rate_hz: float, quality: Quality
-    ) -> None:
+    def __init__(self, rates: Array, log: Log, rate_hz: float, quality: Quality) -> None:
         self.rates, self.masked = rates, np.zeros(rates.shape[1], bool)
-        self.start, self.total, self.gap_rows = 0, rates.shape[1], gap_rows
+        self.start, self.total, self.log = 0, rates.shape[1], log
         self.rate_hz, self.quality = rate_hz, quality
         self.size = max(round(quality.block_s * rate_hz), LEAST_BLOCK)
 
@@ -132,10 +130,10 @@ class _Recording:
             rows = samples.any(axis=0) & ~self.masked
             axes = ", ".join(np.array(AXES)[samples[:, rows].any(axis=1)])
             findings += self._mask(check, rows, f"{'axes' if ',' in axes else 'axis'} {axes}, ")
-        start, stop = longest_stretch(self.masked, self.gap_rows)
+        start, stop = longest_stretch(self.masked, self.log.gap_rows)
         self.rates, self.masked = self.rates[:, start:stop], self.masked[start:stop]
         self.start = start
-        if self.gap_rows.size and start < stop:
+        if self.log.gap_rows.size and start < stop:
             detail = f"rows {start} to {stop - 1}, of {self.total}, are the longest stretch"
             findings.append(Finding("gaps", REPAIRED, detail))
         return findings
@@ -159,7 +157,7 @@ class _Recording:
         rates, sigma = self.used, self.blocks.sigma
         steps = values.check_steps(rates, sigma, self.quality.largest_step)
         turns = values.check_turns(rates, sigma)
-        return _made(values.check_axes(rates), values.check_repeats(rates), turns, steps)
+        return values.check_axes(rates) + values.check_repeats(rates) + turns + steps
 
     def mask_bursts(self, few: int = 3) -> list[Finding]:
         """Spikes of fewer than ``few`` rows; shocks, with a block about where it may still ring."""
@@ -192,13 +190,14 @@ class _Recording:
         noise = np.array([self.blocks.sigma, self.blocks.noise])  # a filter leaves N to the means
         density = (noise * np.sqrt(seconds)).max(axis=0)
         level = values.check_noise(rates, density, self.quality.largest_noise_dps)
-        return _made(values.check_zeros(rates), values.check_tops(rates), level)
+        return values.check_zeros(rates) + values.check_tops(rates) + level
 
     def check_rest(self) -> list[Finding]:
         """Motion, a bias that is taken off, and a drift."""
         blocks, q = self.blocks, self.quality
         if blocks.starts.size < LEAST_BLOCKS:
-            return []  # too short
+            detail = f"{blocks.starts.size} blocks of {q.block_s:g} s hold rows enough; expected"
+            return [Finding("too short", REJECTED, f"{detail} at least {LEAST_BLOCKS}")]
         times = blocks.starts / self.size + 0.5
         drift, fast = fit_drift(blocks.means, times, blocks.noise, q.false_alarm)
         # a smaller start harms nothing
@@ -220,14 +219,28 @@ class _Recording:
             return [Finding("motion", REJECTED, motion)]
         start = np.arange(self.masked.size) < rest.starts[0]
         findings = self._mask("start", start, "settles at once, ") if first else []
-        for name, axis in zip(AXES, drift, strict=True):
-            if np.ptp(axis) > q.drift_mdps * MDPS:
-                constant_s = time_constant(axis, times[first:] * self.size / self.rate_hz)
+        return findings + self._drifts(rest, drift, times[first:] * self.size / self.rate_hz)
+
+    def _drifts(self, blocks: Blocks, drift: Array, times_s: Array) -> list[Finding]:
+        """Drifts that settle or not, and what moves from twentieth to twentieth beside them."""
+        findings, least = [], self.quality.drift_mdps * MDPS
+        edges = np.linspace(0, times_s.size, 21).astype(np.intp)
+        lengths = np.maximum(np.diff(edges), 1)
+        parts = np.add.reduceat(blocks.means - drift, edges[:-1], axis=1) / lengths
+        wander = np.ptp(parts, axis=1)
+        chance = 8 * blocks.noise / np.sqrt(lengths.min())  # the range of so many, at most
+        for axis, name in enumerate(AXES):
+            change = drift[axis, -1] - drift[axis, 0]
+            if abs(change) > least:
+                constant_s = time_constant(drift[axis], times_s)
                 check, end = "warm-up", f"time constant about {constant_s:.2g} s"
                 if np.isinf(constant_s):
                     check, end = "drift", "not settled at the end"
-                change = f"axis {name} by {(axis[-1] - axis[0]) / MDPS:+.3g} mdps"
-                findings.append(Finding(check, KEPT, f"{change}, {end}"))
+                detail = f"axis {name} by {change / MDPS:+.3g} mdps, {end}"
+                findings.append(Finding(check, KEPT, detail))
+            if wander[axis] > max(least, self.quality.least_change_dps, chance[axis]):
+                detail = f"axis {name} wanders by {wander[axis] / MDPS:.3g} mdps"
+                findings.append(Finding("drift", KEPT, detail))
         return findings
 
     def _alarms(self, blocks: Blocks, drift: Array) -> tuple[Mask, Mask]:
@@ -274,14 +287,11 @@ class _Recording:
         return [Finding(check, outcome, f"{what}{self._where(rows)}, {done}")] * int(rows.any())
 
     def _where(self, rows: Mask, most: int = 5) -> str:
-        """Rows of the log, for a person; long runs with their times."""
-        texts = []
-        for first, last in self.start + runs(rows) - [0, 1]:
-            text = f"row {first}" if first == last else f"rows {first} to {last}"
+        """Rows of the file, for a person; long runs with their times."""
+        spans, texts = self.start + runs(rows) - [0, 1], []
+        for first, last in spans[:most]:
+            a, b = (first, last) if self.log.rows is None else self.log.rows[[first, last]]
+            text = f"row {a}" if a == b else f"rows {a} to {b}"
             times = f" ({first / self.rate_hz:.4g} to {last / self.rate_hz:.4g} s)"
             texts.append(text + times * int(last - first >= self.size))
-        return ", ".join(texts[:most]) + f" and {len(texts) - most} more" * (len(texts) > most)
-
-
-def _made(*findings: Finding | None) -> list[Finding]:
-    return [finding for finding in findings if finding is not None]
+        return ", ".join(texts) + f" and {len(spans) - most} more" * (len(spans) > most)

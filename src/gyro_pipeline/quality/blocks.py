@@ -115,7 +115,8 @@ def excursions(rates: Array, blocks: Blocks, false_alarm: float) -> Mask:
     """
     normal = -NormalDist().inv_cdf(false_alarm / (2 * rates.size))
     # sigma from distances: squares would let frequent spikes hide themselves
-    sigma = np.median(blocks.apart, axis=1) * np.sqrt(np.pi / 2 * blocks.size / (blocks.size - 1))
+    median_of_one = np.sqrt(2 / np.pi * (1 - 1 / blocks.size)) * (1 - 1 / (7 * blocks.size))
+    sigma = np.median(blocks.apart, axis=1) / median_of_one
     limits = normal * np.sqrt(1 + np.pi / (18 * blocks.size)) * sigma[:, None]
     beyond = np.zeros(rates.shape[1], bool)
     if (blocks.reach < 0.8 * limits).all():  # one sample of five moves their mean by a fifth

@@ -8,7 +8,6 @@ limits hold at any time. Beside it, the means may not scatter more than those of
 Quality control feeds it a file at once, a live stream block by block; NumPy is all it needs.
 """
 
-from collections.abc import Sequence
 from functools import cache
 from statistics import NormalDist
 
@@ -18,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 KNOWN_BLOCKS = 1e9
-"""Blocks that a stated noise is worth beside those that have come."""
+"""What a stated noise is worth."""
 
 
 class RestDetector:
@@ -34,33 +33,25 @@ class RestDetector:
         least_dps: Smaller changes of the mean are the bias's own.
         least_rise: Smaller factors on the noise are no alarm.
         noise_dps: (axis,), standard deviation of a sample at rest, where it is known.
-        lags: Numbers of last blocks that are tested.
-        reference: Blocks before them with whose mean theirs is compared.
     """
 
-    def __init__(
-        self,
-        size: int,
-        false_alarm: float,
-        least_dps: float,
-        least_rise: float = 1.5,
+    lags, reference = (1, 4, 16), 40  # blocks, the last ones and those before them
+
+    def __init__(  # noqa: PLR0917 - in the order of the docstring
+        self, size: int, false_alarm: float, least_dps: float, least_rise: float = 1.5,
         noise_dps: ArrayLike | None = None,
-        lags: Sequence[int] = (1, 4, 16),
-        reference: int = 40,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.size, self.false_alarm, self.least_dps = size, false_alarm, least_dps
-        self.least_rise = least_rise
-        self.least_growth = least_rise ** (2 / 3) - 1  # of the cube root of the variance
+        self.growth = least_rise ** (2 / 3)  # of the cube root of the variance
         self.known = 0.0 if noise_dps is None else KNOWN_BLOCKS
         self.known_variance = 0.0 if noise_dps is None else np.square(noise_dps)
-        self.lags, self.reference, self.blocks = tuple(lags), reference, 0
-        self._last, self._sums = np.empty((0, 0)), np.empty((0, 0))  # sums: up to the last blocks
+        self.blocks, self._last, self._sums = 0, np.empty((0, 0)), np.empty((0, 0))
 
     def update(self, means: Array, variances: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Take the next blocks; how they are dealt to calls changes no bit.
 
         Args:
-            means: (block, axis), deg/s.
+            means: (block, axis), deg/s, finite.
             variances: (block, axis), (deg/s)^2, of the samples about the mean of their block.
 
         Returns:
@@ -80,9 +71,7 @@ class RestDetector:
             limit = self.least_dps + chance[before, :axes] * np.sqrt(1 / lag + 1 / length)
             moved[rows - first] |= np.abs(change) > limit
             limit = chance[before, axes:] * np.sqrt(1 / lag + 1 / worth[before])
-            noisier[rows - first] |= (
-                last[:, axes:] > (1 + self.least_growth) * noise[before] + limit
-            )
+            noisier[rows - first] |= last[:, axes:] > self.growth * noise[before] + limit
         self._sums = sums[-(self.reference + max(self.lags)) - 1 :]
         return moved, noisier
 
@@ -105,10 +94,10 @@ class RestDetector:
         noise /= worth
         white = np.hstack([variance / self.size, noise**2 * relative])
         coloured = variance / min(self.size, 8) + self.least_dps**2
-        largest = np.hstack([coloured, white[:, axes:] + (self.least_growth * noise) ** 2])
+        largest = np.hstack([coloured, white[:, axes:] + ((self.growth - 1) * noise) ** 2])
         shown = (sums[:, 2 * axes : 4 * axes] + known * white) / np.maximum(worth - 1, 1)
         freedom = np.maximum(worth - 1, 1e-3) * 2 / 3  # of differences between neighbours
-        tests = 4 * axes * len(self.lags)
+        tests = 8 * axes * len(self.lags)  # two sides of the mean, noise, sways; two limits each
         z = _spent(self.false_alarm / tests)[np.frexp(np.maximum(count, 1))[1] - 1][:, None]
         chance = np.minimum(
             student_limits(z, freedom) * np.sqrt(np.maximum(shown, white)),

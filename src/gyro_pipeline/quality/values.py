@@ -1,7 +1,7 @@
 """Values that no gyroscope at rest gives, each told by a function of its own.
 
 Rates are (axis, n), deg/s, finite; sigma is the standard deviation of a sample, (axis,), deg/s. A
-check returns its finding, if there is one.
+check returns its finding, or none.
 """
 
 from itertools import combinations
@@ -15,38 +15,38 @@ from gyro_pipeline.quality.blocks import Array
 READER = "in `reader:` of the catalog entry in catalog.yml"
 
 
-def check_axes(rates: Array) -> Finding | None:
+def check_axes(rates: Array) -> list[Finding]:
     """Two axes of the same values: one column was taken twice."""
     for i, j in combinations(range(len(AXES)), 2):
         if np.array_equal(rates[i], rates[j]):
             detail = (
                 f"axes {AXES[i]} and {AXES[j]} have the same values: correct `columns` {READER}"
             )
-            return Finding("equal axes", REJECTED, detail)
-    return None
+            return [Finding("equal axes", REJECTED, detail)]
+    return []
 
 
-def check_repeats(rates: Array, reported: float = 0.01, most: float = 0.2) -> Finding | None:
+def check_repeats(rates: Array, reported: float = 0.01, most: float = 0.2) -> list[Finding]:
     """A share of rows that repeat the one before, beyond what chance makes of coarse axes."""
     same = rates[:, 1:] == rates[:, :-1]
     shares = np.count_nonzero(same, axis=1) / same.shape[1]
     if shares.min() <= reported:
-        return None
+        return []
     # an axis repeats by chance as often as where the one that repeats least does not
     rarest = int(np.argmin(shares))
     alone = np.delete(same, rarest, axis=0)[:, ~same[rarest]]
     chance = shares[rarest] * np.prod(alone.mean(axis=1)) if alone.size else 0.0
     share = (np.logical_and.reduce(same).mean() - chance) / (1 - chance)
     if share <= reported:
-        return None
+        return []
     detail = f"{share:.1%} of the rows repeat the one before"
     if share <= most:
-        return Finding("repeated rows", KEPT, detail)
+        return [Finding("repeated rows", KEPT, detail)]
     detail += f": each sample is written {1 / (1 - share):.3g} times; type `repeats: drop` {READER}"
-    return Finding("repeated rows", REJECTED, detail)
+    return [Finding("repeated rows", REJECTED, detail)]
 
 
-def check_turns(rates: Array, sigma: Array, least: float = 0.5, period: int = 12) -> Finding | None:
+def check_turns(rates: Array, sigma: Array, least: float = 0.5, period: int = 12) -> list[Finding]:
     """Rows of levels in turn, ``period`` or a divisor of it, apart by ``least`` of the noise."""
     turns = rates[:, : rates.shape[1] // period * period].reshape(len(rates), -1, period)
     slope = (turns[:, -1].mean(axis=1) - turns[:, 0].mean(axis=1)) / rates.shape[1]
@@ -58,11 +58,11 @@ def check_turns(rates: Array, sigma: Array, least: float = 0.5, period: int = 12
         return np.ptp(levels, axis=1) - max(least, chance) * about
 
     if not (excess(turns.mean(axis=1)) > 0).any():
-        return None
+        return []
     levels = np.median(turns, axis=1)  # a shock moves no median
     axis = int(np.argmax(excess(levels)))
     if excess(levels)[axis] <= 0:
-        return None
+        return []
     size = np.ptp(levels[axis])
     ranges = {p: np.ptp(levels[axis].reshape(-1, p), axis=0).max() for p in (2, 3, 4, 6, period)}
     every = min(p for p in ranges if ranges[p] < size / 2)
@@ -70,10 +70,10 @@ def check_turns(rates: Array, sigma: Array, least: float = 0.5, period: int = 12
         f"every {every} rows axis {AXES[axis]} is at another level, {size:.3g} deg/s off: several "
         f"sensors in one file? Pick one by `rows: {{COLUMN: VALUE}}` {READER}"
     )
-    return Finding("alternating rows", REJECTED, detail)
+    return [Finding("alternating rows", REJECTED, detail)]
 
 
-def check_zeros(rates: Array, least: int = 8) -> Finding | None:
+def check_zeros(rates: Array, least: int = 8) -> list[Finding]:
     """A dead band: ``least`` exact zeros or more, far more than of any value near, none between."""
     for axis in np.flatnonzero(np.count_nonzero(rates == 0, axis=1) >= least):
         sizes = np.abs(rates[axis][rates[axis] != 0])
@@ -86,11 +86,11 @@ def check_zeros(rates: Array, least: int = 8) -> Finding | None:
                 f"axis {AXES[axis]} has {zeros} zeros in a dead band of ± {band:.2g} deg/s; the "
                 "mean is pulled to zero. Record without it"
             )
-            return Finding("dead band", REJECTED, detail)
-    return None
+            return [Finding("dead band", REJECTED, detail)]
+    return []
 
 
-def check_tops(rates: Array, least: int = 8, times: int = 4) -> Finding | None:
+def check_tops(rates: Array, least: int = 8, times: int = 4) -> list[Finding]:
     """A flat top: the extreme value is there ``least`` times, and twice as often as the next one.
 
     The tail of noise thins out instead. Behind a low-pass filter a peak lasts, but comes once, not
@@ -105,13 +105,11 @@ def check_tops(rates: Array, least: int = 8, times: int = 4) -> Finding | None:
             came = np.count_nonzero(at_top[axis][1:] & ~at_top[axis][:-1])
             if count >= 2 * np.count_nonzero(below == below.max()) and came >= times:
                 detail = f"axis {AXES[axis]} is cut off at {tops[axis]:.4g} deg/s, {count} times"
-                return Finding("saturation", REJECTED, f"{detail}; the mean is pulled from there")
-    return None
+                return [Finding("saturation", REJECTED, f"{detail}; the mean is pulled from there")]
+    return []
 
 
-def check_steps(
-    rates: Array, sigma: Array, largest: float, reported: float = 1.0
-) -> Finding | None:
+def check_steps(rates: Array, sigma: Array, largest: float, reported: float = 1.0) -> list[Finding]:
     """The coarsest axis, if its quantisation step is above ``reported`` times the noise."""
     steps, changes = np.zeros(len(rates)), np.abs(np.diff(rates, axis=1))
     # white noise repeats a tenth of its samples at a step of 0.36 sigma
@@ -122,19 +120,19 @@ def check_steps(
     noise = np.sqrt(np.maximum(sigma**2 - steps**2 / 12, 0))
     axis = np.argmax(steps - largest * noise)
     if steps[axis] <= noise[axis]:
-        return None
+        return []
     detail = (
         f"axis {AXES[axis]} has a step of {steps[axis] / MDPS:.4g} mdps beside a noise of "
         f"{noise[axis] / MDPS:.4g} mdps; a mean can be trusted up to {largest:g} times the noise "
         "(quality.largest_step)"
     )
     outcome = KEPT if steps[axis] <= largest * noise[axis] else REJECTED
-    return Finding("coarse quantisation", outcome, detail)
+    return [Finding("coarse quantisation", outcome, detail)]
 
 
 def check_noise(
     rates: Array, density: Array, largest_dps: float, least_mdps_rts: float = 0.2
-) -> Finding | None:
+) -> list[Finding]:
     """More noise of a sample, or less N, than a MEMS gyroscope has; the best have 0.02 deg/sqrt(h).
 
     ``density`` is N, (axis,), in deg/s sqrt(s); 0.02 deg/sqrt(h) are 0.33 mdps sqrt(s).
@@ -147,11 +145,11 @@ def check_noise(
             f"axis {AXES[axis]} has a noise of {sigma[axis]:.3g} deg/s; expected at most "
             f"{largest_dps:g} of a gyroscope at rest (check the unit; quality.largest_noise_dps)"
         )
-        return Finding("noise level", REJECTED, detail)
+        return [Finding("noise level", REJECTED, detail)]
     if density.max() >= least_mdps_rts * MDPS:
-        return None
+        return []
     detail = (
         f"N is {density.max() / MDPS:.2g} mdps sqrt(s), less noise than any MEMS gyroscope has; "
         f"check the unit (`units` {READER})"
     )
-    return Finding("little noise", KEPT, detail)
+    return [Finding("little noise", KEPT, detail)]
