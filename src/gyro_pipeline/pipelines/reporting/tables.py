@@ -468,7 +468,9 @@ def _train_recordings(virtual: xr.Dataset, sensor: str) -> int:
 def _gyroscope_recordings(recordings: xr.Dataset) -> xr.DataArray:
     """Whether a gyroscope has a recording: (imu, recording, axis)."""
     there = recordings["samples"].load() > 0
-    return there.expand_dims({"axis": recordings.axis.to_numpy()}).transpose("imu", "recording", "axis")
+    return there.expand_dims({"axis": recordings.axis.to_numpy()}).transpose(
+        "imu", "recording", "axis"
+    )
 
 
 def _counted(recordings: xr.Dataset, roles: pd.DataFrame) -> tuple[xr.DataArray, xr.DataArray]:
