@@ -6,9 +6,9 @@ Writes the files to a temporary folder (4.5 GB for 2,000 like the public ones), 
 that both sides find them in memory as far as it goes, and then, on as many processes each:
 
 * a bare loop of ``pandas.read_csv``, of which nothing is kept;
-* the source, the readers, what is kept of their work, and the quality control, as ``kedro run
-  --pipeline=ground_truth`` calls them;
-* the recordings stored, and the same once more, with all files read before.
+* the raw-logs stage as ``kedro run --pipeline=ground_truth`` calls it: files are read, judged and
+  stored;
+* the same once more, with all files read before.
 
 Prints the time of each, the ratio, and the peak memory of this process and its children.
 """
@@ -120,22 +120,36 @@ def pipeline(folder: Path, scratch: Path, processes: int) -> Callable[[], Any]:
     """The raw-logs stage on a folder."""
     # here, so that the processes of the bare loop do not wait for them
     from gyro_pipeline.datasets.file_logs import FileLogs  # noqa: PLC0415
+    from gyro_pipeline.datasets.recordings import (  # noqa: PLC0415
+        CompletedRecordings,
+        InspectedRecordings,
+    )
     from gyro_pipeline.parameters import Execution, Quality  # noqa: PLC0415
     from gyro_pipeline.pipelines.raw_logs.nodes import (  # noqa: PLC0415
         inspect_logs,
-        require_enough,
+        label_recordings,
+        quality_table,
     )
 
     quality = Quality(**yaml.safe_load((CONF / "parameters" / "stages.yml").read_text())["quality"])
     sensor = yaml.safe_load((CONF / "globals.yml").read_text())["sensors"]["dot"]
     imus = sum(1 for _ in folder.iterdir())
     sensors = {"dot": sensor | {"imus": imus, "samples": ROWS, "recording_s": ROWS / RATE_HZ}}
-    source = FileLogs("dot", "fleet", str(folder), sensors, "imu{imu}/{recording}.csv")
+    source = FileLogs(
+        *("dot", "fleet", str(folder)), sensors=sensors, pattern="imu{imu}/{recording}.csv"
+    )
+    scratch.mkdir()
+    path = str(scratch / "recordings.nc")
+    reading, final = InspectedRecordings(path), CompletedRecordings(path)
     execution = Execution(executor="processes", workers=processes)
 
     def run() -> Any:
-        recordings, table = inspect_logs(source.load(), quality, execution)
-        return require_enough(recordings, table, quality)
+        files = source.load()
+        for item in inspect_logs(files, reading.load(), quality, execution):
+            reading.save(item)
+        table = quality_table(files, reading.load())
+        final.save(label_recordings(files, reading.load(), table, quality))
+        return final.load()
 
     return run
 
@@ -161,16 +175,11 @@ def main() -> None:
         with measured("pandas.read_csv alone", files) as bare:
             in_processes(parse, paths, processes)
         run = pipeline(folder, scratch, processes)
-        with measured("source and quality control", files) as ours:
-            recordings = run()
-        print(f"  {dict(recordings.sizes)}")
-        with measured("storing the recordings", files) as stored:
-            recordings.to_netcdf(scratch / "recordings.nc", engine="h5netcdf")
-        del recordings
+        with measured("read, judged and stored", files) as ours:
+            print(f"  {dict(run().sizes)}")
         with measured("the same, all files read before", files):
             run()
-    peak = max(ours["bytes"], stored["bytes"])
-    print(f"ratio {ours['s'] / bare['s']:.2f}, peak {peak / MB:.0f} MB")
+    print(f"ratio {ours['s'] / bare['s']:.2f}, peak {ours['bytes'] / MB:.0f} MB")
 
 
 if __name__ == "__main__":

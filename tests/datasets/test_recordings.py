@@ -1,7 +1,9 @@
 import os
 import pickle
 import tracemalloc
+from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -9,7 +11,12 @@ from kedro.io import DatasetError
 
 from gyro_pipeline.conventions import InputError, Missing
 from gyro_pipeline.datasets.atomic import replacing
-from gyro_pipeline.datasets.recordings import Recordings
+from gyro_pipeline.datasets.recordings import (
+    CompletedRecordings,
+    InspectedRecordings,
+    Recordings,
+)
+from gyro_pipeline.logs import KEPT, REJECTED, Finding, Listing, Recording
 
 
 def made(samples=50, offset=0.0):
@@ -155,3 +162,93 @@ def test_recordings_that_are_not_there_name_what_makes_them_where_that_is_known(
     assert known.load() == Missing(("make it",))
     known.save(made())
     xr.testing.assert_identical(known.load(), made())
+
+
+# recordings that arrive one by one
+
+
+def recording(imu, number, samples=100, **changes):
+    rates = np.random.default_rng(100 * imu + number).normal(size=(3, samples)).astype(np.float32)
+    given = {
+        **{"imu": imu, "recording": number, "where": f"{imu}_{number}.csv", "key": f"k{number}"},
+        **{"outcome": KEPT, "findings": (Finding("time", KEPT, "jitter of 3 ms"),)},
+        **{"rows": samples + 5, "start": 5, "stop": samples + 5, "content": "abc"},
+        "variables": {"angular_rate": rates},
+    }
+    return Recording(**given | changes)
+
+
+def reading(tmp_path):
+    return InspectedRecordings(str(tmp_path / "dot.nc"))
+
+
+def listing(*recordings):
+    return Listing({one.place: one.key for one in recordings})
+
+
+def described(one):
+    return replace(one, variables={})
+
+
+def test_recordings_come_back_without_their_samples_by_imu_and_number(tmp_path):
+    warm = {"temperature_c": np.arange(100, dtype=np.float32)}
+    ones = [recording(1, 7), recording(2, 7, samples=150, rate_hz=99.5), recording(2, 9)]
+    ones[2] = replace(ones[2], variables=ones[2].variables | warm)
+    assert reading(tmp_path).load() == []
+    reading(tmp_path).save(listing(*ones))
+    for one in reversed(ones):  # in any order
+        reading(tmp_path).save(one)
+    assert reading(tmp_path).load() == [described(one) for one in ones]
+    assert [path.name for path in tmp_path.iterdir()] == ["dot.unfinished.nc"]
+    lengths = xr.DataArray([[100, 0], [150, 100]], {"imu": [1, 2], "recording": [7, 9]})
+    final = CompletedRecordings(str(tmp_path / "dot.nc"))
+    final.save(xr.Dataset({"samples": lengths}, attrs={"sensor": "dot", "rate_hz": 10.0}))
+    back = final.load()
+    assert [path.name for path in tmp_path.iterdir()] == ["dot.nc"]
+    assert set(back.variables) == {
+        *("imu", "recording", "axis", "samples", "angular_rate", "temperature_c")
+    }
+    assert back.attrs == {"sensor": "dot", "rate_hz": 10.0}
+    assert (back.angular_rate.units, back.temperature_c.units) == ("deg/s", "degrees Celsius")
+    for one in ones:
+        stored = back.sel(imu=one.imu, recording=one.recording)
+        for name, values in one.variables.items():
+            np.testing.assert_array_equal(stored[name][..., : values.shape[-1]], values)
+            assert np.isnan(stored[name][..., values.shape[-1] :]).all()
+    assert np.isnan(back.angular_rate.sel(imu=1, recording=9)).all()
+
+
+def test_rejected_and_absent_recordings_take_no_space(tmp_path):
+    # each IMU has a number of its own
+    ones = [recording(imu, imu, samples=2000) for imu in range(1, 41)]
+    reading(tmp_path).save(listing(*ones))
+    for one in ones:
+        used = one.imu % 2
+        reading(tmp_path).save(one if used else replace(described(one), outcome=REJECTED))
+    size = (tmp_path / "dot.unfinished.nc").stat().st_size
+    assert size < 20 * 2000 * 3 * 4 + 300_000
+
+
+@pytest.mark.parametrize("size", [0, 100, 5000])
+def test_a_damaged_unfinished_file_is_begun_anew(tmp_path, size):
+    one = recording(1, 1, samples=2000)
+    reading(tmp_path).save(listing(one))
+    reading(tmp_path).save(one)
+    path = tmp_path / "dot.unfinished.nc"
+    path.write_bytes(path.read_bytes()[:size])
+    assert reading(tmp_path).load() == []
+    reading(tmp_path).save(listing(one))
+    reading(tmp_path).save(one)
+    assert reading(tmp_path).load() == [described(one)]
+
+
+def test_a_new_listing_keeps_what_has_the_same_place_and_key(tmp_path):
+    same, changed, gone = recording(1, 1), recording(1, 2), recording(2, 1)
+    reading(tmp_path).save(listing(same, changed, gone))
+    for one in (same, changed, gone):
+        reading(tmp_path).save(one)
+    reading(tmp_path).save(listing(same, replace(changed, key="new"), recording(3, 1)))
+    assert reading(tmp_path).load() == [described(same)]
+    with h5py.File(tmp_path / "dot.unfinished.nc") as file:
+        assert file["imu"][:].tolist() == [1, 3]
+        np.testing.assert_array_equal(file["angular_rate"][0, 0], same.variables["angular_rate"])

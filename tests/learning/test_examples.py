@@ -154,6 +154,20 @@ def test_side_by_side_every_recording_counts_once():
     np.testing.assert_allclose(last, recorded, atol=1e-4)
 
 
+def test_masked_samples_are_their_windows_mean_and_windows_that_lost_many_are_no_examples():
+    rates, bias = drawn()
+    whole, _ = training_examples([device(rates, bias)], ONE_IMU, "per_device")
+    rates[0, 1, :, [3]] = np.nan  # of the first window of recording 2
+    rates[0, 2, :, 20:24] = np.nan  # a fifth of the second window of recording 3
+    examples, scaling = training_examples([device(rates, bias)], ONE_IMU, "per_device")
+    assert len(whole.inputs) == 6
+    assert len(examples.inputs) == len(examples.targets) == 5
+    window = unpacked(examples, 3)[2] * scaling.input_scale + scaling.centres[0][:, None]
+    recorded = rates[0, 1, :, :WINDOW]
+    expected = np.where(np.isnan(recorded), np.nanmean(recorded, axis=1)[:, None], recorded)
+    np.testing.assert_allclose(window, expected, atol=1e-4)
+
+
 @pytest.mark.parametrize("centring", ["per_device", "global"])
 def test_scaling_comes_from_training_recordings_of_training_devices_only(centring):
     rates, bias = drawn(imus=3)

@@ -649,3 +649,53 @@ def test_a_residual_network_learns_from_the_imus_of_its_cell(world, monkeypatch)
     np.testing.assert_array_equal(drawn, world.virtual.angular_rate.to_numpy()[:3, :5])
     # virtual recordings beyond those that train are not there
     assert np.isnan(together.angular_rate.sel(imu=3, recording=slice(6, 10))).all()
+
+
+# masked samples, and recordings that an IMU lacks
+
+
+@pytest.fixture(scope="module")
+def damaged(world, make_bias):
+    """The same world with a few samples masked, a window lost and two recordings of IMU 1 gone."""
+    recordings = world.recordings.copy(deep=True)
+    recordings.angular_rate[..., [7, 300, 301]] = np.nan
+    recordings.angular_rate[0, 11, :, 210:260] = np.nan  # of a second window, more than a tenth
+    recordings["samples"][0, [4, 12]], recordings.angular_rate[0, [4, 12]] = 0, np.nan
+    allan = measure_allan_variance(recordings)
+    return replace(world, recordings=recordings, allan=allan, bias=make_bias(recordings, allan))
+
+
+def test_masked_samples_and_lacking_recordings_stop_nothing(damaged, as_stored):
+    names = ["cnn", *ESTIMATORS]
+    study = Study(
+        experiment="estimators",
+        estimators=names,
+        sensors={"sparkfun": Grid(method=2, real_gyros=[3, 6])},
+    )
+    small = replace(damaged, study=study, virtual=None)
+    runs = [as_stored(run, f"id{i}") for i, run in enumerate(small.train())]
+    judged = list(
+        evaluate(
+            *(small.plan(), runs, small.recordings, small.bias, small.allan, small.roles),
+            small.evaluation,
+        )
+    )
+    assert len(judged) == len(runs) >= len(names)
+    for run in judged:
+        errors = run.artifacts[ERRORS]
+        assert np.isfinite(errors.error_dps).all()
+        windows = errors[
+            (errors.truth == PAPER) & (errors["axis"] == "x") & (errors.weights == LAST)
+        ]
+        assert windows.groupby("recording").window.count().to_dict() == {11: 5, 12: 4, 14: 5}
+        assert run.metrics["test_rmse_dps_all"] < 0.01
+
+
+def test_errors_in_masked_windows_are_about_what_was_measured(damaged):
+    bench = Bench(damaged.recordings, device_of(damaged), (12,), WINDOW_S, damaged.evaluation)
+    samples = damaged.recordings.angular_rate.sel(imu=1, recording=12).to_numpy().astype(float)
+    errors = bench.mean_errors[bench.mean_errors.truth == PAPER]
+    for window, start in enumerate((0, 400, 600, 800)):
+        means = np.nanmean(samples[:, start : start + SIZE], axis=1) - np.nanmean(samples, axis=1)
+        found = errors.error_dps[errors.window == window]
+        np.testing.assert_allclose(found, means, atol=1e-8)

@@ -99,3 +99,56 @@ def test_allan_variance_falls_as_one_over_time_and_inputs_stay(recordings, allan
     mean = allan.allan_variance.mean(["imu", "recording", "axis"])
     slope = np.polyfit(np.log(allan.time_s), np.log(mean), 1)[0]
     assert slope == pytest.approx(-1, abs=0.05)
+
+
+# recordings of a length each, with masked samples
+
+
+@pytest.fixture
+def uneven(make_recordings):
+    """IMUs 2 and 3 with recordings of 60, 40 and 50 s; ten samples of one are masked."""
+    made = make_recordings(np.full((2, 3, 3), 300.0), SAMPLES, RATE_HZ, NOISE, seed=3)
+    made = made.assign_coords(imu=[2, 3])
+    made["samples"][:, 1], made["samples"][:, 2] = 800, 1000
+    made.angular_rate[:, 1, :, 800:], made.angular_rate[:, 2, :, 1000:] = np.nan, np.nan
+    made.angular_rate[0, 0, :, 400:410] = np.nan
+    return made
+
+
+def test_each_recording_counts_with_its_own_length_and_unmasked_samples(uneven):
+    allan = measure_allan_variance(uneven)
+    bias = measure_bias(uneven, allan, TOLERANCE)
+    noise = measure_noise(uneven, allan, bias).set_index(["imu", "axis"])
+    for row in bias.itertuples():
+        one = uneven.angular_rate.sel(imu=row.imu, recording=row.recording, axis=row.axis)
+        measured = one.to_numpy().astype(np.float64)
+        measured = measured[~np.isnan(measured)]
+        assert row.bias_dps == pytest.approx(measured.mean(), rel=1e-13)
+        assert row.sample_sigma_dps == pytest.approx(measured.std(ddof=1), rel=1e-9)
+        white = noise.white_dps_rts[row.imu, row.axis]
+        expected = white / np.sqrt(len(measured) / RATE_HZ)
+        assert row.standard_error_dps == pytest.approx(expected, rel=1e-12)
+    np.testing.assert_allclose(noise.white_dps_rts, NOISE, rtol=0.25)
+    assert allan.time_s.max() == 60 / 5
+    longest = allan.differences.sel(imu=2).isel(time_s=-1)
+    assert longest.to_numpy().tolist() == [1190 - 480 + 1, 800 - 480 + 1, 1000 - 480 + 1]
+
+
+@pytest.mark.parametrize(("imus", "recordings", "samples"), [(1, 1, 20), (2, 3, 30)])
+def test_what_is_too_short_for_a_fit_has_a_bias_and_one_warning(
+    make_recordings, caplog, imus, recordings, samples
+):
+    short = make_recordings(np.ones((imus, recordings, 3)), samples, RATE_HZ, NOISE)
+    short = short.assign_coords(imu=np.arange(imus) + 2)
+    allan = measure_allan_variance(short)
+    bias = measure_bias(short, allan, TOLERANCE)
+    np.testing.assert_allclose(bias.bias_dps, 1, atol=0.1)
+    assert bias.standard_error_dps.isna().all()
+    noise = measure_noise(short, allan, bias)
+    assert (
+        noise[["white_dps_rts", "instability_dps", "random_walk_dps_per_rts"]].isna().all(axis=None)
+    )
+    assert len(noise) == 3 * imus
+    (message,) = caplog.messages
+    names = ", ".join(str(imu + 2) for imu in range(imus))
+    assert message.startswith(f"sparkfun: N, B and K of IMU {names} are left empty, and with them")

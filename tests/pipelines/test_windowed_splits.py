@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from gyro_pipeline.conventions import HOLD_OUT, TEST, TRAIN, VALIDATION, InputError
-from gyro_pipeline.pipelines.windowed_splits.nodes import split_recordings
+from gyro_pipeline.pipelines.ground_truth.nodes import measure_allan_variance
+from gyro_pipeline.pipelines.windowed_splits.nodes import cut_to_shortest, split_recordings
 
 
 @pytest.fixture(scope="module")
@@ -77,3 +78,75 @@ def test_a_copy_under_another_imu_is_refused_and_absent_ones_are_no_copies(recor
     absent.angular_rate.loc[{"imu": 2, "recording": 12}] = made.angular_rate.sel(imu=1, recording=7)
     with pytest.raises(InputError, match=r"IMU 2 recording 12 .* IMU 1 recording 7"):
         split_recordings(absent, splits)
+
+
+@pytest.fixture
+def uneven(make_recordings):
+    """Of 60, 40 and 50 s at 20 Hz; IMU 2 lacks the second, and four samples are masked."""
+    made = make_recordings(np.full((2, 3, 3), 3.0), 1200, 20.0, 0.005)
+    for number, length in ((1, 800), (2, 1000)):
+        made["samples"][:, number] = length
+        made.angular_rate[:, number, :, length:] = np.nan
+    made["samples"][1, 1], made.angular_rate[1, 1] = 0, np.nan
+    made.angular_rate[0, 0, :, [3, 4, 900, 901]] = np.nan
+    return made
+
+
+def table_of(recordings):
+    """What the raw-logs stage says of them."""
+    rows = recordings["samples"].to_dataframe().reset_index()
+    stop = rows.samples.where(rows.samples > 0) + 5
+    files = [f"{i}_{n}.csv" for i, n in zip(rows.imu, rows.recording, strict=True)]
+    return rows[["imu", "recording"]].assign(file=files, start=stop * 0 + 5, stop=stop)
+
+
+def test_studies_use_the_first_samples_of_each_and_say_who_is_the_shortest(
+    uneven, make_bias, caplog
+):
+    bias = make_bias(uneven, measure_allan_variance(uneven))
+    with caplog.at_level("INFO", "gyro_pipeline"):
+        cut, biases = cut_to_shortest(uneven, bias, table_of(uneven))
+    assert caplog.messages == [
+        "sparkfun: recordings are 40.0 to 60.0 s; studies use the first 40.0 s of each, the length "
+        "of IMU 1 recording 2, 1_2.csv. quality.length_s rejects shorter ones"
+    ]
+    assert cut.angular_rate.identical(uneven.angular_rate[..., :800])
+    assert cut["samples"].values.tolist() == [[800, 800, 800], [800, 0, 800]]
+    assert cut.attrs["data_hash"] != uneven.attrs["data_hash"]
+    assert len(biases) == 5 * 3
+    for row in biases.itertuples():
+        samples = cut.angular_rate.sel(imu=row.imu, recording=row.recording, axis=row.axis)
+        assert row.bias_dps == pytest.approx(np.nanmean(samples.astype(float)), rel=1e-12)
+    assert uneven["samples"].values.tolist() == [[1200, 800, 1000], [1200, 0, 1000]]
+
+
+def test_recordings_of_one_length_stay_as_they_are(make_recordings, caplog):
+    alike = make_recordings(np.zeros((1, 2, 3)), 1200, 20.0, 0.005)
+    with caplog.at_level("INFO", "gyro_pipeline"):
+        cut, bias = cut_to_shortest(alike, "bias", table_of(alike))
+    assert cut is alike
+    assert bias == "bias"
+    assert caplog.messages == ["sparkfun: all recordings are 60.0 s"]
+
+
+def test_recordings_that_the_tested_imu_lacks_train(recordings, parameters):
+    made = recordings(30).copy(deep=True)
+    made["samples"].loc[{"imu": 1, "recording": [3, 30]}] = 0
+    roles = split_recordings(made, parameters("base").splits)
+    lacking = roles[roles.recording.isin([3, 30])]
+    assert set(lacking.role) == {TRAIN}
+    assert len(lacking) == 2 * roles.fold.nunique()
+    given = recordings(30, given_test=(1, 30)).copy(deep=True)
+    given["samples"].loc[{"imu": 1, "recording": [3, 30]}] = 0
+    roles = split_recordings(given, parameters("base").splits)
+    assert numbers(roles, TEST) == [1]
+    assert 3 in numbers(roles, TRAIN)
+    assert 30 not in roles.recording.tolist()
+
+
+def test_without_the_tested_imu_the_way_out_is_said(recordings, parameters):
+    made = recordings(30).assign_coords(imu=[2, 3])
+    with pytest.raises(
+        InputError, match=r"sparkfun: expected .* IMU 1, .* got IMUs 2, 3.*imu:name"
+    ):
+        split_recordings(made, parameters("base").splits)

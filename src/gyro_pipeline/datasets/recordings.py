@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 import xarray as xr
 from kedro.io import AbstractDataset
+from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import AXES, InputError, Missing
 from gyro_pipeline.datasets.atomic import replacing
@@ -104,14 +105,13 @@ class InspectedRecordings(AbstractDataset[Listing | Recording, list[Recording]])
     def save(self, data: Listing | Recording) -> None:
         """Begin a file for the recordings of a listing, or add one of them."""
         if isinstance(data, Recording):
-            with h5netcdf.File(self._path, "r+") as file:
-                _append(file, data)
+            _append(self._path, data)
             return
-        with replacing(self._path) as temporary, h5netcdf.File(temporary, "w") as file:
-            _begin(file, data.keys)
+        with replacing(self._path) as temporary:
+            _begin(temporary, data.keys)
             for recording in _stored(self._source(), data.keys):
                 if recording.key == data.keys.get(recording.place):
-                    _append(file, recording)
+                    _append(temporary, recording)
 
     def _source(self) -> Path:
         return self._path if self._path.is_file() else self._final
@@ -188,40 +188,51 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _begin(file: h5netcdf.File, places: Collection[tuple[int, int]]) -> None:
-    """Write the labels of all recordings that are listed."""
+def _begin(path: Path, places: Collection[tuple[int, int]]) -> None:
+    """Write a file with the labels of all recordings that are listed, and none of them."""
     imus, numbers = (sorted(set(labels)) for labels in zip(*places, strict=True))
-    file.dimensions = {
-        "imu": len(imus),
-        "recording": len(numbers),
-        "axis": len(AXES),
-        "sample": None,
-    }
     text = h5py.string_dtype()
-    file.create_variable("imu", ("imu",), np.int64, data=np.array(imus))
-    file.create_variable("recording", ("recording",), np.int64, data=np.array(numbers))
-    file.create_variable("axis", ("axis",), text, data=np.array(AXES, object))
-    file.create_variable(_INSPECTION, _PLACE, text)
+    with h5netcdf.File(path, "w") as file:
+        sizes = {"imu": len(imus), "recording": len(numbers), "axis": len(AXES)}
+        file.dimensions = sizes | {"sample": None}
+        file.create_variable("imu", ("imu",), np.int64, data=np.array(imus))
+        file.create_variable("recording", ("recording",), np.int64, data=np.array(numbers))
+        file.create_variable("axis", ("axis",), text, data=np.array(AXES, object))
+        file.create_variable(_INSPECTION, _PLACE, text)
 
 
-def _append(file: h5netcdf.File, recording: Recording) -> None:
+def _append(path: Path, recording: Recording) -> None:
     """Write one recording to its place; last of all its description, which marks it as complete."""
-    imu, number = (
-        int(np.searchsorted(file[name][:], label))
-        for name, label in zip(_PLACE, recording.place, strict=True)
-    )
-    for name, values in recording.variables.items():
-        samples = values.shape[-1]
-        if samples > file.dimensions["sample"].size:
-            file.resize_dimension("sample", samples)
-        if name not in file.variables:
-            axis = ("axis",) if values.ndim > 1 else ()
-            layout = {"fillvalue": np.float32(np.nan), "chunks": (1, 1, *values.shape)}
-            variable = file.create_variable(name, (*_PLACE, *axis, "sample"), np.float32, **layout)
-            variable.attrs["units"] = _UNITS[name]
-        file[name][(imu, number, ..., slice(samples))] = values
-    described = asdict(recording) | {"variables": list(recording.variables)}
-    file[_INSPECTION][imu, number] = json.dumps(described)
+    variables = recording.variables
+    with h5py.File(path, "r+") as file:  # in a fifth of the time that h5netcdf takes to open it
+        imu, number = (
+            int(np.searchsorted(file[name][:], label))
+            for name, label in zip(_PLACE, recording.place, strict=True)
+        )
+        if all(
+            name in file and file[name].shape[-1] >= variables[name].shape[-1] for name in variables
+        ):
+            for name, values in variables.items():
+                file[name][imu, number, ..., : values.shape[-1]] = values
+            described = asdict(recording) | {"variables": list(variables)}
+            file[_INSPECTION][imu, number] = json.dumps(described)
+            return
+    _make_room(path, variables)
+    _append(path, recording)
+
+
+def _make_room(path: Path, variables: Mapping[str, NDArray[np.float32]]) -> None:
+    """Add variables that are not there, and samples to those that are too short."""
+    with h5netcdf.File(path, "r+") as file:
+        for name, values in variables.items():
+            if values.shape[-1] > file.dimensions["sample"].size:
+                file.resize_dimension("sample", values.shape[-1])
+            if name not in file.variables:
+                axis = ("axis",) if values.ndim > 1 else ()
+                layout = {"fillvalue": np.float32(np.nan), "chunks": (1, 1, *values.shape)}
+                dimensions = (*_PLACE, *axis, "sample")
+                variable = file.create_variable(name, dimensions, np.float32, **layout)
+                variable.attrs["units"] = _UNITS[name]
 
 
 def _stored(path: Path, wanted: Mapping[tuple[int, int], str] | None = None) -> Iterator[Recording]:

@@ -28,7 +28,8 @@ def sample_sigma(samples: NDArray[np.floating]) -> NDArray[np.float64]:
     Returns:
         (...), deg/s.
     """
-    return np.asarray(np.nanstd(samples, axis=-1, ddof=1, dtype=np.float64))
+    # given a dtype, NumPy would still round deviations to that of the samples on the way
+    return np.asarray(np.nanstd(samples.astype(np.float64), axis=-1, ddof=1))
 
 
 def fill_masked(samples: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -38,7 +38,8 @@ class SquaredErrors:
         Returns:
             Shape (resamples,) or (resamples, times).
         """
-        return (weights @ self.sums) / (weights @ self.counts)
+        with np.errstate(invalid="ignore"):  # recordings of which every such window was dropped
+            return (weights @ self.sums) / (weights @ self.counts)
 
 
 @dataclass(frozen=True)
