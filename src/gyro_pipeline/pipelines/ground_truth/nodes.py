@@ -1,14 +1,12 @@
 """Nodes of the ground-truth stage."""
 
-import logging
 from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
-from gyro_pipeline.conventions import AXES, MDPS
-from gyro_pipeline.logs import REJECTED
+from gyro_pipeline.conventions import MDPS
 from gyro_pipeline.parameters import GroundTruth
 from gyro_pipeline.physics.allan import (
     SHORTEST_FIT_SAMPLES,
@@ -17,8 +15,6 @@ from gyro_pipeline.physics.allan import (
     fit_noise,
 )
 from gyro_pipeline.physics.bias import recording_mean, settling_time_s
-
-logger = logging.getLogger(__name__)
 
 _KEYS = ["imu", "recording", "axis"]
 
@@ -107,42 +103,6 @@ def measure_noise(recordings: xr.Dataset, allan: xr.Dataset, bias: pd.DataFrame)
     figures = figures.reset_index()
     figures.insert(0, "sensor", recordings.attrs["sensor"])
     return figures
-
-
-def report_biases(
-    recordings: xr.Dataset, bias: pd.DataFrame, quality: pd.DataFrame, most: int = 20
-) -> None:
-    """Print the bias of every recording and axis with its standard error, in deg/s.
-
-    Args:
-        recordings: For the sensor and its sample rate.
-        bias: From :func:`measure_bias`.
-        quality: A row per recording: its outcome, and how many of which rows are masked.
-        most: Number of recordings that are printed; more are counted.
-    """
-    sensor, rate_hz = recordings.attrs["sensor"], recordings.attrs["rate_hz"]
-    texts = list(map(_with_error, bias.bias_dps, bias.standard_error_dps))
-    table = bias.assign(text=texts).pivot(index=_KEYS[:2], columns="axis", values="text")
-    table = table.reset_index().merge(quality, on=_KEYS[:2])
-    table["seconds"] = [f"{rows / rate_hz:.2f}" for rows in table["stop"] - table["start"]]
-    columns = [*_KEYS[:2], *AXES, "seconds", "outcome", *table.columns.intersection(["masked"])]
-    lines = [table[columns].head(most).to_string(index=False)]
-    rejected = int((quality.outcome == REJECTED).sum())
-    if len(table) > most:
-        lines.append(f"{len(table) - most} more recordings are in the table of biases")
-    if rejected:
-        lines.append(f"{rejected} recordings were rejected; why is in the table of their quality")
-    if bias.standard_error_dps.isna().any():
-        lines.append("± –: no standard error, the recording is too short to tell its noise")
-    logger.info("%s: biases ± standard errors, deg/s\n%s", sensor, "\n".join(lines))
-
-
-def _with_error(value: float, error: float) -> str:
-    """A value and its standard error, of which two digits are given."""
-    if not error > 0:
-        return f"{value:.5f} ± –"
-    digits = max(0, 1 - int(np.floor(np.log10(error))))
-    return f"{value:.{digits}f} ± {error:.{digits}f}"
 
 
 def _noise_figures(allan: xr.Dataset, duration_s: float, rate_hz: float) -> xr.Dataset:
