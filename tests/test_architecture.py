@@ -26,7 +26,7 @@ ALLOWED = {
     "physics": {"conventions"},
     "estimators": {"conventions", "learning", "physics"},
     "quality": {"conventions", "logs", "parameters", "physics"},
-    "protocol": {"conventions", "logs", "parameters", "physics", "quality"},
+    "protocol": {"conventions", "fingerprints", "logs", "parameters", "physics", "quality"},
     "learning": {"conventions", "executors", "parameters", "protocol"},
     "datasets": {
         "conventions",

@@ -64,9 +64,7 @@ def rejected(end: Ending, *words: str) -> None:
         assert re.search(word, end.findings, re.IGNORECASE), (word, end.findings)
 
 
-def kept(
-    end: Ending, bias: Sequence[float] = TRUTH, *words: str, within: float = 0.01
-) -> None:
+def kept(end: Ending, bias: Sequence[float] = TRUTH, *words: str, within: float = 0.01) -> None:
     assert end.bias is not None and end.outcome != REJECTED, end
     np.testing.assert_allclose(end.bias, bias, atol=within)
     for word in words:
@@ -86,8 +84,10 @@ def seconds(n: int, rate_hz: float = RATE) -> NDArray[np.float64]:
 def text(path: Path, header: str, *columns: Any, sep: str = ",", digits: int = 6) -> Path:
     """A text of a header and columns: numbers, or texts."""
     cells = [
-        [value if isinstance(value, str) else f"{value:.{digits}f}".rstrip("0").rstrip(".")
-         for value in np.asarray(column).tolist()]
+        [
+            value if isinstance(value, str) else f"{value:.{digits}f}".rstrip("0").rstrip(".")
+            for value in np.asarray(column).tolist()
+        ]
         for block in columns
         for column in np.atleast_2d(np.asarray(block).T)
     ]
@@ -211,7 +211,11 @@ def test_kind_4_names_put_axes_in_order(path: Path) -> None:
 def test_kind_4_nothing_but_rates_is_taken_for_rates(path: Path, names: str) -> None:
     text(path, f"time (s),{names}", seconds(6000), still())
     refused(ending(path, None, units="deg/s"), "columns|rate")
-    refused(ending(path, None, units="deg/s", columns=[1, 2, 3]), names.split(",")[0], "trust")
+    refused(
+        ending(path, None, units="deg/s", columns=[1, 2, 3]),
+        names.split(",", maxsplit=1)[0],
+        "trust",
+    )
 
 
 def test_kind_5_a_level_that_no_gyroscope_has_asks_for_an_offset(path: Path) -> None:
@@ -328,7 +332,9 @@ def test_kind_36_lost_decimal_points(path: Path) -> None:
 def test_kind_37_a_header_in_another_encoding(path: Path) -> None:
     text(path, "t (s),gx,gy,gz", seconds(6000), still())
     rows = path.read_text().split("\n", 1)[1]
-    path.write_bytes("时间(s),角速度X(°/s),角速度Y(°/s),角速度Z(°/s)\n".encode("gbk") + rows.encode())
+    path.write_bytes(
+        "时间(s),角速度X(°/s),角速度Y(°/s),角速度Z(°/s)\n".encode("gbk") + rows.encode()
+    )
     refused(ending(path, None), "encoding")
     kept(ending(path, None, encoding="gbk"))
 
@@ -347,7 +353,8 @@ def test_kind_40_two_sensors_side_by_side(path: Path) -> None:
     text(path, ",".join(["t (s)", *names]), seconds(6000), still(), other)
     refused(ending(path, None, units="deg/s"), "icm", "asm", "columns")
     per_imu = ReaderOptions(
-        units="deg/s", columns={1: ["icm_gx", "icm_gy", "icm_gz"], 2: ["asm_gx", "asm_gy", "asm_gz"]}
+        units="deg/s",
+        columns={1: ["icm_gx", "icm_gy", "icm_gz"], 2: ["asm_gx", "asm_gy", "asm_gz"]},
     )
     for imu, bias in ((1, TRUTH), (2, (-0.2, 0.3, 0.9))):
         samples = read_log(path, per_imu, None, imu=imu).samples

@@ -6,7 +6,6 @@ such as a study of a sensor, is checked for the studies that are to run
 """
 
 import math
-import re
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal, Self
 

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from gyro_pipeline.conventions import AXES
-from gyro_pipeline.pipelines.ground_truth.nodes import report_biases
+from gyro_pipeline.pipelines.ground_truth.report import report_biases
 
 RATE_HZ, KEYS = 20.0, ["imu", "recording", "axis"]
 

@@ -1,14 +1,11 @@
 """Nodes of the ground-truth stage. Recordings may differ in length; samples may be masked."""
 
-import logging
-
 import numpy as np
 import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyro_pipeline.conventions import AXES, MDPS, InputError
-from gyro_pipeline.logs import REJECTED
+from gyro_pipeline.conventions import MDPS, InputError
 from gyro_pipeline.parameters import GroundTruth
 from gyro_pipeline.physics.allan import (
     SHORTEST_FIT_SAMPLES,
@@ -19,8 +16,6 @@ from gyro_pipeline.physics.allan import (
 )
 from gyro_pipeline.physics.bias import recording_mean, sample_sigma, settling_time_s
 from gyro_pipeline.protocol.recordings import one_by_one
-
-logger = logging.getLogger(__name__)
 
 _KEYS = ["imu", "recording", "axis"]
 _FIGURES = ["white_dps_rts", "instability_dps", "random_walk_dps_per_rts"]
@@ -148,42 +143,6 @@ def _noise_figures(
             rows = [(axis.white, axis.instability, axis.random_walk) for axis in fitted]
             figures[imu] = np.array(rows), ""
     return figures
-
-
-def report_biases(
-    recordings: xr.Dataset, bias: pd.DataFrame, quality: pd.DataFrame, most: int = 20
-) -> None:
-    """Print the bias of every recording and axis with its standard error, in deg/s.
-
-    Args:
-        recordings: For the sensor and its sample rate.
-        bias: From :func:`measure_bias`.
-        quality: A row per recording: its outcome, and how many of which rows are masked.
-        most: Number of recordings that are printed; more are counted.
-    """
-    sensor, rate_hz = recordings.attrs["sensor"], recordings.attrs["rate_hz"]
-    texts = list(map(_with_error, bias.bias_dps, bias.standard_error_dps))
-    table = bias.assign(text=texts).pivot(index=_KEYS[:2], columns="axis", values="text")
-    table = table.reset_index().merge(quality, on=_KEYS[:2])
-    table["seconds"] = [f"{rows / rate_hz:.2f}" for rows in table["stop"] - table["start"]]
-    columns = [*_KEYS[:2], *AXES, "seconds", "outcome", *table.columns.intersection(["masked"])]
-    lines = [table[columns].head(most).to_string(index=False)]
-    rejected = int((quality.outcome == REJECTED).sum())
-    if len(table) > most:
-        lines.append(f"{len(table) - most} more recordings are in the table of biases")
-    if rejected:
-        lines.append(f"{rejected} recordings were rejected; why is in the table of their quality")
-    if bias.standard_error_dps.isna().any():
-        lines.append("± –: no standard error, the recording is too short to tell its noise")
-    logger.info("%s: biases ± standard errors, deg/s\n%s", sensor, "\n".join(lines))
-
-
-def _with_error(value: float, error: float) -> str:
-    """A value and its standard error, of which two digits are given."""
-    if not error > 0:
-        return f"{value:.5f} ± –"
-    digits = max(0, 1 - int(np.floor(np.log10(error))))
-    return f"{value:.{digits}f} ± {error:.{digits}f}"
 
 
 def _measured(samples: NDArray[np.floating]) -> int:

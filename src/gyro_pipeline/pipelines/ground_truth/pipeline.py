@@ -6,8 +6,8 @@ from gyro_pipeline.pipelines.ground_truth.nodes import (
     measure_allan_variance,
     measure_bias,
     measure_noise,
-    report_biases,
 )
+from gyro_pipeline.pipelines.ground_truth.report import report_biases
 
 
 def create_report(sensor: str) -> Pipeline:
