@@ -24,7 +24,6 @@ the Earth's rate falls differently on the axes. A rotation as steady as a bias c
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding, Log

@@ -1,11 +1,13 @@
 """Nodes of the ground-truth stage. Recordings may differ in length; samples may be masked."""
 
+import logging
+
 import numpy as np
 import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyro_pipeline.conventions import MDPS, InputError
+from gyro_pipeline.conventions import AXES, MDPS, InputError
 from gyro_pipeline.parameters import GroundTruth
 from gyro_pipeline.physics.allan import (
     SHORTEST_FIT_SAMPLES,
@@ -17,7 +19,8 @@ from gyro_pipeline.physics.allan import (
 from gyro_pipeline.physics.bias import recording_mean, sample_sigma, settling_time_s
 from gyro_pipeline.protocol.recordings import one_by_one
 
-_KEYS = ["imu", "recording", "axis"]
+logger = logging.getLogger(__name__)
+
 _FIGURES = ["white_dps_rts", "instability_dps", "random_walk_dps_per_rts"]
 
 
