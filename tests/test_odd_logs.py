@@ -127,15 +127,14 @@ ORDERS = {
 }
 
 
-@pytest.mark.parametrize("order", ORDERS.values(), ids=ORDERS)
-def test_kind_1_devices_that_take_turns_are_refused_and_rows_picks(
-    path: Path, order: NDArray[np.intp]
-) -> None:
+@pytest.mark.parametrize("name", ORDERS)
+def test_kind_1_devices_that_take_turns_are_refused_and_rows_picks(path: Path, name: str) -> None:
+    order = ORDERS[name]
     rates = several_devices(order)
     header = "time (s),sensor,gx (deg/s),gy (deg/s),gz (deg/s)"
     text(path, header, seconds(9000, 300), order + 1, rates)
     refused(ending(path, None), "'?sensor'?", "rows:", "reader")
-    if order[49] == order[0]:  # what a device measures in bursts has gaps
+    if name == "in bursts":  # what a device measures in bursts has gaps
         rejected(ending(path, None, rows={"sensor": 1}), "too short")
     else:
         kept(ending(path, None, rows={"sensor": 1}), DEVICES[0])
@@ -211,11 +210,7 @@ def test_kind_4_names_put_axes_in_order(path: Path) -> None:
 def test_kind_4_nothing_but_rates_is_taken_for_rates(path: Path, names: str) -> None:
     text(path, f"time (s),{names}", seconds(6000), still())
     refused(ending(path, None, units="deg/s"), "columns|rate")
-    refused(
-        ending(path, None, units="deg/s", columns=[1, 2, 3]),
-        names.split(",", maxsplit=1)[0],
-        "trust",
-    )
+    refused(ending(path, None, units="deg/s", columns=[1, 2, 3]), names.split(",")[0], "trust")
 
 
 def test_kind_5_a_level_that_no_gyroscope_has_asks_for_an_offset(path: Path) -> None:
