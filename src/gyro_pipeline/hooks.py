@@ -75,11 +75,10 @@ class Preflight:
         for folder in sorted(folders):
             logger.info("tables and figures: %s", _relative(folder, self._project))
         if not folders:  # no runs either
-            stored = [
-                n for n in pipeline.all_outputs() if n.endswith((".raw_logs.quality", ".bias"))
-            ]
-            for path in sorted(path for name in stored for path in _paths(catalog.get(name))):
-                logger.info("table:              %s", _relative(path, self._project))
+            ends = (".raw_logs.quality", ".ground_truth.bias")
+            for name in sorted(name for name in pipeline.all_outputs() if name.endswith(ends)):
+                for path in _paths(catalog.get(name)):
+                    logger.info("table:              %s", _relative(path, self._project))
         for name in pipeline.all_outputs() & {"reporting.report"}:
             for path in _paths(catalog.get(name)):
                 logger.info("report:             %s", _relative(path, self._project))
