@@ -25,6 +25,7 @@ def report(make_recordings, caplog):
         outcomes = ["repaired"] + ["kept"] * (len(keys) - 1) + ["rejected"] * rejected
         quality = quality.assign(outcome=outcomes, start=1, stop=201, masked=0, file="1.csv")
         quality["findings"] = "motion: it moved"
+        quality = quality.astype({"masked": float})
         quality.loc[0, ["stop", "masked"]] = 151, 3
         with caplog.at_level(logging.INFO):
             report_biases(rates, bias, quality)

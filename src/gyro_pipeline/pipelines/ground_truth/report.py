@@ -32,7 +32,8 @@ def report_biases(
     table = table.reset_index().merge(quality, on=_PLACE)
     table["seconds"] = [f"{rows / rate_hz:.2f}" for rows in table["stop"] - table["start"]]
     columns = [*_PLACE, *AXES, "seconds", "outcome", *table.columns.intersection(["masked"])]
-    lines = [table[columns].head(most).to_string(index=False)]
+    whole = table[columns].head(most).convert_dtypes()  # counts are floats beside rejected rows
+    lines = [whole.to_string(index=False)]
     if bias.standard_error_dps.isna().any():
         lines.append("± –: no standard error, the recordings are too short to fit their noise")
     rejected = quality[quality.outcome == REJECTED]
