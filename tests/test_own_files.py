@@ -1,10 +1,15 @@
 """A user's own device: a folder of files in, biases with their standard errors out."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
+
+from gyro_pipeline.parameters import ReaderOptions
+from gyro_pipeline.readers import check_format
 
 BIAS, NOISE, RATE_HZ = (0.7, -0.4, 0.15), 0.05, 100
 HEADER = "time (s),gx (rad/s),gy (rad/s),gz (rad/s)"
@@ -93,9 +98,11 @@ def test_eight_lines_and_one_command_are_enough(make):
 
 def test_one_line_is_enough(make):
     project = make(*THREE)
+    (project.folder / FOLDER / "notes.txt").write_text("still_2 is the one on the concrete floor\n")
     arguments = f"--params=logs={FOLDER},reader.units=rad/s"
-    check(project.kedro_run("--pipeline=ground_truth", "--env=logs", arguments),
-          [(1, 1), (1, 2), (1, 3)])  # fmt: skip
+    done = project.kedro_run("--pipeline=ground_truth", "--env=logs", arguments)
+    check(done, [(1, 2), (1, 3), (1, 4)])
+    assert "rejected: IMU 1 recording 1, notes.txt: " in done.output
     assert set(biases(project, "logs").sensor) == {"device"}
 
 
@@ -175,3 +182,16 @@ def test_a_sensor_without_files_is_not_simulated_from_nothing(make):
         "device has no files: an entry device.raw_logs.files in conf/<env>/catalog" in done.output
     )
     assert "imus, recordings, train_recordings, samples, recording_s, simulated" in done.output
+
+
+def readme_examples():
+    """Of options of the reader, in the README's table."""
+    table = (Path(__file__).parents[1] / "README.md").read_text().split("| `reader` |")[1]
+    rows = table.split("\n\n")[0].splitlines()[2:]
+    return [found for row in rows for found in re.findall(r"`([a-z_]+: .*?)`", row)]
+
+
+@pytest.mark.parametrize("example", readme_examples())
+def test_options_of_the_readme_are_options_of_the_reader(example):
+    given = yaml.safe_load(f"{{{example}}}")
+    check_format(ReaderOptions(**given).format, "README.md")

@@ -104,7 +104,7 @@ def test_the_configuration_of_this_project_is_accepted(loaded, monkeypatch, tmp_
         ),
         ({"sensors": {"ng": {"rate_hz": 0}}}, "sensors.ng.rate_hz:", "greater than 0"),
         ({"logs": 5}, "logs:", "valid string"),
-        ({"reader": {"unit": "deg/s"}}, "reader.unit:", "unknown key; there are format, columns"),
+        ({"reader": {"unit": "deg/s"}}, "reader.unit:", "unknown key; there are format, "),
     ],
 )
 def test_a_bad_parameter_is_refused_by_its_place(loaded, refusal, changes, place, said):

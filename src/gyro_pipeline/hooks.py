@@ -74,14 +74,16 @@ class Preflight:
         folders = {path.parent.parent for name in tables for path in _paths(catalog.get(name))}
         for folder in sorted(folders):
             logger.info("tables and figures: %s", _relative(folder, self._project))
-        stored = (name for name in pipeline.all_outputs() if name.endswith((".quality", ".bias")))
-        if not folders:
-            for path in sorted(path for name in stored for path in _paths(catalog.get(name))):
-                logger.info("table:              %s", _relative(path, self._project))
+        if not folders:  # no runs either
+            ends = (".raw_logs.quality", ".ground_truth.bias")
+            for name in sorted(name for name in pipeline.all_outputs() if name.endswith(ends)):
+                for path in _paths(catalog.get(name)):
+                    logger.info("table:              %s", _relative(path, self._project))
         for name in pipeline.all_outputs() & {"reporting.report"}:
             for path in _paths(catalog.get(name)):
                 logger.info("report:             %s", _relative(path, self._project))
-        logger.info("compare runs:       mlflow ui")
+        if folders:
+            logger.info("compare runs:       mlflow ui")
         logger.info("see the lineage:    kedro viz")
 
 

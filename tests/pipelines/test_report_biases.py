@@ -23,7 +23,9 @@ def report(make_recordings, caplog):
         bias = bias.assign(bias_dps=-1.23456789, standard_error_dps=error)
         quality = pd.DataFrame(keys + [(3, n) for n in range(rejected)], columns=KEYS[:2])
         outcomes = ["repaired"] + ["kept"] * (len(keys) - 1) + ["rejected"] * rejected
-        quality = quality.assign(outcome=outcomes, start=1, stop=201, masked=0)
+        quality = quality.assign(outcome=outcomes, start=1, stop=201, masked=0, file="1.csv")
+        quality["findings"] = "motion: it moved"
+        quality = quality.astype({"masked": float})
         quality.loc[0, ["stop", "masked"]] = 151, 3
         with caplog.at_level(logging.INFO):
             report_biases(rates, bias, quality)
@@ -55,8 +57,11 @@ def test_lengths_and_masked_rows_are_those_of_each_recording(report):
 
 
 def test_what_is_not_shown_is_counted(report):
-    lines = report(15, np.nan, rejected=4)
-    assert len(lines) == 1 + 20 + 3
-    assert lines[-3] == "10 more recordings are in the table of biases"
-    assert lines[-2] == "4 recordings were rejected; why is in the table of their quality"
-    assert lines[-1].startswith("± –: no standard error")
+    lines = report(15, np.nan, rejected=24)
+    assert len(lines) == 1 + 20 + 1 + 20 + 2
+    assert lines[21].startswith("± –: no standard error")
+    assert lines[22] == "rejected: IMU 3 recording 0, 1.csv: motion: it moved"
+    assert lines[-2:] == [
+        "10 more are in the table of biases",
+        "4 more are in the table of their quality",
+    ]

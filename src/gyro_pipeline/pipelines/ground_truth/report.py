@@ -22,8 +22,9 @@ def report_biases(
     Args:
         recordings: For the sensor and its sample rate.
         bias: The ground truth of all recordings.
-        quality: A row per recording: its outcome, and how many of which rows are masked.
-        most: Number of recordings that are printed; more are counted.
+        quality: A row per recording: its outcome, which rows are used and how many masked.
+        most: Number of recordings that are printed, of the used and of the rejected; more are
+            counted.
     """
     sensor, rate_hz = recordings.attrs["sensor"], recordings.attrs["rate_hz"]
     texts = list(map(_with_error, bias.bias_dps, bias.standard_error_dps))
@@ -31,14 +32,17 @@ def report_biases(
     table = table.reset_index().merge(quality, on=_PLACE)
     table["seconds"] = [f"{rows / rate_hz:.2f}" for rows in table["stop"] - table["start"]]
     columns = [*_PLACE, *AXES, "seconds", "outcome", *table.columns.intersection(["masked"])]
-    lines = [table[columns].head(most).to_string(index=False)]
-    rejected = int((quality.outcome == REJECTED).sum())
-    if len(table) > most:
-        lines.append(f"{len(table) - most} more recordings are in the table of biases")
-    if rejected:
-        lines.append(f"{rejected} recordings were rejected; why is in the table of their quality")
+    whole = table[columns].head(most).convert_dtypes()  # counts are floats beside rejected rows
+    lines = [whole.to_string(index=False)]
     if bias.standard_error_dps.isna().any():
-        lines.append("± –: no standard error, the recording is too short to tell its noise")
+        lines.append("± –: no standard error, the recordings are too short to fit their noise")
+    rejected = quality[quality.outcome == REJECTED]
+    for row in rejected.head(most).itertuples():
+        where = f"IMU {row.imu} recording {row.recording}, {row.file}"
+        lines.append(f"rejected: {where}: {row.findings}")
+    for rows, name in ((table, "biases"), (rejected, "their quality")):
+        if len(rows) > most:
+            lines.append(f"{len(rows) - most} more are in the table of {name}")
     logger.info("%s: biases ± standard errors, deg/s\n%s", sensor, "\n".join(lines))
 
 
