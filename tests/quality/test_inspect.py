@@ -107,7 +107,7 @@ def swaying(amplitude_dps, period_s):
         (with_rows(77, lambda row: row + [0, 9 * SIGMA, 0]), {"spikes": REPAIRED}, ["y, row 77,"]),
         (dense_spikes, {"spikes": REPAIRED}, ["axis y"]),
         (knocked, {"shocks": REPAIRED}, ["rows 450 to 553"]),
-        (started, {"start": REPAIRED}, ["rows 0 to 99 "]),
+        (started, {"start": REPAIRED}, ["rows 0 to 60 "]),
         (lambda x: x + decay(0.5, 0.4), {"start": REPAIRED}, ["rows 0 to 1"]),
         (lambda x: x + decay(0.3, 8), {"warm-up": KEPT}, ["x by -", "time constant about 8"]),
         (lambda x: x + decay(0.2, 3) + decay(0.3, 40), {"warm-up": KEPT}, []),

@@ -94,7 +94,6 @@ def inspect(log: Log, rate_hz: float, quality: Quality) -> Inspected:
         recording.check_length,
         recording.check_noise,
         recording.check_rest,
-        recording.check_length,
     )
     findings = list(log.findings)
     for check in checks:
@@ -114,6 +113,7 @@ class _Recording:
     def __init__(self, rates: Array, log: Log, rate_hz: float, quality: Quality) -> None:
         self.rates, self.masked = rates, np.zeros(rates.shape[1], bool)
         self.start, self.total, self.log = 0, rates.shape[1], log
+        self.cut: Mask | None = None  # what was masked when blocks were cut
         self.rate_hz, self.quality = rate_hz, quality
         self.size = max(round(quality.block_s * rate_hz), LEAST_BLOCK)
 
@@ -142,7 +142,15 @@ class _Recording:
         used, q = int(np.count_nonzero(~self.masked)), self.quality
         least = max(q.least_s * self.rate_hz, LEAST_BLOCKS * self.size)
         if used >= max(least, q.least_share * self.masked.size):
-            return []
+            if self.cut is self.masked:  # nothing was masked since
+                return []
+            self.cut, self.used = self.masked, self.rates
+            self.rates = fill(self.rates, self.masked)
+            self.blocks = cut_blocks(self.rates, self.masked, self.size)
+            if used < self.masked.size:
+                self.used = self.rates.compress(~self.masked, axis=1)
+            if self.blocks.starts.size >= LEAST_BLOCKS:
+                return []
         detail = (
             f"{used} of {self.total} rows can be used, {used / self.rate_hz:.4g} s; expected at "
             f"least {least / self.rate_hz:.4g} s (quality.least_s) and {q.least_share:.0%} of the "
@@ -152,7 +160,6 @@ class _Recording:
 
     def check_values(self) -> list[Finding]:
         """What the values say by themselves, as they are."""
-        self._cut()
         rates, sigma = self.used, self.blocks.sigma
         steps = values.check_steps(rates, sigma, self.quality.largest_step)
         turns = values.check_turns(rates, sigma)
@@ -179,8 +186,6 @@ class _Recording:
                 far = np.abs(self.rates[:, rows] - level).max(axis=1)
                 what = f"up to {far.max():.3g} deg/s from the level, axis {AXES[far.argmax()]}, "
                 findings += self._mask(check, rows & ~self.masked, what)
-        if findings:
-            self._cut()
         return findings
 
     def check_noise(self) -> list[Finding]:
@@ -194,9 +199,6 @@ class _Recording:
     def check_rest(self) -> list[Finding]:
         """Motion, a bias that is taken off, and a drift."""
         blocks, q = self.blocks, self.quality
-        if blocks.starts.size < LEAST_BLOCKS:
-            detail = f"{blocks.starts.size} blocks of {q.block_s:g} s hold rows enough; expected"
-            return [Finding("too short", REJECTED, f"{detail} at least {LEAST_BLOCKS}")]
         times = blocks.starts / self.size + 0.5
         drift, fast = fit_drift(blocks.means, times, blocks.noise, q.false_alarm)
         # a smaller start harms nothing
@@ -218,6 +220,7 @@ class _Recording:
             return [Finding("motion", REJECTED, motion)]
         start = np.arange(self.masked.size) < rest.starts[0]
         findings = self._mask("start", start, "settles at once, ") if first else []
+        findings += self.check_length() if first else []
         return findings + self._drifts(rest, drift, times[first:] * self.size / self.rate_hz)
 
     def _drifts(self, blocks: Blocks, drift: Array, times_s: Array) -> list[Finding]:
@@ -272,18 +275,13 @@ class _Recording:
         rows[blocks.starts[far, None] + np.arange(self.size)] = True
         return f"{text}, {self._where(rows)}" * int(rows.any())
 
-    def _cut(self) -> None:
-        self.rates = fill(self.rates, self.masked)
-        self.blocks = cut_blocks(self.rates, self.masked, self.size)
-        self.used = self.rates
-        if self.masked.any():
-            self.used = self.rates.compress(~self.masked, axis=1)
-
     def _mask(self, check: str, rows: Mask, what: str, outcome: str = REPAIRED) -> list[Finding]:
         """Mask rows, and say so if there are any."""
+        if not rows.any():
+            return []
         self.masked = self.masked | rows
         done = "cut" if check in {"zero rows", "start"} else "masked"
-        return [Finding(check, outcome, f"{what}{self._where(rows)}, {done}")] * int(rows.any())
+        return [Finding(check, outcome, f"{what}{self._where(rows)}, {done}")]
 
     def _where(self, rows: Mask, most: int = 5) -> str:
         """Rows of the file, for a person; long runs with their times."""

@@ -111,7 +111,8 @@ def excursions(rates: Array, blocks: Blocks, false_alarm: float) -> Mask:
     """Rows farther from the level about them than noise explains.
 
     The level is the median of the means of nine blocks, so that a movement does not hide itself.
-    White noise has any with a probability of ``false_alarm``, however many samples there are.
+    White noise has any with a probability of ``false_alarm``, however many samples there are. At
+    least seven blocks are needed.
     """
     normal = -NormalDist().inv_cdf(false_alarm / (2 * rates.size))
     # sigma from distances: squares would let frequent spikes hide themselves
@@ -121,7 +122,10 @@ def excursions(rates: Array, blocks: Blocks, false_alarm: float) -> Mask:
     beyond = np.zeros(rates.shape[1], bool)
     if (blocks.reach < 0.8 * limits).all():  # one sample of five moves their mean by a fifth
         return beyond
-    padded = np.pad(blocks.means, ((0, 0), (4, 4)), "reflect", reflect_type="odd")  # keeps a slope
+    # a slope goes on beyond the ends, whatever the first and the last block hold
+    before = 2 * np.median(blocks.means[:, :3], axis=1, keepdims=True) - blocks.means[:, 6:2:-1]
+    after = 2 * np.median(blocks.means[:, -3:], axis=1, keepdims=True) - blocks.means[:, -4:-8:-1]
+    padded = np.hstack([before, blocks.means, after])
     levels = np.median(np.lib.stride_tricks.sliding_window_view(padded, 9, axis=1), axis=2)
     wide = (blocks.reach + np.abs(blocks.means - levels) > limits).any(axis=0)
     rows = blocks.starts[wide, None] + np.arange(blocks.size)

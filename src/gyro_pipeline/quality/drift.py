@@ -74,7 +74,8 @@ def goes_to_zero(means: Array, noise: Array, least_dps: float = 3e-3, longest: i
     late = means[:, -max(means.shape[1] // 4, 1) :]
     zero = np.clip(4 * noise / np.sqrt(late.shape[1]), least_dps, 4 * least_dps)
     level = np.abs(means[:, 0])
-    middle = np.abs(np.abs(means[np.argmax(level)]) / level.max() - 0.5) < 0.3  # noqa: PLR2004
     was = np.count_nonzero(level > np.maximum(10 * zero, 5 * noise)) > 1
-    gone = (np.abs(late.mean(axis=1)) < zero).all()
-    return bool(was and gone and np.count_nonzero(middle) <= longest)
+    if not was or (np.abs(late.mean(axis=1)) >= zero).any():
+        return False
+    middle = np.abs(np.abs(means[np.argmax(level)]) / level.max() - 0.5) < 0.3  # noqa: PLR2004
+    return bool(np.count_nonzero(middle) <= longest)

@@ -50,21 +50,21 @@ def check_turns(rates: Array, sigma: Array, least: float = 0.5, period: int = 12
     """Rows of levels in turn, ``period`` or a divisor of it, apart by ``least`` of the noise."""
     turns = rates[:, : rates.shape[1] // period * period].reshape(len(rates), -1, period)
     slope = (turns[:, -1].mean(axis=1) - turns[:, 0].mean(axis=1)) / rates.shape[1]
+    trend = slope[:, None] * np.arange(period)
 
     def excess(levels: Array) -> Array:
-        levels = levels - slope[:, None] * np.arange(period)
         about = np.sqrt(np.maximum(sigma**2 - levels.var(axis=1), 0.01 * sigma**2))
         chance = 8 / np.sqrt(turns.shape[1])  # the range of so many means or medians, at most
         return np.ptp(levels, axis=1) - max(least, chance) * about
 
-    if not (excess(turns.mean(axis=1)) > 0).any():
+    if not (excess(turns.mean(axis=1) - trend) > 0).any():
         return []
-    levels = np.median(turns, axis=1)  # a shock moves no median
+    levels = np.median(turns, axis=1) - trend  # a shock moves no median
     axis = int(np.argmax(excess(levels)))
     if excess(levels)[axis] <= 0:
         return []
     size = np.ptp(levels[axis])
-    ranges = {p: np.ptp(levels[axis].reshape(-1, p), axis=0).max() for p in (2, 3, 4, 6, period)}
+    ranges = {p: np.ptp(levels[axis].reshape(-1, p), axis=0).max() for p in (2, 3, 4, 6, 12)}
     every = min(p for p in ranges if ranges[p] < size / 2)
     detail = (
         f"every {every} rows axis {AXES[axis]} is at another level, {size:.3g} deg/s off: several "
