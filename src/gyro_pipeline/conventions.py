@@ -5,12 +5,16 @@ where a person reads or types them, and the name then says so (``noise_mdps_rts`
 
 Recordings are :class:`xarray.Dataset` objects with
 
-* ``angular_rate`` (imu, recording, axis, sample), float32, deg/s;
+* ``angular_rate`` (imu, recording, axis, sample), float32, deg/s; NaN beyond the recording's length
+  and where it is masked: where a sample holds no measurement;
+* ``samples`` (imu, recording), the length; 0 where the IMU lacks the recording;
+* ``temperature_c`` (imu, recording, sample), degrees Celsius, and ``acceleration_g``
+  (imu, recording, axis, sample), g, float32, where the files have them;
 * ``true_bias`` (imu, recording, axis), float64, deg/s, on simulated data only;
 * ``given_split`` (recording), ``"train"`` or ``"test"``, where the source came split;
 * attributes ``sensor``, ``source``, ``simulated`` (0 or 1), ``rate_hz`` and ``data_hash``.
 
-A recording that one IMU lacks is NaN as a whole for that IMU; no other NaN is allowed.
+Those of a study (``windowed_splits.recordings``) are all of one length.
 """
 
 from dataclasses import dataclass

@@ -131,7 +131,8 @@ class Recording:
         stop: The row after the last one that is kept.
         masked: Rows between them that hold no measurement.
         rate_hz: Measured from timestamps; None where there are none, or it cannot be read.
-        content: Hash of the samples that are kept; two recordings of one hash are one.
+        content: Hash of the samples that are kept (:func:`~gyro_pipeline.fingerprints.data_hash`);
+            two recordings of one hash are one.
         variables: What is kept, float32, by its name in the recordings: ``angular_rate``
             (axis, sample), NaN where masked; ``temperature_c`` (sample) and ``acceleration_g``
             (axis, sample) where the file has them. Empty for a rejected recording.

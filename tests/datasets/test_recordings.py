@@ -16,6 +16,7 @@ from gyro_pipeline.datasets.recordings import (
     InspectedRecordings,
     Recordings,
 )
+from gyro_pipeline.fingerprints import data_hash
 from gyro_pipeline.logs import KEPT, REJECTED, Finding, Listing, Recording
 
 
@@ -172,7 +173,8 @@ def recording(imu, number, samples=100, **changes):
     given = {
         **{"imu": imu, "recording": number, "where": f"{imu}_{number}.csv", "key": f"k{number}"},
         **{"outcome": KEPT, "findings": (Finding("time", KEPT, "jitter of 3 ms"),)},
-        **{"rows": samples + 5, "start": 5, "stop": samples + 5, "content": "abc"},
+        **{"rows": samples + 5, "start": 5, "stop": samples + 5},
+        "content": data_hash(rates, None),
         "variables": {"angular_rate": rates},
     }
     return Recording(**given | changes)
@@ -252,3 +254,7 @@ def test_a_new_listing_keeps_what_has_the_same_place_and_key(tmp_path):
     with h5py.File(tmp_path / "dot.unfinished.nc") as file:
         assert file["imu"][:].tolist() == [1, 3]
         np.testing.assert_array_equal(file["angular_rate"][0, 0], same.variables["angular_rate"])
+    with h5py.File(tmp_path / "dot.unfinished.nc", "r+") as file:
+        file["angular_rate"][0, 0, 0, 50] = 7.0  # as a process that is killed may leave it
+    reading(tmp_path).save(listing(same))
+    assert reading(tmp_path).load() == []

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import AXES, InputError, Missing
 from gyro_pipeline.datasets.atomic import replacing
+from gyro_pipeline.fingerprints import data_hash
 from gyro_pipeline.logs import REJECTED, Finding, Listing, Recording
 
 _ENGINE: Final = "h5netcdf"
@@ -110,7 +111,7 @@ class InspectedRecordings(AbstractDataset[Listing | Recording, list[Recording]])
         with replacing(self._path) as temporary:
             _begin(temporary, data.keys)
             for recording in _stored(self._source(), data.keys):
-                if recording.key == data.keys.get(recording.place):
+                if recording.key == data.keys.get(recording.place) and _intact(recording):
                     _append(temporary, recording)
 
     def _source(self) -> Path:
@@ -219,6 +220,12 @@ def _append(path: Path, recording: Recording) -> None:
             return
     _make_room(path, variables)
     _append(path, recording)
+
+
+def _intact(recording: Recording) -> bool:
+    """Whether its samples are those that were written; a process may be killed while it writes."""
+    rates = recording.variables.get("angular_rate")
+    return rates is None or data_hash(rates, None) == recording.content
 
 
 def _make_room(path: Path, variables: Mapping[str, NDArray[np.float32]]) -> None:

@@ -1,12 +1,12 @@
 """One recording, read once and judged; what a worker process does."""
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gyro_pipeline.conventions import InputError
+from gyro_pipeline.fingerprints import data_hash
 from gyro_pipeline.logs import REJECTED, Finding, Log, LogEntry, Recording
 from gyro_pipeline.parameters import Quality
 from gyro_pipeline.quality import inspect
@@ -123,6 +123,6 @@ def _with_samples(
         start=kept.start,
         stop=kept.stop,
         masked=int(masked.sum()),
-        content=hashlib.sha256(rates.data).hexdigest(),
+        content=data_hash(rates, None),
         variables=variables,
     )

@@ -113,7 +113,7 @@ class Bench:
             for imu, number in places
             if there.sel(imu=imu, recording=number)
         ]
-        return [
+        tested = [
             TestRecording(
                 number=int(one.recording),
                 samples=one.angular_rate.to_numpy(),
@@ -124,6 +124,7 @@ class Bench:
             )
             for one in chosen
         ]
+        return [one for one in tested if len(one.starts(self.size))]
 
     @cached_property
     def _truths(self) -> list[dict[str, tuple[np.ndarray, np.ndarray]]]:
