@@ -63,6 +63,12 @@ def knocked(x):
     return x
 
 
+def knocked_throughout(x):
+    for start in range(30, ROWS, 300):
+        x[start : start + 10] += 5
+    return x
+
+
 def touched(x):
     for start in (1000, 3000, 5000):
         x[start : start + 150, 1] += 5 * np.hanning(150)
@@ -114,6 +120,7 @@ def swaying(amplitude_dps, period_s):
         (lambda x: x + 0.4 * SECONDS[:, None] / 60, {"drift": KEPT}, ["by +4", "not settled"]),
         (lambda x: x + 0.3 * (SECONDS[:, None] / 60) ** 2, {"drift": KEPT}, []),
         (lambda x: x + decay(20, 20), {"motion": REJECTED}, ["largest_drift_dps"]),
+        (knocked_throughout, {"motion": REJECTED}, ["and 15 more"]),
         (touched, {"motion": REJECTED}, ["rows 9", "rows 29", "rows 49", "axis y"]),
         (with_rows(slice(2500, None), lambda x: x - [0.1, 0, 0]), {"motion": REJECTED}, ["axis x"]),
         (with_rows(slice(3000), lambda x: x * 2 - BIAS), {"motion": REJECTED}, ["the noise"]),

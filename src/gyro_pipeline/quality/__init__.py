@@ -174,6 +174,8 @@ class _Recording:
                 spikes[first:last] = True
             else:
                 about[max(first - self.size, 0) : last + self.size] = True
+        if about.mean() > 1 - self.quality.least_share:  # knocks throughout are a motion
+            self.moved, about = about, self.moved
         for first, last in runs(about):
             if last - first >= self.quality.shock_s * self.rate_hz + 2 * self.size:
                 self.moved[first:last], about[first:last] = True, False
