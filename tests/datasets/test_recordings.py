@@ -12,7 +12,6 @@ from kedro.io import DatasetError
 from gyro_pipeline.conventions import InputError, Missing
 from gyro_pipeline.datasets.atomic import replacing
 from gyro_pipeline.datasets.recordings import (
-    CompletedRecordings,
     InspectedRecordings,
     Recordings,
 )
@@ -203,7 +202,7 @@ def test_recordings_come_back_without_their_samples_by_imu_and_number(tmp_path):
     assert reading(tmp_path).load() == [described(one) for one in ones]
     assert [path.name for path in tmp_path.iterdir()] == ["dot.unfinished.nc"]
     lengths = xr.DataArray([[100, 0], [150, 100]], {"imu": [1, 2], "recording": [7, 9]})
-    final = CompletedRecordings(str(tmp_path / "dot.nc"))
+    final = Recordings(str(tmp_path / "dot.nc"))
     final.save(xr.Dataset({"samples": lengths}, attrs={"sensor": "dot", "rate_hz": 10.0}))
     back = final.load()
     assert [path.name for path in tmp_path.iterdir()] == ["dot.nc"]
