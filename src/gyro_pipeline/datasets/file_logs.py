@@ -105,7 +105,8 @@ class FileLogs(LogSource):
         ]
         imus = len({entry.imu for entry in entries})
         if self.entry.imus not in (None, imus):
-            self._say(f"files of {imus} IMUs, where globals.yml says imus: {self.entry.imus}")
+            stated = f"globals.yml says imus: {self.entry.imus}"
+            self._say(f"files of {imus} IMUs, where {stated}", logging.WARNING)
         entries.sort(key=lambda entry: (entry.imu, entry.recording))
         return Logs(self._sensor, self._source, False, self.entry.rate_hz, entries)
 
@@ -116,11 +117,11 @@ class FileLogs(LogSource):
         reader = self._options.model_dump(exclude_defaults=True)
         return super()._describe() | {"pattern": self._pattern, "reader": reader}
 
-    def _say(self, message: str) -> None:
+    def _say(self, message: str, level: int = logging.INFO) -> None:
         """Log a message once, although several nodes load the source."""
         if message not in self._messages:
             self._messages.add(message)
-            _LOG.info("%s %s: %s", self._sensor, self._path, message)
+            _LOG.log(level, "%s %s: %s", self._sensor, self._path, message)
 
     def _entry(self, name: str, imu: int, recording: int, settings: list[Any]) -> LogEntry:
         """One IMU of one file."""
