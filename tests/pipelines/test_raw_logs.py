@@ -115,14 +115,11 @@ def test_each_has_its_own_length_from_the_first_usable_row_on(inspected):
 
 
 def test_masked_samples_are_nan_and_counted(inspected, monkeypatch):
-    class Masking(Inspected):
-        @property
-        def masked(self):
-            return np.isin(np.arange(self.stop - self.start), [5, 1600])
+    def masking(log, *_):
+        rows = len(log.samples) - 10
+        return Inspected(KEPT, 10, 10 + rows, np.isin(np.arange(rows), [5, 1600]), ())
 
-    monkeypatch.setattr(
-        inspection, "inspect", lambda log, *_: Masking(KEPT, 10, len(log.samples), ())
-    )
+    monkeypatch.setattr(inspection, "inspect", masking)
     logs = four()
     recordings, table = inspected(listed(logs), length_s=16.0)
     samples = samples_of(recordings, 2, 1)
@@ -171,13 +168,13 @@ def test_an_error_that_is_no_bad_input_is_not_hidden(inspected):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300])  # 1e300 overflows float32
-def test_the_longest_stretch_without_a_fault_is_kept(inspected, value):
+def test_what_is_no_number_in_float32_is_masked(inspected, value):
     samples = noise(7)
     samples[200, 1] = value
-    logs = four(log_12=Log(samples))
-    recordings, table = inspected(listed(logs))
-    assert table.loc[1, 2].outcome == REPAIRED
-    np.testing.assert_array_equal(samples_of(recordings, 1, 2), samples[201:].T.astype(np.float32))
+    recordings, table = inspected(listed(four(log_12=Log(samples))))
+    assert (table.loc[1, 2].outcome, table.loc[1, 2].masked) == (REPAIRED, 1)
+    samples[200] = np.nan
+    np.testing.assert_array_equal(samples_of(recordings, 1, 2), samples.T.astype(np.float32))
 
 
 def test_the_same_samples_twice_are_one_recording(inspected):
