@@ -195,9 +195,11 @@ def _append(file: h5py.File, recording: Recording) -> None:
         for name, label in zip(_PLACE, recording.place, strict=True)
     )
     for name, values in recording.variables.items():
-        if name not in file or file[name].shape[-1] < values.shape[-1]:
+        stored = file.get(name)
+        if stored is None or stored.shape[-1] < values.shape[-1]:
             _make_room(file, name, values)
-        file[name][(*index, ..., slice(values.shape[-1]))] = values
+            stored = file[name]
+        stored[(*index, ..., slice(values.shape[-1]))] = values
     described = asdict(replace(recording, variables={})) | {"variables": list(recording.variables)}
     file[_INSPECTION][index] = json.dumps(described)
     file.flush()  # a process that is killed later loses nothing of it
