@@ -221,22 +221,37 @@ def _stored(path: Path, wanted: Mapping[tuple[int, int], str] | None = None) -> 
     """Recordings of a file by IMU and number, without their samples.
 
     Where keys are given, only those that have them, with their samples, if these are as they were
-    written; a process may be killed while it writes. A damaged file has what can be read of it.
+    written. Of a damaged file, as a process that is killed may leave it, what can be read.
     """
-    with suppress(OSError, KeyError, ValueError), h5py.File(path) as file:
-        texts = file[_INSPECTION][:]
-        for index in np.argwhere(texts != b"").tolist():
-            described = json.loads(texts[*index])
-            names = described.pop("variables")
-            findings = tuple(Finding(**finding) for finding in described.pop("findings"))
-            recording = Recording(**described, findings=findings)
-            if wanted is None:
+    damage = OSError, KeyError, ValueError
+    with suppress(*damage), h5py.File(path) as file:
+        for index in np.ndindex(file[_INSPECTION].shape):
+            recording = None
+            with suppress(*damage):  # each by itself, or one would hide the others
+                recording = _read(file, index, wanted)
+            if recording is not None:
                 yield recording
-            elif recording.key and recording.key == wanted.get(recording.place):
-                stretch = (*index, ..., slice(recording.stop - recording.start))
-                kept = {name: file[name][stretch] for name in names}
-                if not kept or data_hash(kept["angular_rate"], None) == recording.content:
-                    yield replace(recording, variables=kept)
+
+
+def _read(
+    file: h5py.File, index: tuple[int, ...], wanted: Mapping[tuple[int, int], str] | None
+) -> Recording | None:
+    """A recording as :func:`_stored` yields it; None where there is none."""
+    text = file[_INSPECTION][index]
+    if not text:
+        return None
+    described = json.loads(text)
+    names = described.pop("variables")
+    findings = tuple(Finding(**finding) for finding in described.pop("findings"))
+    recording = Recording(**described, findings=findings)
+    if wanted is None:
+        return recording
+    if not recording.key or recording.key != wanted.get(recording.place):
+        return None
+    stretch = (*index, ..., slice(recording.stop - recording.start))
+    kept = {name: file[name][stretch] for name in names}
+    intact = not kept or data_hash(kept["angular_rate"], None) == recording.content
+    return replace(recording, variables=kept) if intact else None
 
 
 def _erase(path: Path, samples: xr.DataArray) -> None:
