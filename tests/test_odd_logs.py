@@ -210,7 +210,11 @@ def test_kind_4_names_put_axes_in_order(path: Path) -> None:
 def test_kind_4_nothing_but_rates_is_taken_for_rates(path: Path, names: str) -> None:
     text(path, f"time (s),{names}", seconds(6000), still())
     refused(ending(path, None, units="deg/s"), "columns|rate")
-    refused(ending(path, None, units="deg/s", columns=[1, 2, 3]), names.split(",")[0], "trust")
+    refused(
+        ending(path, None, units="deg/s", columns=[1, 2, 3]),
+        names.split(",", maxsplit=1)[0],
+        "trust",
+    )
 
 
 def test_kind_5_a_level_that_no_gyroscope_has_asks_for_an_offset(path: Path) -> None:

@@ -33,9 +33,8 @@ class Inspection:
         """Estimated cost, in bytes."""
         return float(self.entry.size)
 
-    def rejected(self, check: str, problem: str) -> Recording:
+    def rejected(self, *findings: Finding) -> Recording:
         """The recording as one of which nothing can be used."""
-        findings = (Finding(check, REJECTED, problem),)
         entry = self.entry
         return Recording(
             entry.imu, entry.recording, entry.where, self.key, REJECTED, findings=findings
@@ -56,7 +55,7 @@ def judge(job: Inspection, report: Callable[[float], None]) -> Recording:
     try:
         log = job.entry.read()
     except InputError as error:
-        recording = job.rejected("file", str(error))
+        recording = job.rejected(Finding("file", REJECTED, str(error)))
         if _of_the_system(error.__cause__):
             recording = replace(recording, key="")
     else:
@@ -79,19 +78,19 @@ def _of_the_system(cause: BaseException | None) -> bool:
 def _judged(log: Log, job: Inspection) -> Recording:
     rate_hz = log.rate_hz or job.rate_hz
     if rate_hz is None:
-        return job.rejected(
-            "sample rate",
+        problem = (
             "no times that can be read, and none stated; name the time column and its unit, "
             "time_column and time_units, in `reader:` of the catalog entry in catalog.yml, or give "
-            "rate_hz, samples a second, in the sensor's entry in globals.yml",
+            "rate_hz, samples a second, in the sensor's entry in globals.yml"
         )
+        return job.rejected(*log.findings, Finding("sample rate", REJECTED, problem))
     with np.errstate(over="ignore"):  # becomes infinite, and is found as such
         stored = np.asarray(log.samples, np.float32)
     inspected = inspect(replace(log, samples=stored.astype(np.float64)), rate_hz, job.quality)
     length_s, usable = job.quality.length_s, inspected.stop - inspected.start
     asked = usable if length_s is None else round(length_s * rate_hz)
     recording = replace(
-        job.rejected("", ""),
+        job.rejected(),
         outcome=inspected.outcome,
         findings=inspected.findings,
         rows=len(stored),
