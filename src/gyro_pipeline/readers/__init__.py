@@ -66,9 +66,10 @@ def log_of(
     raw = _stacked(file, columns)
     keep = sample_rows(file, raw)
     timing = timing_of(file, keep)
-    rates = _in_dps(file, raw[keep], scale, timing.rate_hz or expected_rate_hz)
+    raw = raw[keep]
+    rates = _in_dps(file, raw, scale, timing.rate_hz or expected_rate_hz)
     temperature, acceleration = temperature_of(file), acceleration_of(file, columns)
-    contradict_values(file, raw[keep], rates, are_counts)
+    contradict_values(file, raw, rates, are_counts)
     contradict_turns(file, {*columns, *temperature[0], *acceleration[0]}, keep, rates)
     file.settle()
     gaps = counted(file, keep)

@@ -42,10 +42,7 @@ class Header(NamedTuple):
     @property
     def quantity(self) -> str:
         """``rate``, ``attitude``, ``other``, or an empty text, by the words of the name."""
-        words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", self.name)
-        text = " ".join(words).lower()
-        matches = (name for name, word in _QUANTITIES if re.search(rf"\b({word})\b", text))
-        return next(matches, "")
+        return _quantity_of(self.name)
 
     def measures(self, *quantities: str) -> bool:
         """Whether its unit is of one of these quantities."""
@@ -55,6 +52,13 @@ class Header(NamedTuple):
     def has_unit(self) -> bool:
         """Whether it has a unit, if an unknown one, rather than a remark in brackets."""
         return self.unit is not None or bool(re.search(r"[/^√*\d]", self.said))
+
+
+@lru_cache(1 << 10)
+def _quantity_of(name: str) -> str:
+    text = " ".join(re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)).lower()
+    matches = (name for name, word in _QUANTITIES if re.search(rf"\b({word})\b", text))
+    return next(matches, "")
 
 
 @lru_cache(64)  # the files of a folder have the same header

@@ -111,17 +111,17 @@ def contradict_turns(file: File, used: Collection[int], keep: Mask, rates: Float
         if number in used or (measures and column.dtype.kind == "f") or len(column) != len(keep):
             continue
         name = file.table.names[number]
-        turns = takes_turns(name, column[keep], rates)
+        turns, value = takes_turns(name, column, keep, rates)
         if turns:
             file.contradictions.append(
-                f"{file.listed([number])} takes turns among {turns[0]}, but a recording is of one "
-                f"device; pick its rows, such as rows: {{{name or number}: {turns[1]}}}"
+                f"{file.listed([number])} takes turns among {turns}, but a recording is of one "
+                f"device; pick its rows, such as rows: {{{name or number}: {value}}}"
             )
 
 
 def takes_turns(
-    name: str, column: NDArray[Any], rates: Floats, most_values: int = 32
-) -> tuple[str, str] | None:
+    name: str, column: NDArray[Any], keep: Mask, rates: Floats, most_values: int = 32
+) -> tuple[str, str]:
     """Whether a column says what a row is of, such as a device, a sensor or a kind of row.
 
     It has few values, and they come and go. Texts then say what a row is; so do numbers of a column
@@ -129,18 +129,19 @@ def takes_turns(
 
     Args:
         name: Of the column.
-        column: (n,), its values.
-        rates: (n, 3), of the same rows.
+        column: (n,).
+        keep: (n,), the rows that are left.
+        rates: (m, 3), of these.
         most_values: More are measurements or counters.
 
     Returns:
-        Values and evidence, for a message, and a value; None where it says nothing of the rows.
+        Values and evidence, for a message, and a value; empty where it says nothing of the rows.
     """
-    if len(pd.unique(column[:: len(column) // 100 + 1])) > most_values:
-        return None
-    codes, texts = _coded(column)
+    if len(pd.unique(column[:: len(column) // 100 + 1])) > most_values:  # most columns
+        return "", ""
+    codes, texts = _coded(column[keep])
     if not 1 < len(texts) <= most_values:
-        return None
+        return "", ""
     rows, filled = np.bincount(codes), texts.astype(bool)
     runs = np.bincount(codes[np.flatnonzero(np.diff(codes, prepend=-1))])
     words = filled & [not _NUMBER_OR_FLAG.fullmatch(text) for text in texts]
@@ -150,7 +151,7 @@ def takes_turns(
         evidence = "which say what a row is"
     else:
         evidence = _change(rates, codes)
-    return (f"{_counted(codes, texts)}, {evidence}", texts[filled][0]) if evidence else None
+    return evidence and f"{_counted(codes, texts)}, {evidence}", texts[filled][0]
 
 
 def _change(
@@ -177,10 +178,8 @@ def _change(
             sizes, errors = np.abs(some.mean(axis=0)), some.std(axis=0) / np.sqrt(len(some))
             excess = sizes - np.maximum(sigmas * errors, least * noise.mean(axis=0))
             if excess.max() > 0:
-                size = sizes[excess.argmax()]
-                return (
-                    f"with which {what} about {AXES[excess.argmax()]} changes by {size:.3g} deg/s"
-                )
+                size = f"{AXES[excess.argmax()]} changes by {sizes[excess.argmax()]:.3g} deg/s"
+                return f"with which {what} about {size}"
     return ""
 
 
