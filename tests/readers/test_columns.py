@@ -125,13 +125,6 @@ def test_of_sensors_side_by_side_names_of_two_are_not_mixed():
         read(header, S, X, X + 1, columns=("icm_gx", "icm_gy", "asm_gz"), **DEG)
 
 
-@pytest.mark.parametrize("columns", [None, ("x[0]", "y[0]", "z[0]")])
-def test_several_samples_a_row_are_refused(columns):
-    names = ",".join(f"{axis}[{k}]" for axis in "xyz" for k in range(8))
-    with pytest.raises(InputError, match=r"each row holds 8 samples, 'x\[0\]', 'y\[0\]'"):
-        read(f"dt,samples,{names}", S, S, np.repeat(X, 8, 1), columns=columns, **DEG)
-
-
 def test_increments_need_a_step_and_an_angle():
     options = {"units": "rad", "columns": (1, 2, 3), "increments": True}
     log = read(f"{T}delta_angle[0],delta_angle[1],delta_angle[2]", S, X * RAD / 100, **options)

@@ -64,10 +64,9 @@ def acceleration_of(file: File, rates: Sequence[int]) -> Beside:
         numbers = list(named[0]) if len(named) == 1 else []
     if len(numbers) != len(AXES) or {*numbers} & {*rates}:
         return (), Unit("acceleration")
-    said = units or file.headers[numbers[0]].said
-    for unit in (read_unit(said), read_unit(said.lower())):  # G is a gauss to pint
-        if unit and unit.quantity == "acceleration":
-            return numbers, unit
+    unit = read_unit(units or file.headers[numbers[0]].said)
+    if unit and unit.quantity == "acceleration":
+        return numbers, unit
     text = f"{file.listed(numbers)} have no unit and are not kept; give acceleration_units"
     file.note("acceleration", text)
     return (), Unit("acceleration")

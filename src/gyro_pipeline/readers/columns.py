@@ -13,7 +13,7 @@ from gyro_pipeline.conventions import AXES, InputError
 from gyro_pipeline.parameters import Column
 from gyro_pipeline.readers.file import File
 from gyro_pipeline.readers.formats import find_all
-from gyro_pipeline.readers.names import ATTITUDE, RATE, Header, samples_a_row, triples
+from gyro_pipeline.readers.names import ATTITUDE, RATE, Header, triples
 from gyro_pipeline.readers.scales import RATE_UNITS
 
 Columns = Sequence[int]
@@ -47,12 +47,6 @@ def rate_columns(file: File, imu: int | None = None) -> Columns:
             raise file.refusal(f"columns are given of IMUs {imus}, not of IMU {imu}; correct them")
         given = given[imu]
     rates = _given(file, given) if given else _named(file)
-    samples = samples_a_row(file.headers, rates[0])
-    if samples > 1:
-        file.contradictions.append(
-            f"each row holds {samples} samples, {file.listed(rates)} and so on, but one of them "
-            "would be read; write a row for each sample"
-        )
     for words, text in _NOTES.items():
         if re.search(words, file.table.names[rates[0]], re.IGNORECASE):
             file.note("rates", text.format(repr(file.table.names[rates[0]])))
@@ -102,8 +96,7 @@ def _named(file: File) -> Columns:
     certain, silent = groups[True], groups[False]
     if not certain and file.options.units:  # the user's word
         certain = silent
-    samples = samples_a_row(file.headers, certain[0][0]) if certain else 1
-    if len(certain) == samples:
+    if len(certain) == 1:
         return certain[0]
     raise _refusal_of(file, certain, silent)
 
@@ -112,9 +105,10 @@ def _refusal_of(file: File, certain: Sequence[Columns], silent: Sequence[Columns
     if certain:
         first, second = map(list, certain[:2])
         return file.refusal(
-            f"expected one sensor, got {len(certain)}, such as {file.listed(first)} and "
-            f"{file.listed(second)}; give columns of the one to read, such as {first}, or of both "
-            f"as IMUs, {{1: {first}, 2: {second}}},"
+            f"expected one sensor and one sample a row, got {len(certain)}, such as "
+            f"{file.listed(first)} and {file.listed(second)}; give columns of the one to read, "
+            f"such as {first}, or of both as IMUs, {{1: {first}, 2: {second}}}, or write a row for "
+            "each sample;"
         )
     if len(silent) == 1:
         return file.refusal(

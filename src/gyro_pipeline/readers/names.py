@@ -136,14 +136,3 @@ def _axes_in(name: str) -> Iterator[tuple[str, str]]:
     if index := _INDEX.search(name):
         number = int(index[1])
         yield f"{name[: index.start()]}[*]", AXES[number] if number < len(AXES) else index[1]
-
-
-def samples_a_row(headers: tuple[Header, ...], number: int) -> int:
-    """How many samples a row holds: 8 of ``x[0]``, …, ``x[7]``; 1 of names without an index."""
-    name = headers[number].name
-    index = _INDEX.search(name)
-    if index is None or not name[: index.start()].lower().endswith(AXES):
-        return 1
-    stem = re.escape(name[: index.start()]) + _INDEX.pattern
-    count = sum(bool(re.match(stem, header.name)) for header in headers)
-    return count if count > len(AXES) else 1  # angular_velocity[0]

@@ -99,6 +99,9 @@ def repeated(rates: Floats) -> Mask:
 def contradict_turns(file: File, used: Collection[int], keep: Mask, rates: Floats) -> None:
     """Columns that nobody asked for, measure nothing, and say what a row is of.
 
+    Such a column has few values, and they come and go. Texts then say what a row is; so do numbers
+    of a column that is named as a device, and those with which level or noise of the rates changes.
+
     Args:
         file: Gets the contradictions.
         used: Numbers of the columns that have been asked for.
@@ -111,7 +114,7 @@ def contradict_turns(file: File, used: Collection[int], keep: Mask, rates: Float
         if number in used or (measures and column.dtype.kind == "f") or len(column) != len(keep):
             continue
         name = file.table.names[number]
-        turns, value = takes_turns(name, column, keep, rates)
+        turns, value = _takes_turns(name, column, keep, rates)
         if turns:
             file.contradictions.append(
                 f"{file.listed([number])} takes turns among {turns}, but a recording is of one "
@@ -119,23 +122,12 @@ def contradict_turns(file: File, used: Collection[int], keep: Mask, rates: Float
             )
 
 
-def takes_turns(
+def _takes_turns(
     name: str, column: NDArray[Any], keep: Mask, rates: Floats, most_values: int = 32
 ) -> tuple[str, str]:
-    """Whether a column says what a row is of, such as a device, a sensor or a kind of row.
+    """Values of a column (n,) and evidence, for a message, and a value; empty where there is none.
 
-    It has few values, and they come and go. Texts then say what a row is; so do numbers of a column
-    that is named as a device, and those with which the level or the noise of the rates changes.
-
-    Args:
-        name: Of the column.
-        column: (n,).
-        keep: (n,), the rows that are left.
-        rates: (m, 3), of these.
-        most_values: More are measurements or counters.
-
-    Returns:
-        Values and evidence, for a message, and a value; empty where it says nothing of the rows.
+    A column of more values holds measurements or counts.
     """
     if len(pd.unique(column[:: len(column) // 100 + 1])) > most_values:  # most columns
         return "", ""
