@@ -26,7 +26,7 @@ _AXIS_WORDS = [
     {"roll": "x", "pitch": "y", "yaw": "z"},
 ]
 _BRACKETS = re.compile(r"\s*[(\[]((?:[^()\[\]]|[(\[][^()\[\]]*[)\]])*)[)\]]")
-_BEHIND_UNIT = re.compile(r"[\W_]*([xyz]|[xyz][\W_]?axis|cal|raw)?[\W_]*", re.IGNORECASE)
+_BEHIND_UNIT = re.compile(r"(?i)[\W_]*([xyz]|[xyz][\W_]?axis|cal|raw|since .*)?[\W_]*")
 _INDEX = re.compile(r"[\[.](\d+)\]?$")
 _CLOCK_UNITS_S = (1.0, 1e-3, 1e-6, 1e-9, 60.0, 3600.0)
 _LONGEST = 200  # characters of a name that is looked into
@@ -76,9 +76,9 @@ def read_header(text: str) -> Header:
         return Header(text)
     array = match[0] if (match := re.search(r"\.[xyzXYZ]$", text)) else ""
     text = text.removesuffix(array)
-    brackets = [_in_brackets(text, match) for match in _BRACKETS.finditer(text)]
-    brackets = [header for header in brackets if not re.fullmatch(r"\d*|[xyzXYZ]", header.said)]
-    if brackets:
+    matches = [m for m in _BRACKETS.finditer(text) if not re.fullmatch(r"\d*|[xyzXYZ]", m[1])]
+    if matches:
+        brackets = [_in_brackets(text, match) for match in matches]
         last = next((h for h in reversed(brackets) if h.unit), brackets[-1])
         return last._replace(name=last.name + array)
     for start, end in [(0, 0), *(m.span() for m in re.finditer(r"[ _./]+", text))]:

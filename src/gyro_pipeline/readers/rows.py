@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
+from scipy.stats import t as student
 
 from gyro_pipeline.conventions import AXES
 from gyro_pipeline.readers.file import File
@@ -146,18 +147,16 @@ def _takes_turns(
     return evidence and f"{_counted(codes, texts)}, {evidence}", texts[filled][0]
 
 
-def _change(
-    rates: Floats, codes: Codes, least: float = 0.3, sigmas: float = 8.0, least_runs: int = 5
-) -> str:
+def _change(rates: Floats, codes: Codes, least: float = 0.3, chance: float = 1e-12) -> str:
     """How level or noise of rates (n, 3) change with the codes (n,) of their rows, for a message.
 
     Each run of a code is compared with both of its neighbours, which takes off drift and the slow
     part of flicker; how these differences scatter is the rest. A change is more than ``least`` of
-    the mean size of the noise, and than ``sigmas`` standard errors of ``least_runs`` or more.
+    the mean size of the noise, and of a size that comes by ``chance`` in runs that are alike.
     """
     finite = np.isfinite(rates).all(axis=1)
     starts = np.flatnonzero(np.diff(codes[finite], prepend=-1))
-    if len(starts) < 2 * least_runs:
+    if len(starts) < 3:  # noqa: PLR2004
         return ""
     runs, lengths = codes[finite][starts[1:-1]], np.diff(starts, append=finite.sum())[:, None]
     level = _without_spikes(rates[finite])
@@ -165,10 +164,11 @@ def _change(
     for what, values in (("rate", level), ("noise", noise)):
         means = np.add.reduceat(values, starts) / lengths
         apart = means[1:-1] - (means[:-2] + means[2:]) / 2
-        for code in np.flatnonzero(np.bincount(runs) >= least_runs):
+        for code in np.flatnonzero(np.bincount(runs) > 2):  # noqa: PLR2004
             some = apart[runs == code]
             sizes, errors = np.abs(some.mean(axis=0)), some.std(axis=0) / np.sqrt(len(some))
-            excess = sizes - np.maximum(sigmas * errors, least * noise.mean(axis=0))
+            limits = student.isf(chance / 2, len(some) - 1) * errors
+            excess = sizes - np.maximum(limits, least * noise.mean(axis=0))
             if excess.max() > 0:
                 size = f"{AXES[excess.argmax()]} changes by {sizes[excess.argmax()]:.3g} deg/s"
                 return f"with which {what} about {size}"
