@@ -23,7 +23,7 @@ PX4 = "gyro_rad[{0}],accelerometer_m_s2[{0}]"
 
 def axes(name, names="xyz"):
     """A column about each axis; of several names, one after the other."""
-    return ",".join(one.format(axis) for one in name.split(",") for axis in names)
+    return ",".join(text.format(axis) for text in name.split(",") for axis in names)
 
 
 # name of the format (None: its header says all), header, columns, lines above, g in an acceleration

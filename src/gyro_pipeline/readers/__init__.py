@@ -66,7 +66,7 @@ def log_of(
     raw = _stacked(file, columns)
     keep = sample_rows(file, raw)
     timing = timing_of(file, keep)
-    raw = raw[keep]
+    raw = raw if keep.all() else raw[keep]
     rates = _in_dps(file, raw, scale, timing.rate_hz or expected_rate_hz)
     temperature, acceleration = temperature_of(file), acceleration_of(file, columns)
     contradict_values(file, raw, rates, are_counts)
@@ -82,13 +82,7 @@ def log_of(
         temperature_c=None if celsius is None else celsius[:, 0],
         acceleration_g=read_beside(file, acceleration, keep),
         rows=None if keep.all() else np.flatnonzero(keep),
-        findings=(
-            *table.findings,
-            *file.findings,
-            *timing.findings,
-            *gaps.findings,
-            *compared,
-        ),
+        findings=(*table.findings, *file.findings, *timing.findings, *gaps.findings, *compared),
     )
 
 

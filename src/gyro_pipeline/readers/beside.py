@@ -25,7 +25,8 @@ def read_beside(file: File, beside: Beside, keep: NDArray[np.bool_]) -> NDArray[
     columns = [file.table.columns[number] for number in numbers]
     if not columns or any(c.dtype.kind != "f" or len(c) != len(keep) for c in columns):
         return None
-    values = np.stack(columns, axis=1)[keep] * unit.factor + unit.offset
+    values = np.stack(columns, axis=1) * unit.factor + unit.offset
+    values = values if keep.all() else values[keep]
     return values if np.isfinite(values).any() else None
 
 
@@ -34,8 +35,8 @@ def temperature_of(file: File) -> Beside:
     celsius = Unit("temperature")
     named = [n for n, h in enumerate(file.headers) if _TEMPERATURE.search(h.name)]
     measured = [n for n, h in enumerate(file.headers) if h.measures("temperature")]
-    measured = [n for n in measured if n in named or file.headers[n].said != "K"]  # gain [K]
-    numbers = measured or [n for n in named if not file.headers[n].said]
+    measured = [n for n in measured if n in named or file.headers[n].unit_text != "K"]  # gain [K]
+    numbers = measured or [n for n in named if not file.headers[n].unit_text]
     if file.options.temperature_column is not None:
         numbers = [file.find(file.options.temperature_column)]
     elif len(numbers) > 1:
@@ -64,7 +65,7 @@ def acceleration_of(file: File, rates: Sequence[int]) -> Beside:
         numbers = list(named[0]) if len(named) == 1 else []
     if len(numbers) != len(AXES) or {*numbers} & {*rates}:
         return (), Unit("acceleration")
-    unit = read_unit(units or file.headers[numbers[0]].said)
+    unit = read_unit(units or file.headers[numbers[0]].unit_text)
     if unit and unit.quantity == "acceleration":
         return numbers, unit
     text = f"{file.listed(numbers)} have no unit and are not kept; give acceleration_units"

@@ -40,24 +40,24 @@ def rate_columns(file: File, imu: int | None = None) -> Columns:
     Raises:
         InputError: No columns, or several, could be meant.
     """
-    given = file.options.columns
-    if isinstance(given, dict):
-        if imu not in given:
-            imus = ", ".join(map(str, given))
-            raise file.refusal(f"columns are given of IMUs {imus}, not of IMU {imu}; correct them")
-        given = given[imu]
-    rates = _given(file, given) if given else _named(file)
+    columns = file.options.columns
+    if isinstance(columns, dict):
+        if imu not in columns:
+            imus = ", ".join(map(str, columns))
+            raise file.refusal(f"columns are of IMUs {imus}, not of IMU {imu}; correct them")
+        columns = columns[imu]
+    rates = _by_options(file, columns) if columns else _by_name(file)
     for words, text in _NOTES.items():
         if re.search(words, file.table.names[rates[0]], re.IGNORECASE):
             file.note("rates", text.format(repr(file.table.names[rates[0]])))
     return rates
 
 
-def _given(file: File, given: Sequence[Column]) -> Columns:
+def _by_options(file: File, columns: Sequence[Column]) -> Columns:
     """The columns of the options; they contradict names of something else or of another order."""
-    rates = [file.find(column) for column in given]
+    rates = [file.find(column) for column in columns]
     if len(set(rates)) < len(AXES):
-        raise file.refusal(f"expected three columns of rates, got {list(given)}; correct columns")
+        raise file.refusal(f"expected three columns of rates, got {list(columns)}; correct columns")
     others = [triple for triple in triples(file.headers) if {*triple} & {*rates}]
     same = [triple for triple in others if {*triple} == {*rates}]
     if others and tuple(rates) not in same:
@@ -81,7 +81,7 @@ def _may_be_rate(file: File, header: Header) -> bool:
     return header.quantity in ("", RATE) or (header.quantity == ATTITUDE and angle_turned)
 
 
-def _named(file: File) -> Columns:
+def _by_name(file: File) -> Columns:
     """The only three columns that say they are rates about x, y, z."""
     if file.form:
         return find_all(file.table, *file.form.rates.split())

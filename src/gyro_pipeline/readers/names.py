@@ -36,7 +36,7 @@ class Header(NamedTuple):
     """A name, its unit as written (an empty text: none), and what that is (None: not known)."""
 
     name: str
-    said: str = ""
+    unit_text: str = ""
     unit: Unit | None = None
 
     @property
@@ -51,7 +51,7 @@ class Header(NamedTuple):
     @property
     def has_unit(self) -> bool:
         """Whether it has a unit, if an unknown one, rather than a remark in brackets."""
-        return self.unit is not None or bool(re.search(r"[/^√*\d]", self.said))
+        return self.unit is not None or bool(re.search(r"[/^√*\d]", self.unit_text))
 
 
 @lru_cache(1 << 10)
@@ -95,10 +95,10 @@ def _in_brackets(text: str, match: re.Match[str]) -> Header:
     """A header with a unit in brackets, with all behind them if it may belong to the unit."""
     before, behind = text[: match.start()], text[match.end() :]
     is_all = _BEHIND_UNIT.fullmatch(_BRACKETS.sub("", behind))  # not gx (deg/s)*100
-    said = match[1].strip() if is_all else text[match.start() :].strip()
-    if re.search("temp", before, re.IGNORECASE) and said in ("C", "F"):
-        said = f"deg{said}"  # and no coulomb or farad
-    return Header((before + behind).strip(), said, read_unit(said))
+    unit_text = match[1].strip() if is_all else text[match.start() :].strip()
+    if re.search("temp", before, re.IGNORECASE) and unit_text in ("C", "F"):
+        unit_text = f"deg{unit_text}"  # and no coulomb or farad
+    return Header((before + behind).strip(), unit_text, read_unit(unit_text))
 
 
 def _stands_without_brackets(unit: Unit, text: str, alone: bool) -> bool:

@@ -44,7 +44,9 @@ def sample_rows(file: File, rates: Floats) -> Mask:
         ("blank rows", True, blank_at_regular_shares, "are blank, at a regular share"),
         ("repeated rows", file.options.repeats, repeated, "repeat the one before"),
     ):
-        out = leave_out(rates[keep]) if wanted else np.zeros(1, bool)
+        if not wanted:
+            continue
+        out = leave_out(rates if keep.all() else rates[keep])
         if out.any():
             file.note(check, f"{out.sum()} of {len(out)} rows {why}: no samples, left out")
             keep[np.flatnonzero(keep)[out]] = False

@@ -84,7 +84,7 @@ def _of_format(file: File, rates: Sequence[int]) -> list[Statement]:
 def _of_headers(file: File, rates: Sequence[int]) -> list[Statement]:
     """Units in brackets and names; a unit of anything but a rate contradicts."""
     headers = [file.headers[number] for number in rates]
-    inner = [read_header(header.name) for header in headers if header.said]
+    inner = [read_header(header.name) for header in headers if header.unit_text]
     headers += [header for header in inner if header.measures("rate")]  # gx_dps (rad/s)
     quantities = ("angle",) if file.options.increments else ("rate", "count")
     strange = [h for h in headers if h.has_unit and not h.measures(*quantities)]
@@ -92,13 +92,13 @@ def _of_headers(file: File, rates: Sequence[int]) -> list[Statement]:
         kind = "angle turned" if file.options.increments else "angular rate"
         angles = "give increments: true if they are angles turned since the last row"
         hint = angles if strange[0].measures("angle") else "give columns of angular rates"
-        names = f"{file.listed(rates)} say {strange[0].said!r}"
+        names = f"{file.listed(rates)} say {strange[0].unit_text!r}"
         file.contradictions.append(f"{names}, but that is no {kind}; {hint}")
-    elif headers[0].said and headers[0].unit is None:
-        text = f"the remark {headers[0].said!r} in the header is no unit that is known"
+    elif headers[0].unit_text and headers[0].unit is None:
+        text = f"the remark {headers[0].unit_text!r} in the header is no unit that is known"
         file.note("unit", text)
     units = {h.unit: h for h in headers if h.unit and h not in strange}
-    return [Statement(f"the header says {h.said}", unit) for unit, h in units.items()]
+    return [Statement(f"the header says {h.unit_text}", unit) for unit, h in units.items()]
 
 
 def _above(file: File) -> list[Statement]:

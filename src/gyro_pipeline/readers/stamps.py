@@ -83,15 +83,15 @@ def _candidates(file: File) -> list[tuple[int, float | None, bool]]:
     The format's go first, then others in the file's order; those with a time's name and a unit
     that nothing contradicts before the rest. One that is not named so must increase.
     """
-    times, asked = file.form.times if file.form else (), file.options.time_column
+    times, column = file.form.times if file.form else (), file.options.time_column
     by_format = {n: unit_s for name, unit_s in times for n in find_all(file.table, name)}
     order = dict.fromkeys([*by_format, *range(len(file.headers))])
     candidates, options_s = [], _options_s(file)
-    for number in order if asked is None else [file.find(asked)]:
+    for number in order if column is None else [file.find(column)]:
         header, unit = file.headers[number], file.headers[number].unit
         unit_s = unit.factor if unit and header.measures("time") else by_format.get(number)
         is_text = file.table.columns[number].dtype.kind != "f"
-        named = is_text or asked is not None or number in by_format or names_time(header)
+        named = is_text or column is not None or number in by_format or names_time(header)
         certain = is_text or len({unit_s, options_s} - {None}) == 1
         if named or (unit_s and not _DURATION.search(header.name.lower())):
             candidates.append(((not named, not certain), (number, unit_s, named)))
