@@ -121,8 +121,8 @@ def pipeline(folder: Path, scratch: Path, processes: int) -> Callable[[], Any]:
     # here, so that the processes of the bare loop do not wait for them
     from gyro_pipeline.datasets.file_logs import FileLogs  # noqa: PLC0415
     from gyro_pipeline.datasets.recordings import (  # noqa: PLC0415
-        CompletedRecordings,
         InspectedRecordings,
+        Recordings,
     )
     from gyro_pipeline.parameters import Execution, Quality  # noqa: PLC0415
     from gyro_pipeline.pipelines.raw_logs.nodes import (  # noqa: PLC0415
@@ -140,7 +140,7 @@ def pipeline(folder: Path, scratch: Path, processes: int) -> Callable[[], Any]:
     )
     scratch.mkdir()
     path = str(scratch / "recordings.nc")
-    reading, final = InspectedRecordings(path), CompletedRecordings(path)
+    reading, final = InspectedRecordings(path), Recordings(path)
     execution = Execution(executor="processes", workers=processes)
 
     def run() -> Any:

@@ -29,7 +29,7 @@ from mlflow import MlflowClient
 from mlflow.entities import Run
 
 from gyro_pipeline.conventions import AXES, DIMENSIONS, HOLD_OUT, TEST, TRAIN, VALIDATION
-from gyro_pipeline.datasets.recordings import CompletedRecordings, InspectedRecordings
+from gyro_pipeline.datasets.recordings import InspectedRecordings, Recordings
 from gyro_pipeline.fingerprints import data_hash
 from gyro_pipeline.logs import Logs
 from gyro_pipeline.parameters import Execution, Parameters, Quality
@@ -258,7 +258,7 @@ def read_logs() -> Callable[..., tuple[xr.Dataset, pd.DataFrame]]:
         """Recordings, and the table of their quality."""
         execution = Execution(executor="processes" if workers else "serial", workers=workers)
         path = str(folder / "recordings.nc")
-        reading, final = InspectedRecordings(path), CompletedRecordings(path)
+        reading, final = InspectedRecordings(path), Recordings(path)
         for item in inspect_logs(files, reading.load(), quality, execution):
             reading.save(item)
         table = quality_table(files, reading.load())

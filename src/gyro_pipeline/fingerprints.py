@@ -7,6 +7,7 @@ import inspect
 import json
 import pkgutil
 from collections.abc import Iterable
+from functools import cache
 from types import ModuleType
 from typing import Any
 
@@ -35,6 +36,7 @@ def code_hash(modules: Iterable[ModuleType]) -> str:
     return digest.hexdigest()[:_DIGITS]
 
 
+@cache  # of what was imported, which does not change
 def package_hash(package: ModuleType) -> str:
     """Hash of what all modules of a package do."""
     found = pkgutil.walk_packages(package.__path__, f"{package.__name__}.")

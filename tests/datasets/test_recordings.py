@@ -12,7 +12,6 @@ from kedro.io import DatasetError
 from gyro_pipeline.conventions import InputError, Missing
 from gyro_pipeline.datasets.atomic import replacing
 from gyro_pipeline.datasets.recordings import (
-    CompletedRecordings,
     InspectedRecordings,
     Recordings,
 )
@@ -57,17 +56,12 @@ def test_round_trip_is_identical(tmp_path):
     assert os.listdir(tmp_path / "new") == ["dot.nc"]
 
 
-def test_what_was_read_can_be_saved_to_the_same_file(tmp_path):
+def test_what_was_read_can_be_saved_to_the_same_file_with_other_values(tmp_path):
     kept(tmp_path).save(made())
-    kept(tmp_path).save(kept(tmp_path).load() + 1)
-    np.testing.assert_array_equal(kept(tmp_path).load().angular_rate, made().angular_rate + 1)
-
-
-def test_what_was_read_can_be_given_other_values(tmp_path):
-    kept(tmp_path).save(made())
-    back = kept(tmp_path).load()
+    back = kept(tmp_path).load() + 1
     back["count"] = back["count"].copy(data=[0.5, 1.5, 2.5])  # was stored as integers
     kept(tmp_path).save(back)
+    np.testing.assert_array_equal(kept(tmp_path).load().angular_rate, made().angular_rate + 1)
     assert kept(tmp_path).load()["count"].values.tolist() == [0.5, 1.5, 2.5]
 
 
@@ -106,11 +100,15 @@ def test_a_damaged_file_is_named_with_the_way_out(tmp_path, size):
     assert str(caught.value.__cause__).startswith(str(file))
 
 
-def test_a_missing_file_is_not_called_damaged(tmp_path):
+def test_a_missing_file_is_not_called_damaged_and_its_maker_is_named_where_known(tmp_path):
     assert not kept(tmp_path).exists()
     with pytest.raises(DatasetError) as caught:
         kept(tmp_path).load()
     assert isinstance(caught.value.__cause__, FileNotFoundError)
+    maker = Recordings(str(tmp_path / "new" / "dot.nc"), made_by="make it")
+    assert maker.load() == Missing(("make it",))
+    maker.save(made())
+    xr.testing.assert_identical(maker.load(), made())
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
@@ -125,44 +123,22 @@ def test_an_interrupted_write_leaves_the_old_file_and_no_other(tmp_path, error):
     assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {"table.csv": "old"}
 
 
-def test_a_folder_in_place_of_the_file_is_named(tmp_path):
+def test_what_is_in_the_way_of_a_file_is_named(tmp_path, monkeypatch):
+    def refused(path, words):
+        with pytest.raises(InputError, match=words), replacing(path):
+            pass
+
     (tmp_path / "table.csv").mkdir()
-    with (
-        pytest.raises(InputError, match="a folder has that name"),
-        replacing(tmp_path / "table.csv"),
-    ):
-        pass
-    assert os.listdir(tmp_path) == ["table.csv"]
-
-
-def test_a_file_in_place_of_a_folder_is_named(tmp_path):
+    refused(tmp_path / "table.csv", "a folder has that name")
     (tmp_path / "data").write_text("")
-    with (
-        pytest.raises(InputError, match=f"{tmp_path / 'data'} is a file"),
-        replacing(tmp_path / "data" / "sub" / "table.csv"),
-    ):
-        pass
+    refused(tmp_path / "data" / "sub" / "table.csv", f"{tmp_path / 'data'} is a file")
+    assert sorted(os.listdir(tmp_path)) == ["data", "table.csv"]
 
-
-def test_a_folder_that_cannot_be_written_to_is_named(tmp_path, monkeypatch):
-    def refuse(*_, **__):
+    def deny(*_, **__):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("pathlib.Path.touch", refuse)  # root may write anywhere
-    with (
-        pytest.raises(InputError, match=f"Permission denied in {tmp_path}"),
-        replacing(tmp_path / "table.csv"),
-    ):
-        pass
-
-
-def test_recordings_that_are_not_there_name_what_makes_them_where_that_is_known(tmp_path):
-    with pytest.raises(DatasetError, match="No such file"):
-        kept(tmp_path).load()
-    known = Recordings(str(tmp_path / "new" / "dot.nc"), made_by="make it")
-    assert known.load() == Missing(("make it",))
-    known.save(made())
-    xr.testing.assert_identical(known.load(), made())
+    monkeypatch.setattr("pathlib.Path.touch", deny)  # root may write anywhere
+    refused(tmp_path / "other.csv", f"Permission denied in {tmp_path}")
 
 
 # recordings that arrive one by one
@@ -203,7 +179,7 @@ def test_recordings_come_back_without_their_samples_by_imu_and_number(tmp_path):
     assert reading(tmp_path).load() == [described(one) for one in ones]
     assert [path.name for path in tmp_path.iterdir()] == ["dot.unfinished.nc"]
     lengths = xr.DataArray([[100, 0], [150, 100]], {"imu": [1, 2], "recording": [7, 9]})
-    final = CompletedRecordings(str(tmp_path / "dot.nc"))
+    final = Recordings(str(tmp_path / "dot.nc"))
     final.save(xr.Dataset({"samples": lengths}, attrs={"sensor": "dot", "rate_hz": 10.0}))
     back = final.load()
     assert [path.name for path in tmp_path.iterdir()] == ["dot.nc"]

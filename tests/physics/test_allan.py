@@ -71,12 +71,9 @@ def test_averaging_times_are_whole_samples_up_to_a_fifth_and_all_usable(rate, n_
     assert np.all(np.diff(np.rint(factors)) >= 1)
     assert (np.rint(factors[0]), np.rint(factors[-1])) == (1, n_samples // 5)
     assert times.size <= 20
+    assert times.size >= 18 or n_samples < 13_000
     noise = np.random.default_rng(3).normal(size=n_samples)
     assert np.all(variance_of(noise, rate, times) > 0)
-
-
-def test_thirteen_thousand_samples_have_about_twenty_averaging_times():
-    assert averaging_times_s(13_000, RATE).size in (18, 19, 20)
 
 
 def test_variances_come_in_the_order_asked_for():
@@ -158,11 +155,8 @@ def test_an_exact_curve_gives_its_three_terms_back():
     n, b, k = 5 * MDPS, 3 * MDPS, 1 * MDPS
     curve = n**2 / times + FLICKER_FLOOR * b**2 + k**2 * times / 3
     fitted = fit_noise(times, curve, 100.0, shortest_s=0.1)
+    assert np.sqrt(FLICKER_FLOOR) == pytest.approx(0.664, abs=5e-4)  # IEEE Std 952
     assert (fitted.white, fitted.instability, fitted.random_walk) == pytest.approx((n, b, k))
-
-
-def test_the_flicker_floor_is_that_of_ieee_952():
-    assert np.sqrt(FLICKER_FLOOR) == pytest.approx(0.664, abs=5e-4)
 
 
 def test_times_before_the_shortest_have_no_influence():

@@ -2,7 +2,6 @@ import copy
 import logging
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -15,6 +14,7 @@ from gyro_pipeline.parameters import Execution
 from gyro_pipeline.pipelines.raw_logs import nodes
 from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs, require_enough
 from gyro_pipeline.protocol import inspection
+from gyro_pipeline.quality import Inspected
 
 RATE_HZ, SAMPLES = 100.0, 2000
 PAIR = Execution(executor="processes", workers=2)
@@ -43,6 +43,11 @@ def listed(logs, **changes):
         for (imu, recording), log in logs.items()
     ]
     return replace(Logs("dot", "mine", False, RATE_HZ, entries), **changes)
+
+
+def started(samples=SAMPLES):
+    """A recording whose first three rows are zero."""
+    return np.concatenate([np.zeros((3, 3)), noise(7, samples)[3:]])
 
 
 def four(**changes):
@@ -99,9 +104,7 @@ def test_recordings_are_labelled_as_the_conventions_say(inspected):
 
 
 def test_each_has_its_own_length_from_the_first_usable_row_on(inspected):
-    started = noise(7)
-    started[:3] = 0
-    logs = four(log_12=Log(started), log_21=Log(noise(8, 2500)), log_22=Log(noise(9, 300)))
+    logs = four(log_12=Log(started()), log_21=Log(noise(8, 2500)), log_22=Log(noise(9, 300)))
     recordings, table = inspected(listed(logs))
     assert recordings["samples"].values.tolist() == [[2000, 1997], [2500, 0]]
     for (imu, recording), first in {(1, 1): 0, (1, 2): 3, (2, 1): 0}.items():
@@ -116,9 +119,8 @@ def test_each_has_its_own_length_from_the_first_usable_row_on(inspected):
 
 def test_masked_samples_are_nan_and_counted(inspected, monkeypatch):
     def masking(log, *_):
-        masked = np.isin(np.arange(len(log.samples) - 10), [5, 1600])
-        stretch = {"start": 10, "stop": len(log.samples), "masked": masked}
-        return SimpleNamespace(outcome=KEPT, findings=(), **stretch)
+        rows = len(log.samples) - 10
+        return Inspected(KEPT, 10, 10 + rows, np.isin(np.arange(rows), [5, 1600]), ())
 
     monkeypatch.setattr(inspection, "inspect", masking)
     logs = four()
@@ -131,11 +133,9 @@ def test_masked_samples_are_nan_and_counted(inspected, monkeypatch):
     assert table.stop.tolist() == [1610] * 4
 
 
-def test_all_are_cut_to_a_stated_length_and_shorter_ones_rejected(inspected):
-    logs = four(log_22=Log(noise(9, 1200)))
-    recordings, table = inspected(listed(logs), length_s=15.0)
-    assert recordings.sizes["sample"] == 1500
-    assert table.outcome.tolist() == [KEPT, KEPT, KEPT, REJECTED]
+def test_shorter_ones_than_a_stated_length_are_rejected(inspected):
+    _, table = inspected(listed(four(log_22=Log(noise(9, 1200)))), length_s=15.0)
+    assert table.stop.tolist()[:3] == [1500] * 3
     assert table.loc[2, 2].findings == (
         "too short: 1200 rows can be used, quality.length_s asks for 1500"
     )
@@ -156,26 +156,35 @@ def test_what_no_imu_has_is_left_out(inspected):
     assert len(table) == 3
 
 
-def test_a_file_that_cannot_be_read_is_a_rejected_recording(inspected):
+def test_a_file_that_cannot_be_read_is_a_rejected_recording_and_other_errors_are_raised(inspected):
     _, table = inspected(listed(four(log_12=InputError("1_2.csv: expected text, got a zip"))))
     assert table.loc[1, 2].outcome == REJECTED
     assert table.loc[1, 2].findings == "file: 1_2.csv: expected text, got a zip"
-    assert table.loc[1, 2].rows == 0
-
-
-def test_an_error_that_is_no_bad_input_is_not_hidden(inspected):
     with pytest.raises(ZeroDivisionError):
         inspected(listed(four(log_12=ZeroDivisionError())))
 
 
-def test_the_same_samples_twice_are_one_recording(inspected):
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300])  # 1e300 overflows float32
+def test_what_is_no_number_in_float32_is_masked(inspected, value):
+    samples = noise(7)
+    samples[200, 1] = value
+    recordings, table = inspected(listed(four(log_12=Log(samples))))
+    assert (table.loc[1, 2].outcome, table.loc[1, 2].masked) == (REPAIRED, 1)
+    samples[200] = np.nan
+    np.testing.assert_array_equal(samples_of(recordings, 1, 2), samples.T.astype(np.float32))
+
+
+def test_the_same_samples_twice_are_one_recording_which_is_used_once_alone(inspected):
     logs = four()
     logs[2, 2] = logs[1, 2]
     recordings, table = inspected(listed(logs))
     assert np.isnan(recordings.angular_rate.sel(imu=2, recording=2)).all()
-    assert table.loc[1, 2].outcome == KEPT
-    assert table.loc[2, 2].outcome == REJECTED
+    assert table.outcome.tolist() == [KEPT, KEPT, KEPT, REJECTED]
     assert "duplicate: the same samples as 1_2.csv" in table.loc[2, 2].findings
+    logs[1, 2] = Log(noise(11))
+    recordings, _ = inspected(listed(logs))
+    kept = logs[2, 2].samples.T.astype(np.float32)
+    np.testing.assert_array_equal(samples_of(recordings, 2, 2), kept)
 
 
 def test_the_rate_is_the_median_of_the_measured_ones(inspected):
@@ -194,12 +203,10 @@ def test_the_rate_is_the_median_of_the_measured_ones(inspected):
 
 def test_temperature_and_acceleration_are_kept_with_their_recording(inspected):
     warm = np.linspace(20, 30, SAMPLES)
-    started = noise(7)
-    started[:3] = 0
     acceleration = noise(3)
     logs = four(
         log_11=Log(noise(1), temperature_c=warm, acceleration_g=acceleration),
-        log_22=Log(started, temperature_c=warm),
+        log_22=Log(started(), temperature_c=warm),
     )
     recordings, _ = inspected(listed(logs))
     np.testing.assert_array_equal(
@@ -211,7 +218,7 @@ def test_temperature_and_acceleration_are_kept_with_their_recording(inspected):
     np.testing.assert_array_equal(warmth.sel(imu=1, recording=1), warm.astype(np.float32))
     np.testing.assert_array_equal(warmth.sel(imu=2, recording=2)[:-3], warm[3:].astype(np.float32))
     assert np.isnan(warmth.sel(imu=1, recording=2)).all()
-    without, _ = inspected(listed(four(log_22=Log(started))))
+    without, _ = inspected(listed(four(log_22=Log(started()))))
     assert "temperature_c" not in without
 
 
@@ -237,9 +244,7 @@ def test_without_timestamps_and_a_stated_rate_a_recording_is_rejected(inspected)
 
 
 def test_processes_give_the_same_as_this_one(inspected, monkeypatch, caplog, tmp_path):
-    started = noise(7)
-    started[:3] = 0
-    files = listed(four(log_12=Log(started), log_21=Log(noise(8, 2500)), log_22=Log(started)))
+    files = listed(four(log_12=Log(started()), log_21=Log(noise(8, 2500)), log_22=Log(started())))
     here, table = inspected(files)
     here = here.load()
     (tmp_path / "recordings.nc").unlink()
@@ -304,17 +309,6 @@ def test_what_the_system_could_not_read_is_read_again(monkeypatch, inspected):
     _, table = inspected(files)
     assert read == ["1_2.csv"]
     assert table.outcome.tolist() == [KEPT, REJECTED, REJECTED, KEPT]
-
-
-def test_a_copy_is_read_again_once_it_is_alone(monkeypatch, inspected):
-    logs = four()
-    logs[2, 2] = logs[1, 2]
-    inspected(listed(logs))
-    logs[1, 2] = Log(noise(11))
-    recordings, _ = inspected(listed(logs))
-    np.testing.assert_array_equal(
-        samples_of(recordings, 2, 2), logs[2, 2].samples.T.astype(np.float32)
-    )
 
 
 def test_too_few_leave_the_old_recordings_and_what_was_read(inspected, tmp_path, monkeypatch):

@@ -17,13 +17,12 @@ from gyro_pipeline.logs import Log, LogEntry, Logs
 LAYOUT = ("recording", "gyroscope", "sample")
 """What the three axes of a file are, in the order in which the published files have them."""
 
-WHOLE = "all"
+_WHOLE = "all"
 """The key of a file whose recordings are not split into train and test."""
 
-_DOMINANCE = 4
-"""So many times more samples than recordings or gyroscopes tell the sample axis from the others."""
 
 Order = tuple[str, ...]
+Shape = tuple[int, ...]
 
 
 class ArrayLogs(LogSource):
@@ -54,7 +53,7 @@ class ArrayLogs(LogSource):
     ) -> None:
         super().__init__(sensor, sensors, source, path, metadata)
         _check_entry(sensor, files, axes_order)
-        self._files = {split: files[split] for split in ("train", "test", WHOLE) if split in files}
+        self._files = {split: files[split] for split in ("train", "test", _WHOLE) if split in files}
         self._axes_order = None if axes_order is None else tuple(axes_order)
 
     def load(self) -> Logs:
@@ -84,55 +83,45 @@ class ArrayLogs(LogSource):
 
     def _open(self, name: str) -> NDArray[Any]:
         """Map one file, refusing what is not three axes of real numbers."""
-        where = f"{self._sensor} {name}"
-        if not (self._path / name).is_file():
+        where, path = f"{self._sensor} {name}", self._path / name
+        if not path.is_file():
             raise InputError(
                 f"{where}: no such file in {self._path}; put it there, or choose another source"
             )
         try:
             # reads the header only, and unlike numpy.load can never unpickle
-            array: NDArray[Any] = np.lib.format.open_memmap(self._path / name, mode="r")
+            array: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
         except Exception as error:  # a damaged header fails in many ways
             raise InputError(
                 f"{where}: expected a plain numeric .npy file as numpy.save writes it, but: "
                 f"{error}. It is truncated, of another format, or holds pickled objects, which are "
-                f"never loaded; replace or delete {self._path / name}"
+                f"never loaded; replace or delete {path}"
             ) from error
-        if array.dtype.kind not in "iuf":
-            raise InputError(f"{where}: expected real numbers in deg/s, got dtype {array.dtype}")
-        if array.ndim != len(LAYOUT):
+        if array.dtype.kind not in "iuf" or array.ndim != len(LAYOUT) or array.size == 0:
             raise InputError(
-                f"{where}: expected 3 axes (recordings, gyroscopes, samples in any order), got "
-                f"shape {array.shape}"
+                f"{where}: expected real numbers in deg/s along 3 axes (recordings, gyroscopes, "
+                f"samples in any order), got {array.dtype} of shape {array.shape}"
             )
-        if array.size == 0:
-            raise InputError(f"{where}: expected recordings, got none: shape {array.shape}")
         return array
 
-    def _order(self, shapes: Mapping[str, tuple[int, ...]]) -> Order:
-        """Tell which axis is which, from the shapes where they allow only one answer."""
-        candidates = [
+    def _order(self, shapes: Mapping[str, Shape]) -> Order:
+        """Tell which axis is which, by the shapes where they allow only one answer."""
+        plausible = [
             order
             for order in permutations(LAYOUT)
-            if all(_plausible(order, shape) for shape in shapes.values())
+            if all(_is_plausible(order, shape) for shape in shapes.values())
         ]
         given = self._axes_order
-        if len(candidates) == 1 and given in (None, candidates[0]):
-            return candidates[0]
-        if given is None:
-            problem = f"cannot tell which axis is which; add axes_order: {_listed(LAYOUT)}, sorted"
-            problem += " as the axes of the file are, to the catalog entry"
-        elif len(candidates) == 1:
-            problem = f"axes_order says {_listed(given)}, the shape something else; correct it"
-        elif not all(_in_threes(given, shape) for shape in shapes.values()):
-            problem = f"axes_order says {_listed(given)}, which makes gyroscopes not divisible by 3"
-        else:
+        if len(plausible) == 1 and given in (None, plausible[0]):
+            return plausible[0]
+        if given and len(plausible) != 1 and all(_in_threes(given, s) for s in shapes.values()):
             return given
-        files = ", ".join(_shapes(shapes))
-        found = " or ".join(_listed(order) for order in candidates) or "none"
+        listed = [f"[{', '.join(order)}]" for order in plausible]
         raise InputError(
-            f"{self._sensor} {files}: {problem}. Orders with gyroscopes divisible by 3 and at "
-            f"least {_DOMINANCE} times more samples than recordings or gyroscopes: {found}"
+            f"{self._sensor} {', '.join(f'{name} of shape {s}' for name, s in shapes.items())}: "
+            f"axes_order in the catalog entry: expected {' or '.join(LAYOUT)} of each axis, got "
+            f"{list(given) if given else 'none'}. Orders with gyroscopes in threes and far more "
+            f"samples than recordings or gyroscopes: {' or '.join(listed) or 'none'}"
         )
 
     def _entries(
@@ -150,7 +139,7 @@ class ArrayLogs(LogSource):
                 partial(_read, path, order, imu, recording),
                 size=state.st_size // (imus * count["recording"]),
                 key=fingerprint([*file, imu, recording]),
-                split=None if split == WHOLE else split,
+                split=None if split == _WHOLE else split,
             )
             for imu in range(imus)
             for recording in range(count["recording"])
@@ -158,12 +147,10 @@ class ArrayLogs(LogSource):
 
 
 def _check_entry(sensor: str, files: Mapping[str, str], axes_order: Sequence[str] | None) -> None:
-    if set(files) not in ({"train", "test"}, {WHOLE}):
-        raise InputError(f"{sensor}: files: expected train and test, or all, got {sorted(files)}")
-    if len(set(files.values())) < len(files):
+    if set(files) not in ({"train", "test"}, {_WHOLE}) or len(set(files.values())) < len(files):
         raise InputError(
-            f"{sensor}: files: train and test name the same file, {files['train']}; recordings "
-            "to test on must be others than those trained on. Name it all to have it split"
+            f"{sensor}: files: expected a train and a test file, which are not the same one, or "
+            f"all, one file to be split, got {dict(files)}"
         )
     if axes_order is not None and sorted(axes_order) != sorted(LAYOUT):
         raise InputError(
@@ -172,13 +159,13 @@ def _check_entry(sensor: str, files: Mapping[str, str], axes_order: Sequence[str
         )
 
 
-def _plausible(order: Order, shape: tuple[int, ...]) -> bool:
-    size = dict(zip(order, shape, strict=True))
-    others = max(size["recording"], size["gyroscope"])
-    return _in_threes(order, shape) and size["sample"] >= _DOMINANCE * others
+def _is_plausible(order: Order, shape: Shape, least_ratio: int = 4) -> bool:
+    """Whether there are so many times more samples than recordings or gyroscopes."""
+    samples = shape[order.index("sample")]
+    return _in_threes(order, shape) and samples >= least_ratio * sorted(shape)[1]
 
 
-def _in_threes(order: Order, shape: tuple[int, ...]) -> bool:
+def _in_threes(order: Order, shape: Shape) -> bool:
     return shape[order.index("gyroscope")] % len(AXES) == 0
 
 
@@ -188,11 +175,3 @@ def _read(path: Path, order: Order, imu: int, recording: int) -> Log:
     recordings_first = array.transpose([order.index(name) for name in LAYOUT])
     gyroscopes = slice(len(AXES) * imu, len(AXES) * (imu + 1))
     return Log(recordings_first[recording, gyroscopes].T.astype(np.float64))
-
-
-def _shapes(shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
-    return [f"{name} of shape {shape}" for name, shape in shapes.items()]
-
-
-def _listed(order: Order) -> str:
-    return f"[{', '.join(order)}]"

@@ -3,12 +3,12 @@
 import logging
 import os
 import re
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
+import pandas as pd
 from pydantic import ValidationError
 
 from gyro_pipeline import readers
@@ -20,15 +20,19 @@ from gyro_pipeline.parameters import ReaderOptions
 
 _LOG = logging.getLogger(__name__)
 
-_NAMED = 5
-"""So many files are named in a message."""
-
 _HIDDEN = re.compile(r"(^|/)(\.|~\$)")  # the latter while Excel has a file open
-_LARGEST = 10**18 - 1  # of the numbers in names; fits an integer
-_PART = re.compile(r"\{(imu|recording)(:name)?\}|(\*)")
+_PARTS = {
+    "{imu}": "0*(?P<imu>[0-9]{1,18})",
+    "{recording}": "0*(?P<recording>[0-9]{1,18})",
+    "{imu:name}": "(?P<imu>[^/]+?)",
+    "{recording:name}": "(?P<recording>[^/]+?)",
+    "*": "[^/]*",
+}
+"""What a pattern is made of, as regular expressions."""
+_UNCLEAR = re.compile(r"[}*][{*]|\{(imu|recording)\}[0-9]")  # where does the first part end?
 
 Matches = Mapping[str, re.Match[str]]
-"""By a file's path in the folder, what the pattern says of it."""
+"""The pattern's match of each file, by its path in the folder."""
 
 
 class FileLogs(LogSource):
@@ -62,23 +66,24 @@ class FileLogs(LogSource):
         metadata: dict[str, Any] | None = None,
     ) -> None:
         super().__init__(sensor, sensors, source, path, metadata)
-        self._pattern = pattern
-        self._regex = _compiled(f"{sensor}: pattern {pattern} in the catalog entry", pattern)
+        self._pattern = str(pattern)
+        self._regex = _compiled(f"{sensor}: pattern in the catalog entry", self._pattern)
+        where = f"{sensor}: reader in the catalog entry"
         try:
             self._options = ReaderOptions.model_validate(reader or {})
         except ValidationError as error:
-            raise InputError(f"{sensor}: reader in the catalog entry: {error}") from error
-        readers.check_format(self._options.format, f"{sensor}: reader in the catalog entry")
+            raise InputError(f"{where}: {error}") from error
+        readers.check_format(self._options.format, where)
         columns = self._options.columns
-        self._side_by_side: list[int] = list(columns) if isinstance(columns, Mapping) else []
+        self._side_by_side = list(columns) if isinstance(columns, Mapping) else []
         if self._side_by_side and "imu" in self._regex.groupindex:
             raise InputError(
-                f"{sensor}: columns in the catalog entry's reader name IMUs "
-                f"{', '.join(map(str, self._side_by_side))} in each file, and {{imu}} in the "
-                f"pattern {pattern} says that a file is of one; leave one of the two out"
+                f"{where}: columns name several IMUs in each file, and {{imu}} in the pattern "
+                f"{pattern} says that a file is of one; leave one of the two out"
             )
+        self._messages: set[str] = set()
         if cache is not None:
-            _LOG.info("%s: cache in the catalog entry is no longer needed; remove it", sensor)
+            self._say("cache in the catalog entry is no longer needed; remove it")
 
     def load(self) -> Logs:
         """List the recordings; their files are read later, one at a time.
@@ -87,25 +92,21 @@ class FileLogs(LogSource):
             InputError: As the cause of Kedro's ``DatasetError``, no such folder, no file that
                 matches, or two files of one recording.
         """
-        places = self._places(self._matching())
-        settings: list[Any] = [self._options.model_dump(mode="json"), self.entry.rate_hz]
-        settings.append(package_hash(readers))
+        table = self._numbered(self._matching())
+        settings = [
+            self._options.model_dump(mode="json"),
+            self.entry.rate_hz,
+            package_hash(readers),
+        ]
         entries = [
-            self._listed(name, imu, recording, settings)
-            for name, (own, recording) in places.items()
+            self._entry(name, imu, recording, settings)
+            for name, own, recording in table.itertuples(name=None)
             for imu in self._side_by_side or [own]
         ]
-        if "{recording" not in self._pattern and "*" in self._pattern:
-            _LOG.info(
-                "%s: recordings of each IMU are numbered in the order of the files' names: %s",
-                *(self._sensor, _shown([f"{name} is {n}" for name, (_, n) in places.items()])),
-            )
         imus = len({entry.imu for entry in entries})
         if self.entry.imus not in (None, imus):
-            _LOG.warning(
-                "%s: files of %d IMUs in %s, where globals.yml says imus: %d",
-                *(self._sensor, imus, self._path, self.entry.imus),
-            )
+            stated = f"globals.yml says imus: {self.entry.imus}"
+            self._say(f"files of {imus} IMUs, where {stated}", logging.WARNING)
         entries.sort(key=lambda entry: (entry.imu, entry.recording))
         return Logs(self._sensor, self._source, False, self.entry.rate_hz, entries)
 
@@ -116,83 +117,77 @@ class FileLogs(LogSource):
         reader = self._options.model_dump(exclude_defaults=True)
         return super()._describe() | {"pattern": self._pattern, "reader": reader}
 
-    def _listed(self, name: str, imu: int, recording: int, settings: Sequence[Any]) -> LogEntry:
+    def _say(self, message: str, level: int = logging.INFO) -> None:
+        """Log a message once, although several nodes load the source."""
+        if message not in self._messages:
+            self._messages.add(message)
+            _LOG.log(level, "%s %s: %s", self._sensor, self._path, message)
+
+    def _entry(self, name: str, imu: int, recording: int, settings: list[Any]) -> LogEntry:
         """One IMU of one file."""
         path = self._path / name
-        try:
-            state = path.stat()
-        except OSError as error:
-            raise InputError(
-                f"{self._sensor} {path}: cannot be read: {error.strerror}; correct the link, or "
-                "remove it"
-            ) from error
-        which = {"imu": imu} if self._side_by_side else {}
+        state = path.stat() if path.exists() else path.lstat()  # a broken link is rejected as read
+        columns_of = {"imu": imu} if self._side_by_side else {}
         return LogEntry(
             *(imu, recording, name),
-            read=partial(readers.read_log, path, self._options, self.entry.rate_hz, **which),
+            read=partial(readers.read_log, path, self._options, self.entry.rate_hz, **columns_of),
             size=state.st_size,
-            key=fingerprint([str(path), state.st_size, state.st_mtime_ns, which, settings]),
+            key=fingerprint([str(path), state.st_size, state.st_mtime_ns, columns_of, settings]),
         )
 
     def _matching(self) -> Matches:
         """Paths in the folder that the pattern describes, 2 before 10."""
+        where = f"{self._sensor} {self._path}"
         if not self._path.is_dir():
             raise InputError(
-                f"{self._sensor} {self._path}: no such folder; put the files there, or name "
-                "another path in the catalog"
+                f"{where}: no such folder; put the files there, or name another path in the catalog"
             )
         paths = (path.relative_to(self._path).as_posix() for path in _files(self._path))
         names = sorted((name for name in paths if not _HIDDEN.search(name)), key=_natural)
         matches = {name: match for name in names if (match := self._regex.fullmatch(name))}
         others = [name for name in names if name not in matches]
-        where = f"{self._sensor} {self._path}"
         if not matches:
             raise InputError(
-                f"{where}: expected files like {self._pattern}, got {_shown(others) or 'none'}; "
+                f"{where}: expected files like {self._pattern}, got {_first(others) or 'none'}; "
                 "correct the pattern in the catalog, or the files' names"
             )
         if others:
-            _LOG.info(
-                "%s: %d files are not like %s: %s",
-                *(where, len(others), self._pattern, _shown(others)),
-            )
+            self._say(f"{len(others)} files are not like {self._pattern}: {_first(others)}")
         return matches
 
-    def _places(self, matches: Matches) -> dict[str, tuple[int, int]]:
-        """IMU and recording of each path."""
-        imus, recordings = (self._numbers(part, matches) for part in ("imu", "recording"))
-        counts, taken = Counter[int](), dict[tuple[int, int], str]()
-        for name in matches:
-            imu = imus.get(name, 1)
-            counts[imu] += 1
-            place = imu, recordings.get(name, counts[imu] if "*" in self._pattern else 1)
-            other = taken.setdefault(place, name)
-            if other != name:
-                raise InputError(
-                    f"{self._sensor}: {other} and {name} are both recording {place[1]} of IMU "
-                    f"{imu} by the pattern {self._pattern}; remove one of them, or correct the "
-                    "pattern in the catalog"
-                )
-        return {name: place for place, name in taken.items()}
+    def _numbered(self, matches: Matches) -> pd.DataFrame:
+        """Columns ``imu`` and ``recording``, by the files' paths."""
+        parts = {part: self._numbers(part, matches) for part in self._regex.groupindex}
+        table = pd.DataFrame({"imu": 1, "recording": 1} | parts, index=list(matches))
+        if "recording" not in parts and "*" in self._pattern:
+            table["recording"] += table.groupby("imu").cumcount()
+            self._say(
+                "recordings of each IMU are numbered in the order of the files' names: "
+                + _first([f"{name} is {number}" for name, number in table.recording.items()])
+            )
+        alike = table[table.duplicated(keep=False)].sort_values(["imu", "recording"])
+        if len(alike):
+            raise InputError(
+                f"{self._sensor}: {alike.index[0]} and {alike.index[1]} are both recording "
+                f"{alike.recording.iloc[0]} of IMU {alike.imu.iloc[0]} by the pattern "
+                f"{self._pattern}; remove one of them, or correct the pattern in the catalog"
+            )
+        return table
 
-    def _numbers(self, part: str, matches: Matches) -> dict[str, int]:
-        """What one part of each path says, as a number; nothing where there is no such part."""
-        if part not in self._regex.groupindex:
-            return {}
-        texts = {name: match[part] for name, match in matches.items()}
+    def _numbers(self, part: str, matches: Matches) -> list[int]:
+        """The number that one part of each path says, or that its name gets."""
+        texts = [match[part] for match in matches.values()]  # of numbers without leading zeros
         if f"{{{part}:name}}" in self._pattern:
-            order = {text: number for number, text in enumerate(dict.fromkeys(texts.values()), 1)}
-            named = _shown([f"{text} is {number}" for text, number in order.items()])
-            _LOG.info("%s: %d %ss by name: %s", self._sensor, len(order), part, named)
-            return {name: order[text] for name, text in texts.items()}
-        numbers = {name: int(text[-4000:]) for name, text in texts.items()}
-        for name, number in numbers.items():
-            if not 1 <= number <= _LARGEST:
-                raise InputError(
-                    f"{self._sensor}: {name}: expected numbers from 1 to {_LARGEST:.0e} for "
-                    f"{{{part}}}; write {{{part}:name}} to have them numbered in their order"
-                )
-        return numbers
+            numbers = {text: number for number, text in enumerate(dict.fromkeys(texts), 1)}
+            order = _first([f"{text} is {number}" for text, number in numbers.items()])
+            self._say(f"{len(numbers)} {part}s by name: {order}")
+            return [numbers[text] for text in texts]
+        if "0" in texts:
+            raise InputError(
+                f"{self._sensor}: expected numbers from 1 for {{{part}}} in {self._pattern}, got "
+                f"0; write {{{part}:name}} to have them numbered in their order"
+            )
+        return [int(text) for text in texts]
 
 
 def _files(folder: Path) -> Iterator[Path]:
@@ -205,37 +200,21 @@ def _files(folder: Path) -> Iterator[Path]:
 
 def _compiled(where: str, pattern: str) -> re.Pattern[str]:
     """The pattern as a regular expression."""
-
-    def refuse(problem: str) -> NoReturn:
-        raise InputError(f"{where}: {problem}")
-
-    if not isinstance(pattern, str):
-        refuse("expected a text such as imu{imu}/*.csv")
-    if set("{}") & set(_PART.sub("", pattern)):
-        refuse("expected {imu}, {recording}, {imu:name}, {recording:name} and * as its parts")
-    if touching := re.search(r"[}*](\{.*?\}|\*)", pattern):
-        refuse(f"expected a character before {touching[1]}, or it cannot be told where it begins")
-    if digit := re.search(r"\{(imu|recording)\}([0-9])", pattern):
-        refuse(f"expected no digit behind a number, which would belong to it, got {digit[2]}")
-    written, last = "", 0
-    for part in _PART.finditer(pattern):
-        name, named, _ = part.groups()
-        if f"<{name}>" in written:
-            refuse(f"{{{name}}} is there twice")
-        text = "[^/]+?" if named else "[0-9]+"
-        written += re.escape(pattern[last : part.start()])
-        written += f"(?P<{name}>{text})" if name else "[^/]*"
-        last = part.end()
-    return re.compile(written + re.escape(pattern[last:]))
+    pieces = re.split("({})".format("|".join(map(re.escape, _PARTS))), pattern)
+    twice = any(pattern.count(f"{{{part}") > 1 for part in ("imu", "recording"))
+    if twice or re.search("[{}]", "".join(pieces[::2])) or _UNCLEAR.search(pattern):
+        raise InputError(
+            f"{where}: expected {{imu}} or {{imu:name}}, {{recording}} or {{recording:name}}, each "
+            "once, and *, with a character between them that is no digit, such as imu{imu}/*.csv, "
+            f"got {pattern}"
+        )
+    return re.compile("".join(_PARTS.get(piece, re.escape(piece)) for piece in pieces))
 
 
-def _natural(path: str) -> list[tuple[int, int | str]]:
-    """Sorts 2 before 10."""
-    return [
-        (0, int(text)) if text.isdecimal() else (1, text) for text in re.findall(r"\d+|\D+", path)
-    ]
+def _natural(path: str) -> str:
+    """A key that sorts 2 before 10."""
+    return re.sub(r"\d+", lambda number: number[0].zfill(18), path)
 
 
-def _shown(names: Sequence[str]) -> str:
-    """The first of them."""
-    return ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")
+def _first(names: Sequence[str], count: int = 5) -> str:
+    return ", ".join(names[:count]) + (", …" if len(names) > count else "")

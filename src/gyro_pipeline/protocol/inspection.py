@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +11,12 @@ from gyro_pipeline.fingerprints import data_hash
 from gyro_pipeline.logs import REJECTED, Finding, Log, LogEntry, Recording
 from gyro_pipeline.parameters import Quality
 from gyro_pipeline.quality import inspect
+
+_NO_RATE = (
+    "no times that can be read, and none stated; name the time column and its unit, time_column "
+    "and time_units, in `reader:` of the catalog entry in catalog.yml, or give rate_hz, samples a "
+    "second, in the sensor's entry in globals.yml"
+)
 
 
 @dataclass(frozen=True)
@@ -33,12 +40,11 @@ class Inspection:
         """Estimated cost, in bytes."""
         return float(self.entry.size)
 
-    def rejected(self, *findings: Finding) -> Recording:
-        """The recording as one of which nothing can be used."""
-        entry = self.entry
-        return Recording(
-            entry.imu, entry.recording, entry.where, self.key, REJECTED, findings=findings
-        )
+    def recording(self, *findings: Finding, **attributes: Any) -> Recording:
+        """The recording as one that is rejected, unless its attributes say otherwise."""
+        entry, outcome = self.entry, attributes.pop("outcome", REJECTED)
+        place = entry.imu, entry.recording, entry.where
+        return Recording(*place, self.key, outcome, findings, **attributes)
 
 
 def judge(job: Inspection, report: Callable[[float], None]) -> Recording:
@@ -55,7 +61,7 @@ def judge(job: Inspection, report: Callable[[float], None]) -> Recording:
     try:
         log = job.entry.read()
     except InputError as error:
-        recording = job.rejected(Finding("file", REJECTED, str(error)))
+        recording = job.recording(Finding("file", REJECTED, str(error)))
         if _of_the_system(error.__cause__):
             recording = replace(recording, key="")
     else:
@@ -78,50 +84,36 @@ def _of_the_system(cause: BaseException | None) -> bool:
 def _judged(log: Log, job: Inspection) -> Recording:
     rate_hz = log.rate_hz or job.rate_hz
     if rate_hz is None:
-        problem = (
-            "no times that can be read, and none stated; name the time column and its unit, "
-            "time_column and time_units, in `reader:` of the catalog entry in catalog.yml, or give "
-            "rate_hz, samples a second, in the sensor's entry in globals.yml"
-        )
-        return job.rejected(*log.findings, Finding("sample rate", REJECTED, problem))
+        return job.recording(*log.findings, Finding("sample rate", REJECTED, _NO_RATE))
     with np.errstate(over="ignore"):  # becomes infinite, and is found as such
         stored = np.asarray(log.samples, np.float32)
     inspected = inspect(replace(log, samples=stored.astype(np.float64)), rate_hz, job.quality)
-    length_s, usable = job.quality.length_s, inspected.stop - inspected.start
-    asked = usable if length_s is None else round(length_s * rate_hz)
-    recording = replace(
-        job.rejected(),
-        outcome=inspected.outcome,
-        findings=inspected.findings,
-        rows=len(stored),
-        rate_hz=log.rate_hz,
-    )
+    usable, length_s = inspected.stop - inspected.start, job.quality.length_s
+    length = usable if length_s is None else round(length_s * rate_hz)
+    measured = {"rows": len(stored), "rate_hz": log.rate_hz}
     if inspected.outcome == REJECTED:
-        return recording
-    if usable < asked:
-        problem = f"{usable} rows can be used, quality.length_s asks for {asked}"
-        too_short = Finding("too short", REJECTED, problem)
-        return replace(recording, outcome=REJECTED, findings=(*recording.findings, too_short))
-    return _with_samples(recording, log, stored, inspected.start, inspected.masked[:asked])
-
-
-def _with_samples(
-    recording: Recording, log: Log, stored: np.ndarray, start: int, masked: np.ndarray
-) -> Recording:
-    """Keep the rows from ``start`` on, as many as ``masked`` (rows,) tells of."""
-    kept = slice(start, start + len(masked))
-    rates = np.ascontiguousarray(stored[kept].T)
-    rates[:, masked] = np.nan
-    variables = {"angular_rate": rates}
-    for name in ("temperature_c", "acceleration_g"):
-        values = getattr(log, name)
-        if values is not None:
-            variables[name] = np.ascontiguousarray(values[kept].T, dtype=np.float32)
-    return replace(
-        recording,
+        return job.recording(*inspected.findings, **measured)
+    if usable < length:
+        problem = f"{usable} rows can be used, quality.length_s asks for {length}"
+        short = Finding("too short", REJECTED, problem)
+        return job.recording(*inspected.findings, short, **measured)
+    kept, masked = slice(inspected.start, inspected.start + length), inspected.masked[:length]
+    variables = {
+        name: np.ascontiguousarray(values[kept].T, dtype=np.float32)
+        for name, values in (
+            *(("angular_rate", stored), ("temperature_c", log.temperature_c)),
+            ("acceleration_g", log.acceleration_g),
+        )
+        if values is not None
+    }
+    variables["angular_rate"][:, masked] = np.nan
+    return job.recording(
+        *inspected.findings,
+        **measured,
+        outcome=inspected.outcome,
         start=kept.start,
         stop=kept.stop,
         masked=int(masked.sum()),
-        content=data_hash(rates, None),
+        content=data_hash(variables["angular_rate"], None),
         variables=variables,
     )

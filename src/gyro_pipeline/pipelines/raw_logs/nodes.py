@@ -24,10 +24,10 @@ logger = logging.getLogger(__name__)
 
 _WORTH_PROCESSES = 10**8
 """Bytes to read; fewer are read by this process before others have started."""
-
 _AT_ONCE, _BYTES_AT_ONCE = 16, 16 * 10**6
 """Recordings, and bytes of them, that go to a process together, and come back so."""
-
+_OF_USED = ("start", "stop", "masked")
+"""Columns of recordings that are used."""
 _NAMED = 10
 """So many are named in a message; all are in the table."""
 
@@ -86,8 +86,24 @@ def quality_table(files: Logs, inspected: Sequence[Recording]) -> pd.DataFrame:
         file; the rows that are used, from ``start`` to before ``stop``, and of these ``masked``;
         ``rate_hz``, measured; ``findings``.
     """
-    table = pd.DataFrame(_described(files.sensor, one) for one in _without_copies(inspected))
-    return table.astype({"start": "Int64", "stop": "Int64", "masked": "Int64"})
+    rows = []
+    for recording in _without_copies(inspected):
+        used = recording.outcome != REJECTED
+        findings = [f"{finding.check}: {finding.detail}" for finding in recording.findings]
+        rows.append(
+            {
+                "sensor": files.sensor,
+                "imu": recording.imu,
+                "recording": recording.recording,
+                "file": recording.where,
+                "outcome": recording.outcome,
+                "rows": recording.rows,
+                **{name: getattr(recording, name) if used else None for name in _OF_USED},
+                "rate_hz": _rounded(recording.rate_hz),
+                "findings": "; ".join(findings) or None,
+            }
+        )
+    return pd.DataFrame(rows).astype(dict.fromkeys(_OF_USED, "Int64"))
 
 
 def label_recordings(
@@ -117,11 +133,13 @@ def label_recordings(
     splits = {entry.recording: entry.split for entry in files.entries}
     if any(splits.values()):
         coordinates["given_split"] = ("recording", [splits[number] for number in numbers])
+    measured = used.rate_hz.dropna()
     attributes = {
         "sensor": files.sensor,
         "source": files.source,
         "simulated": int(files.simulated),
-        "rate_hz": _agreed_rate(used, files.rate_hz),
+        # the reader has rejected those whose rate is far from the expected one
+        "rate_hz": _rounded(measured.median()) if len(measured) else files.rate_hz,
     }
     contents = [[*one.place, one.content] for one in inspected if one.place in used.index]
     attributes["data_hash"] = fingerprint([attributes, sorted(splits.items()), contents])
@@ -168,56 +186,30 @@ def _without_copies(inspected: Sequence[Recording]) -> Iterator[Recording]:
     """Reject recordings that are there before under another number."""
     first = dict[str, Recording]()
     for recording in inspected:
-        if recording.outcome == REJECTED:
+        same = first.setdefault(recording.content, recording)
+        if same is recording or recording.outcome == REJECTED:
             yield recording
             continue
-        same = first.setdefault(recording.content, recording)
         problem = f"the same samples as {same.where}, so one of the two is not what its name says"
-        copy = (*recording.findings, Finding("duplicate", REJECTED, problem))
-        alone = same is recording
-        yield recording if alone else replace(recording, outcome=REJECTED, findings=copy)
+        findings = (*recording.findings, Finding("duplicate", REJECTED, problem))
+        yield replace(recording, outcome=REJECTED, findings=findings)
 
 
-def _described(sensor: str, recording: Recording) -> dict[str, Any]:
-    """A row of the table."""
-    used, rate_hz = recording.outcome != REJECTED, recording.rate_hz
-    return {
-        "sensor": sensor,
-        "imu": recording.imu,
-        "recording": recording.recording,
-        "file": recording.where,
-        "outcome": recording.outcome,
-        "rows": recording.rows,
-        "start": recording.start if used else None,
-        "stop": recording.stop if used else None,
-        "masked": recording.masked if used else None,
-        "rate_hz": None if rate_hz is None else _rounded(rate_hz),
-        "findings": "; ".join(f"{one.check}: {one.detail}" for one in recording.findings) or None,
-    }
-
-
-def _agreed_rate(used: pd.DataFrame, expected_hz: float | None) -> float | None:
-    """The median of the measured rates; the reader has rejected those far from the expected one."""
-    measured = used.rate_hz.dropna()
-    return _rounded(measured.median()) if len(measured) else expected_hz
-
-
-def _rounded(rate_hz: float) -> float:
+def _rounded(rate_hz: float | None) -> float | None:
     """To a millionth, which is better than any logger's clock."""
-    return float(f"{rate_hz:.6g}")
+    return None if rate_hz is None else float(f"{rate_hz:.6g}")
 
 
 def _reasons(rejected: pd.DataFrame) -> list[str]:
     """Why recordings were rejected, each reason once, with the recordings that it is of."""
-    alike: dict[str, list[Any]] = {}
-    for row in rejected.itertuples():
-        reason = re.sub(rf"\S*{re.escape(str(row.file))}", "the file", str(row.findings))
-        alike.setdefault(reason, []).append(row)
+    reasons = [
+        re.sub(rf"\S*{re.escape(file)}", "the file", str(findings))
+        for file, findings in zip(rejected.file, rejected.findings, strict=True)
+    ]
     lines = []
-    for reason, rows in alike.items():
-        which = f"IMU {rows[0].imu} recording {rows[0].recording}, {rows[0].file}"
-        which += f", and {len(rows) - 1} more" if len(rows) > 1 else ""
-        lines.append(f"{which}: {reason}")
+    for reason, alike in rejected.groupby(reasons, sort=False):
+        row, more = alike.iloc[0], f", and {len(alike) - 1} more" if len(alike) > 1 else ""
+        lines.append(f"IMU {row.imu} recording {row.recording}, {row.file}{more}: {reason}")
     further = len(lines) - _NAMED
-    more = [f"and {further} other reasons, in the table of their quality"] if further > 0 else []
-    return lines[:_NAMED] + more
+    rest = [f"and {further} other reasons, in the table of their quality"] if further > 0 else []
+    return lines[:_NAMED] + rest
