@@ -153,24 +153,6 @@ class ReaderOptions(Parameter):
         "auto",
         description="name in gyro_pipeline.readers.FORMATS; general: none of them; auto: told",
     )
-    trust: Literal["options"] | None = Field(
-        None, description="options: these options overrule what the file says of itself"
-    )
-    encoding: str | None = Field(None, description="of a text; null: UTF-8 or UTF-16")
-    delimiter: str | None = Field(
-        None, min_length=1, max_length=1, description="of a text; a blank: runs of them; null: told"
-    )
-    row: str | None = Field(
-        None, description="expression with named groups; each line that it matches is a row"
-    )
-    rows: dict[Column, str | float] = Field(
-        {}, description="only rows with these values in these columns, such as {sensor: 1}"
-    )
-    repeats: Literal["drop"] | None = Field(
-        None, description="drop: rows whose rates are those of the row before are no samples"
-    )
-    topic: str | None = Field(None, description="of a flight log or a bag, that with the rates")
-    instance: int | None = Field(None, ge=0, description="of several sensors in such a log, from 0")
     columns: Triple | dict[int, Triple] | None = Field(
         None, description="of the angular rates about x, y, z; or these of each IMU, by number"
     )
@@ -203,6 +185,24 @@ class ReaderOptions(Parameter):
     counter_bits: int | None = Field(
         None, ge=2, le=32, description="it starts anew after 2 to this; null: the format's, or 16"
     )
+    trust: Literal["options"] | None = Field(
+        None, description="options: these options overrule what the file says of itself"
+    )
+    encoding: str | None = Field(None, description="of a text; null: UTF-8 or UTF-16")
+    delimiter: str | None = Field(
+        None, min_length=1, max_length=1, description="of a text; a blank: runs of them; null: told"
+    )
+    row: str | None = Field(
+        None, description="expression with named groups; each line that it matches is a row"
+    )
+    rows: dict[Column, str | float] = Field(
+        {}, description="only rows with these values in these columns, such as {sensor: 1}"
+    )
+    repeats: Literal["drop"] | None = Field(
+        None, description="drop: rows whose rates are those of the row before are no samples"
+    )
+    topic: str | None = Field(None, description="of a flight log or a bag, that with the rates")
+    instance: int | None = Field(None, ge=0, description="of several sensors in such a log, from 0")
     rate_tolerance_pct: float = Field(
         2.0, gt=0, description="that a measured sample rate may differ from the expected one"
     )

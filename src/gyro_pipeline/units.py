@@ -22,7 +22,6 @@ degree_per_second = degree / second = dps = degps = deg_s = deg_per_s = deg_sec 
 radian_per_second = radian / second = radps = rad_s = rad_per_s = rad_sec = rad_per_sec
 degree_per_hour = degree / hour = dph = deg_h = deg_per_h
 """
-
 _REFERENCES = {
     "rate": "degree_per_second",
     "angle": "degree",
@@ -33,12 +32,11 @@ _REFERENCES = {
 }
 """What is told apart, and the unit in which each is used here."""
 
-_SIGNS = str.maketrans({"º": "°", "˚": "°", "℃": "degC", "℉": "degF", "·": "*", "⋅": "*"})
-_POWERS = {"⁻¹": "^-1", "⁻²": "^-2", "²": "^2", "°C": "degC", "°F": "degF", "°c": "degC"}
+_SPELLINGS = {"º": "°", "˚": "°", "℃": "°C", "℉": "°F", "°c": "°C", "°f": "°F", "·": "*", "⋅": "*"}
+_SPELLINGS |= {"⁻¹": "^-1", "⁻²": "^-2", "²": "^2", "°": "deg"}
 _TERM = r"[^\W\d_][^\W\d]*(?:\^?-?[1-3])?"
 # words, products and quotients, but neither numbers nor roots; pint would evaluate 9**9**9
-_EXPRESSION = re.compile(rf"\(?{_TERM}(?:[/* ()]{{1,3}}{_TERM})*\)?")
-_LONGEST = 40
+_EXPRESSION = re.compile(rf"(?=.{{1,40}}$)\(?{_TERM}(?:[/* ()]{{1,3}}{_TERM})*\)?")
 
 
 class Unit(NamedTuple):
@@ -65,11 +63,8 @@ def _registry() -> tuple[Any, dict[Any, str]]:
     units.load_definitions(str(files("pint") / "default_en.txt"))
     for definition in _DEFINITIONS.strip().splitlines():
         units.define(definition)
-    quantities = {
-        units.Quantity(1, reference).dimensionality: quantity
-        for quantity, reference in _REFERENCES.items()
-    }
-    return units, quantities
+    references = {units.Quantity(1, unit): quantity for quantity, unit in _REFERENCES.items()}
+    return units, {unit.dimensionality: quantity for unit, quantity in references.items()}
 
 
 @lru_cache(1 << 12)  # a folder's files have the same headers
@@ -79,25 +74,20 @@ def read_unit(text: str) -> Unit | None:
     Returns:
         What it measures; ``other`` for known units of anything else; None where it is no unit.
     """
-    expression = _spelled_for_pint(text)
-    written, small = _parsed(expression), _parsed(expression.lower())
-    # DPS, Deg/Sec, MS; as written where that says something else, for mG is not mg
-    small_is_usual = small is not None and small.quantity in ("rate", "time")
-    unclear = written is None or (written.quantity == "other" and small_is_usual)
-    return small if unclear else written
-
-
-def _spelled_for_pint(text: str) -> str:
-    text = text.strip().translate(_SIGNS)
-    for sign, spelled in _POWERS.items():
-        text = text.replace(sign, spelled)
-    text = re.sub(r"\.(?=\s|$)", "", text.replace("°", "deg"))  # Deg. per s
+    text = text.strip()
+    for spelling, of_pint in _SPELLINGS.items():
+        text = text.replace(spelling, of_pint)
+    text = re.sub(r"\.(?=\s|$)", "", text)  # Deg. per s
     text = re.sub(r"(?<=[^\W\d])\.(?=[^\W\d])", "*", text)
-    return re.sub(r"(?<=[^\W\d])(?=-?[123]\b)", "^", text)  # rad s-1, m/s2
+    text = re.sub(r"(?<=[^\W\d])(?=-?[123]\b)", "^", text)  # rad s-1, m/s2
+    written, small = _parsed(text), _parsed(text.lower())
+    # DPS, Deg/Sec, MS, G; as written where that says something else
+    usual = small is not None and small.quantity in ("rate", "time", "acceleration")
+    return small if written is None or (written.quantity == "other" and usual) else written
 
 
 def _parsed(expression: str) -> Unit | None:
-    if len(expression) > _LONGEST or not _EXPRESSION.fullmatch(expression):
+    if not _EXPRESSION.fullmatch(expression):
         return None
     units, quantities = _registry()
     try:

@@ -63,7 +63,7 @@ def test_the_flicker_floor_is_flat_at_0664_b(rate):
     noise = simulate_noise(np.random.default_rng(6), (150, 6000), rate, 0.0, flicker_dps=b)
     times = averaging_times_s(6000, rate)
     times = times[times >= 8 / rate]
-    variance = np.mean([allan_variance(samples, rate, times) for samples in noise], axis=0)
+    variance = np.mean([allan_variance(samples, rate, times)[0] for samples in noise], axis=0)
     floor = np.sqrt(FLICKER_FLOOR) * b
     np.testing.assert_allclose(np.sqrt(variance), floor, rtol=0.1)
     assert np.sqrt(variance[:6]).mean() == pytest.approx(floor, rel=0.02)
@@ -72,7 +72,7 @@ def test_the_flicker_floor_is_flat_at_0664_b(rate):
 def test_flicker_adds_to_the_white_noise():
     b, times = 3 * MDPS, np.array([0.2, 5.0])
     noise = simulate_noise(np.random.default_rng(7), (300, 5000), RATE, N, flicker_dps=b)
-    variance = np.mean([allan_variance(samples, RATE, times) for samples in noise], axis=0)
+    variance = np.mean([allan_variance(samples, RATE, times)[0] for samples in noise], axis=0)
     np.testing.assert_allclose(variance, N**2 / times + FLICKER_FLOOR * b**2, rtol=0.1)
 
 

@@ -84,7 +84,7 @@ def _of_the_system(cause: BaseException | None) -> bool:
 def _judged(log: Log, job: Inspection) -> Recording:
     rate_hz = log.rate_hz or job.rate_hz
     if rate_hz is None:
-        return job.recording(Finding("sample rate", REJECTED, _NO_RATE))
+        return job.recording(*log.findings, Finding("sample rate", REJECTED, _NO_RATE))
     with np.errstate(over="ignore"):  # becomes infinite, and is found as such
         stored = np.asarray(log.samples, np.float32)
     inspected = inspect(replace(log, samples=stored.astype(np.float64)), rate_hz, job.quality)

@@ -11,11 +11,23 @@ from collections.abc import Sequence
 
 from gyro_pipeline.conventions import AXES, InputError
 from gyro_pipeline.parameters import Column
-from gyro_pipeline.readers.formats import BIAS_TAKEN_OFF, find_all
-from gyro_pipeline.readers.names import ATTITUDE, RATE, File, Header, samples_a_row, triples
+from gyro_pipeline.readers.file import File
+from gyro_pipeline.readers.formats import find_all
+from gyro_pipeline.readers.names import ATTITUDE, RATE, Header, triples
 from gyro_pipeline.readers.scales import RATE_UNITS
 
 Columns = Sequence[int]
+
+_NOTES = {
+    "motionRotationRate": "{} is what is left of a bias: Core Motion removes it (Apple, "
+    "CMDeviceMotion.rotationRate); gyroRotation columns are free of that",
+    "gyroADC": "{} is what is left of a bias: Betaflight takes off the mean at power-on",
+    "unbiased|debias|bias_?(free|corrected|removed)|(?<!un)calibrated(?=[_ ]|$)": "{} is what is "
+    "left of a bias: by its name, it is taken off",
+    "alpha|beta|gamma": "{}: a browser's alpha is taken for the rate about z, beta x, gamma y "
+    "(W3C, 2016); some browsers number them from x",
+}
+"""What the name of a rate says beside."""
 
 
 def rate_columns(file: File, imu: int | None = None) -> Columns:
@@ -28,25 +40,27 @@ def rate_columns(file: File, imu: int | None = None) -> Columns:
     Raises:
         InputError: No columns, or several, could be meant.
     """
-    given = file.options.columns
-    if isinstance(given, dict):
-        if imu not in given:
-            known = ", ".join(map(str, given))
-            raise file.refusal(f"columns are given of IMUs {known}, not of IMU {imu}; correct them")
-        given = given[imu]
-    rates = _given(file, given) if given else _named(file)
-    _note_what_names_say(file, rates)
+    columns = file.options.columns
+    if isinstance(columns, dict):
+        if imu not in columns:
+            imus = ", ".join(map(str, columns))
+            raise file.refusal(f"columns are of IMUs {imus}, not of IMU {imu}; correct them")
+        columns = columns[imu]
+    rates = _by_options(file, columns) if columns else _by_name(file)
+    for words, text in _NOTES.items():
+        if re.search(words, file.table.names[rates[0]], re.IGNORECASE):
+            file.note("rates", text.format(repr(file.table.names[rates[0]])))
     return rates
 
 
-def _given(file: File, given: Sequence[Column]) -> Columns:
+def _by_options(file: File, columns: Sequence[Column]) -> Columns:
     """The columns of the options; they contradict names of something else or of another order."""
-    rates = [file.find(column) for column in given]
+    rates = [file.find(column) for column in columns]
     if len(set(rates)) < len(AXES):
-        raise file.refusal(f"expected three columns of rates, got {list(given)}; correct columns")
+        raise file.refusal(f"expected three columns of rates, got {list(columns)}; correct columns")
     others = [triple for triple in triples(file.headers) if {*triple} & {*rates}]
     same = [triple for triple in others if {*triple} == {*rates}]
-    if others and list(rates) not in map(list, same):
+    if others and tuple(rates) not in same:
         together = "in this order" if same else "together"
         file.contradictions.append(
             f"columns of the options are {file.listed(rates)}, but by their names "
@@ -63,45 +77,38 @@ def _given(file: File, given: Sequence[Column]) -> Columns:
 
 def _may_be_rate(file: File, header: Header) -> bool:
     """Whether a name allows it; that of an angle does, of increments or with a unit of rates."""
-    of_angle = header.quantity == ATTITUDE
-    return header.quantity in ("", RATE) or (
-        of_angle and (file.options.increments or header.measures("rate"))
-    )
+    angle_turned = file.options.increments or header.measures("rate")
+    return header.quantity in ("", RATE) or (header.quantity == ATTITUDE and angle_turned)
 
 
-def _named(file: File) -> Columns:
+def _by_name(file: File) -> Columns:
     """The only three columns that say they are rates about x, y, z."""
     if file.form:
-        return [find_all(file.table, name)[0] for name in file.form.rates]
-    by_name: list[Columns] = []
-    by_unit: list[Columns] = []
-    silent: list[Columns] = []
-    wrong: list[Columns] = []
+        return find_all(file.table, *file.form.rates.split())
+    measured = "angle" if file.options.increments else "rate"
+    groups: dict[bool, list[Columns]] = {True: [], False: []}
     for triple in triples(file.headers):
         header = file.headers[triple[0]]
-        if header.quantity == RATE:
-            right = not header.unit or header.measures("rate", "count", "angle")
-            (by_name if right else wrong).append(triple)
-        elif not header.quantity:
-            measured = header.measures("angle" if file.options.increments else "rate")
-            (by_unit if measured else silent).append(triple)
+        if header.quantity in ("", RATE):
+            groups[header.quantity == RATE or header.measures(measured)].append(triple)
     if not any(file.table.names) and len(file.table.names) == len(AXES):
-        silent = [(0, 1, 2)]
-    asked = bool(file.options.units)  # the user's word
-    candidates = by_name + by_unit or wrong or (silent if asked else [])
-    several = len(candidates) > 1 and samples_a_row(file.headers, candidates[0]) <= len(AXES)
-    if candidates and not several:
-        return candidates[0]
-    raise _refusal_of(file, candidates, silent)
+        groups[False].append((0, 1, 2))
+    certain, silent = groups[True], groups[False]
+    if not certain and file.options.units:  # the user's word
+        certain = silent
+    if len(certain) == 1:
+        return certain[0]
+    raise _refusal_of(file, certain, silent)
 
 
-def _refusal_of(file: File, candidates: Sequence[Columns], silent: Sequence[Columns]) -> InputError:
-    if candidates:
-        first, second = map(list, candidates[:2])
+def _refusal_of(file: File, certain: Sequence[Columns], silent: Sequence[Columns]) -> InputError:
+    if certain:
+        first, second = map(list, certain[:2])
         return file.refusal(
-            f"expected one sensor, got {len(candidates)}, such as {file.listed(first)} and "
-            f"{file.listed(second)}; give columns of the one to read, such as {first}, or of both "
-            f"as IMUs, {{1: {first}, 2: {second}}},"
+            f"expected one sensor and one sample a row, got {len(certain)}, such as "
+            f"{file.listed(first)} and {file.listed(second)}; give columns of the one to read, "
+            f"such as {first}, or of both as IMUs, {{1: {first}, 2: {second}}}, or write a row for "
+            "each sample;"
         )
     if len(silent) == 1:
         return file.refusal(
@@ -112,22 +119,3 @@ def _refusal_of(file: File, candidates: Sequence[Columns], silent: Sequence[Colu
         "expected three columns of angular rate about x, y, z that say so by name or unit, got "
         f"{file.table.listed()}; give columns, such as [gx, gy, gz], and units"
     )
-
-
-def _note_what_names_say(file: File, rates: Columns) -> None:
-    """Several samples a row; rates that are free of their bias; a browser's axes."""
-    samples = samples_a_row(file.headers, rates)
-    if samples > len(AXES):
-        file.contradictions.append(
-            f"each row holds {samples} samples, {file.listed(rates)} and so on, but one of them "
-            "would be read; write a row for each sample"
-        )
-    first = file.table.names[rates[0]]
-    for words, reason in BIAS_TAKEN_OFF.items():
-        if re.search(words, first, re.IGNORECASE):
-            file.note("bias taken off", f"{first!r} is what is left of a bias: {reason}")
-    if re.search("alpha|beta|gamma", first, re.IGNORECASE):
-        text = "a browser's alpha is taken for the rate about z, beta x, gamma y (W3C, 2016)"
-        file.note("axes", f"{text}; some browsers number them from x")
-    if file.form and file.form.remark:
-        file.note("axes", file.form.remark)

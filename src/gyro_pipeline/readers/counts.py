@@ -10,34 +10,44 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import trim_mean
 
-from gyro_pipeline.conventions import AXES, InputError
+from gyro_pipeline.conventions import AXES
+from gyro_pipeline.readers.file import File
 
 Floats = NDArray[np.float64]
 
 
-def _finite(values: Floats) -> Floats:
-    return values[np.isfinite(values).all(axis=1)]
+def contradict_values(file: File, raw: Floats, rates: Floats, are_counts: bool) -> None:
+    """Values that no gyroscope at rest gives, unless the options explain them.
+
+    Args:
+        file: Gets the first contradiction.
+        raw: (n, 3), as the file has them.
+        rates: (n, 3), deg/s.
+        are_counts: Whether the file's numbers are known to be counts.
+    """
+    options = file.options
+    explained = options.offset is not None
+    text = "" if explained or options.signed_bits else wrapped(raw)
+    text = text or ("" if are_counts else lost_decimal_points(raw))
+    text = text or ("" if explained else implausible_level(rates))
+    if text:
+        file.contradictions.append(text)
 
 
 def wrapped(
-    values: Floats,
-    bits: Sequence[int] = (12, 14, 16, 20, 24, 32),
-    compact: float = 8,
-    most: float = 0.99,
+    values: Floats, bits: Sequence[int] = (12, 14, 16, 20, 24, 32), compact: float = 8
 ) -> str:
     """Signed counts that were written as unsigned ones.
 
-    Most rows are whole numbers without a sign, of which some lie so high that their signed reading
-    is smaller, in range or in size, by the factor ``compact``.
+    Nearly all rows are whole numbers without a sign, of which some lie so high that their signed
+    reading is smaller, in range or in size, by the factor ``compact``.
     """
-    values = _finite(values)
-    some = values[:100]  # enough to tell most recordings
-    if not len(some) or (some != np.rint(some)).any(axis=1).mean() > 0.1:  # noqa: PLR2004
+    if not _are_whole(values[:100]):
         return ""
     counts = values[((values == np.rint(values)) & (values >= 0)).all(axis=1)]
     for width in bits:
         within = counts[(counts < 2**width).all(axis=1)]
-        if not len(within) or len(within) < most * len(values):
+        if len(within) < 0.99 * len(_finite(values)):  # noqa: PLR2004
             continue
         high = within >= 2 ** (width - 1)
         signed = np.where(high, within - 2.0**width, within)
@@ -53,7 +63,7 @@ def wrapped(
     return ""
 
 
-def signed(values: Floats, bits: int, where: str) -> Floats:
+def signed(file: File, values: Floats, bits: int) -> Floats:
     """Signed counts of unsigned ones.
 
     Raises:
@@ -61,18 +71,20 @@ def signed(values: Floats, bits: int, where: str) -> Floats:
     """
     finite = values[np.isfinite(values)]
     if (finite != np.rint(finite)).any() or finite.min() < 0 or finite.max() >= 2**bits:
-        raise InputError(
-            f"{where}: signed_bits: {bits}: expected whole numbers from 0 to {2**bits - 1}, got "
-            f"{finite.min():g} to {finite.max():g}"
+        raise file.refusal(
+            f"signed_bits: {bits}: expected whole numbers from 0 to {2**bits - 1}, got "
+            f"{finite.min():g} to {finite.max():g}; correct it"
         )
     return np.where(values >= 2 ** (bits - 1), values - 2.0**bits, values)
 
 
 def lost_decimal_points(values: Floats, digits: tuple[int, int] = (6, 9), most: float = 0.9) -> str:
     """Whole numbers of many digits: a spreadsheet took decimal points for separators."""
+    if not _are_whole(values[:100]):
+        return ""
     values = np.abs(_finite(values))
     many = (values >= 10.0 ** (digits[0] - 1)) & (values < 10.0 ** digits[1])
-    if not len(values) or (many & (values == np.rint(values))).mean() < most:
+    if (many & (values == np.rint(values))).mean() < most:
         return ""
     return (
         f"whole numbers of {digits[0]} to {digits[1]} digits, such as {values[0, 0]:.0f}: the "
@@ -82,7 +94,7 @@ def lost_decimal_points(values: Floats, digits: tuple[int, int] = (6, 9), most: 
 
 def implausible_level(rates: Floats, most_dps: float = 100.0, trimmed: float = 0.1) -> str:
     """A mean that no MEMS gyroscope at rest has; of rates in deg/s."""
-    if not ((np.abs(rates) > most_dps).mean(axis=0) > trimmed).any():  # most recordings
+    if (np.abs(rates) > most_dps).mean() < trimmed / 3:  # most recordings, at a glance
         return ""
     rates = _finite(rates)
     means = trim_mean(rates, trimmed, axis=0) if len(rates) else np.zeros(1)
@@ -93,3 +105,13 @@ def implausible_level(rates: Floats, most_dps: float = 100.0, trimmed: float = 0
         f"a mean of {means[axis]:.4g} deg/s about {AXES[axis]}, and no MEMS gyroscope at rest has "
         f"more than {most_dps:g}; check units and scale_dps, or give offset, the count at rest"
     )
+
+
+def _finite(values: Floats) -> Floats:
+    return values[np.isfinite(values).all(axis=1)]
+
+
+def _are_whole(values: Floats) -> bool:
+    """Whether nearly all of some values (n, 3) are whole numbers."""
+    values = _finite(values)
+    return len(values) > 0 and bool((values == np.rint(values)).mean() > 0.9)  # noqa: PLR2004

@@ -6,43 +6,61 @@ options or where the rows themselves say so. What could be either is refused.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
-from scipy.stats import trim_mean
+from scipy.stats import t as student
 
-from gyro_pipeline.conventions import AXES, InputError
-from gyro_pipeline.readers.table import IN_READER, Table
+from gyro_pipeline.conventions import AXES
+from gyro_pipeline.readers.file import File
+from gyro_pipeline.readers.names import triples
+from gyro_pipeline.readers.stamps import names_time
 
-Mask = NDArray[np.bool_]
+Codes = NDArray[np.intp]
 Floats = NDArray[np.float64]
-
-WINDOW = 51
-"""Rows whose mean a sample is compared with, to see its noise."""
+Mask = NDArray[np.bool_]
 
 _DEVICE = re.compile(
-    r"(?i)(?:^|[ _.])(?:device|sensor|imu|node|serial|mac|topic|dev)"
-    r"(?:[ _]?(?:id|no|nr|num|number|name|index|tag|addr|address))?$"
+    r"(?i)(?:^|[ _.])(?:device|dev|sensor|imu|node|serial|mac|topic)"
+    r"(?:[ _]?(?:id|no|num|number|name|index|tag|addr|address))?$"
 )
-_FLAGS = {"true", "false", "t", "f", "yes", "no", "y", "n", "on", "off"}
+_NUMBER_OR_FLAG = re.compile(r"(?i)[-+.\de]*|inf|-inf|true|false|t|f|yes|no|y|n|on|off")
 
 
-def with_value(table: Table, number: int, value: Any, count: int) -> Mask:
-    """Rows (count,) with a value in a column.
+def sample_rows(file: File, rates: Floats) -> Mask:
+    """Rows (n,) that are samples; rates (n, 3) are the numbers of the file.
 
     Raises:
-        InputError: There is none, or the column is of another length.
+        InputError: No row has what the options ask for.
     """
-    column = table.columns[number]
-    same = _as_texts(column) == _as_text(value)
+    keep = np.ones(len(rates), bool)
+    for name, value in file.options.rows.items():
+        keep &= _with_value(file, file.find(name), value, len(rates))
+    for check, wanted, leave_out, why in (
+        ("blank rows", True, blank_at_regular_shares, "are blank, at a regular share"),
+        ("repeated rows", file.options.repeats, repeated, "repeat the one before"),
+    ):
+        if not wanted:
+            continue
+        out = leave_out(rates if keep.all() else rates[keep])
+        if out.any():
+            file.note(check, f"{out.sum()} of {len(out)} rows {why}: no samples, left out")
+            keep[np.flatnonzero(keep)[out]] = False
+    return keep
+
+
+def _with_value(file: File, number: int, value: str | float, count: int) -> Mask:
+    """Rows (count,) with a value in a column."""
+    codes, texts = _coded(file.table.columns[number])
+    same = np.asarray(texts == _as_text(value))[codes]
     if len(same) != count or not same.any():
-        raise InputError(
-            f"{table.where}: expected {count} rows, some with {_as_text(value)} in "
-            f"{table.names[number]!r}, got {_counted(column)}; correct rows {IN_READER}"
+        raise file.refusal(
+            f"expected {count} rows, some with {_as_text(value)} in {file.table.names[number]!r}, "
+            f"got {_counted(codes, texts)}; correct rows"
         )
     return same
 
@@ -62,158 +80,121 @@ def blank_at_regular_shares(
     Returns:
         (n,), nothing where blank rows are losses.
     """
+    none = np.zeros(len(rates), bool)
+    if np.isnan(rates[:, 0]).mean() < least_share:
+        return none
     blank = np.isnan(rates).all(axis=1)
-    lengths = _run_lengths(np.asarray(blank, np.intp))[1:-1]
+    lengths = np.diff(np.flatnonzero(np.diff(blank)))
     if blank.mean() < least_share or len(lengths) < 2 * least_runs:
-        return np.zeros(len(rates), bool)
+        return none
     for some in (lengths[0::2], lengths[1::2]):
         usual = np.median(some)
         if (np.abs(some - usual) <= max(1, usual / 4)).mean() < alike:
-            return np.zeros(len(rates), bool)
+            return none
     return np.asarray(blank)
 
 
 def repeated(rates: Floats) -> Mask:
     """Rows (n,) whose rates (n, 3) are all those of the row before."""
-    same = np.zeros(len(rates), bool)
-    same[1:] = (rates[1:] == rates[:-1]).all(axis=1)
-    return same
+    return np.r_[False, (rates[1:] == rates[:-1]).all(axis=1)]
 
 
-def takes_turns(table: Table, number: int, keep: Mask, rates: Floats, most_values: int = 32) -> str:
-    """Whether a column says what a row is of, such as a device, a sensor or a kind of row.
+def contradict_turns(file: File, used: Collection[int], keep: Mask, rates: Floats) -> None:
+    """Columns that nobody asked for, measure nothing, and say what a row is of.
 
-    It has few values, and they come and go. Texts then say what a row is; so do numbers of a column
-    that is named as a device, and those with which the rates change.
+    Such a column has few values, and they come and go. Texts then say what a row is; so do numbers
+    of a column that is named as a device, and those with which level or noise of the rates changes.
 
     Args:
-        table: (n) rows.
-        number: Of a column that nobody asked for.
+        file: Gets the contradictions.
+        used: Numbers of the columns that have been asked for.
         keep: (n,), the rows that are left.
         rates: (m, 3), of these.
-        most_values: More are measurements or counters.
-
-    Returns:
-        What it is, for a message; an empty text where it says nothing of the rows.
     """
-    column = table.columns[number]
-    some = column[:: len(column) // 256 + 1]
-    if len(column) != len(keep) or len(pd.unique(some)) > most_values:
-        return ""
-    codes, values = pd.factorize(column[keep], use_na_sentinel=False)
-    if not 1 < len(values) <= most_values:
-        return ""
-    name = table.names[number]
-    evidence = _evidence(name, [_as_text(value) for value in values], codes, rates)
-    if not evidence:
-        return ""
-    pick = f"{{{name or number}: {next(filter(None, map(_as_text, values)))}}}"
-    return (
-        f"{name or f'column {number}'!r} takes turns among {_counted(column[keep])}, {evidence}, "
-        f"but a recording is of one device; pick its rows, such as rows: {pick}"
-    )
+    of_axes = {number for triple in triples(file.headers) for number in triple}
+    for number, (header, column) in enumerate(zip(file.headers, file.table.columns, strict=True)):
+        measures = header.has_unit or names_time(header) or (number in of_axes and header.quantity)
+        if number in used or (measures and column.dtype.kind == "f") or len(column) != len(keep):
+            continue
+        name = file.table.names[number]
+        turns, value = _takes_turns(name, column, keep, rates)
+        if turns:
+            file.contradictions.append(
+                f"{file.listed([number])} takes turns among {turns}, but a recording is of one "
+                f"device; pick its rows, such as rows: {{{name or number}: {value}}}"
+            )
 
 
-def _evidence(name: str, values: Sequence[str], codes: NDArray[np.intp], rates: Floats) -> str:
-    """Why values, by the codes (n,) of the rows, say what a row is; nothing if they do not."""
-    rows = np.bincount(codes, minlength=len(values))
-    runs = np.bincount(codes[np.flatnonzero(np.diff(codes, prepend=-1))], minlength=len(values))
-    filled = np.array([bool(value) for value in values])
-    if _DEVICE.search(name) and (filled & (rows >= 0.01 * len(codes))).sum() > 1:
-        return "by its name devices"
-    texts = filled & np.array([not _is_number_or_flag(value) for value in values])
-    if (texts & (runs > 2)).sum() > 1:  # noqa: PLR2004
-        return "which say what a row is"
-    for code in _suspected(rates, codes, len(values)) if (runs > 4).any() else ():  # noqa: PLR2004
-        if runs[code] > 4 and (difference := _rates_change(rates, codes == code)):  # noqa: PLR2004
-            return f"and with {values[code] or 'blank'} {difference}"
+def _takes_turns(
+    name: str, column: NDArray[Any], keep: Mask, rates: Floats, most_values: int = 32
+) -> tuple[str, str]:
+    """Values of a column (n,) and evidence, for a message, and a value; empty where there is none.
+
+    A column of more values holds measurements or counts.
+    """
+    if len(pd.unique(column[:: len(column) // 100 + 1])) > most_values:  # most columns
+        return "", ""
+    codes, texts = _coded(column[keep])
+    if not 1 < len(texts) <= most_values:
+        return "", ""
+    rows, filled = np.bincount(codes), texts.astype(bool)
+    runs = np.bincount(codes[np.flatnonzero(np.diff(codes, prepend=-1))])
+    words = filled & [not _NUMBER_OR_FLAG.fullmatch(text) for text in texts]
+    if _DEVICE.search(name) and (filled & (rows >= len(codes) / 100)).sum() > 1:
+        evidence = "by its name devices"
+    elif (words & (runs > 2)).sum() > 1:  # noqa: PLR2004
+        evidence = "which say what a row is"
+    else:
+        evidence = _change(rates, codes)
+    return evidence and f"{_counted(codes, texts)}, {evidence}", texts[filled][0]
+
+
+def _change(rates: Floats, codes: Codes, least: float = 0.3, chance: float = 1e-12) -> str:
+    """How level or noise of rates (n, 3) change with the codes (n,) of their rows, for a message.
+
+    Each run of a code is compared with both of its neighbours, which takes off drift and the slow
+    part of flicker; how these differences scatter is the rest. A change is more than ``least`` of
+    the mean size of the noise, and of a size that comes by ``chance`` in runs that are alike.
+    """
+    finite = np.isfinite(rates).all(axis=1)
+    starts = np.flatnonzero(np.diff(codes[finite], prepend=-1))
+    if len(starts) < 3:  # noqa: PLR2004
+        return ""
+    runs, lengths = codes[finite][starts[1:-1]], np.diff(starts, append=finite.sum())[:, None]
+    level = _without_spikes(rates[finite])
+    noise = _without_spikes(np.abs(level - uniform_filter1d(level, 51, axis=0)))
+    for what, values in (("rate", level), ("noise", noise)):
+        means = np.add.reduceat(values, starts) / lengths
+        apart = means[1:-1] - (means[:-2] + means[2:]) / 2
+        for code in np.flatnonzero(np.bincount(runs) > 2):  # noqa: PLR2004
+            some = apart[runs == code]
+            sizes, errors = np.abs(some.mean(axis=0)), some.std(axis=0) / np.sqrt(len(some))
+            limits = student.isf(chance / 2, len(some) - 1) * errors
+            excess = sizes - np.maximum(limits, least * noise.mean(axis=0))
+            if excess.max() > 0:
+                size = f"{AXES[excess.argmax()]} changes by {sizes[excess.argmax()]:.3g} deg/s"
+                return f"with which {what} about {size}"
     return ""
 
 
-def _is_number_or_flag(value: str) -> bool:
-    return bool(re.fullmatch(r"[-+.\deE]+|inf|-inf", value)) or value.lower() in _FLAGS
+def _without_spikes(values: Floats) -> Floats:
+    """Values (n, 3) within their quantiles of 1 and 99 %."""
+    return np.clip(values, *np.quantile(values, [0.01, 0.99], axis=0))
 
 
-def _suspected(rates: Floats, codes: NDArray[np.intp], values: int) -> NDArray[np.intp]:
-    """Codes with which means or noise of the rates differ at all; a look that costs little."""
-    finite = np.isfinite(rates).all(axis=1)
-    rates, codes = rates[finite], codes[finite]
-    rows = np.maximum(np.bincount(codes, minlength=values), 1)
-    sizes = np.abs(rates - uniform_filter1d(rates, WINDOW, axis=0))
-    found = np.zeros(values, bool)
-    for column, size in zip(rates.T, sizes.T, strict=True):
-        means, noises = (np.bincount(codes, some, values) / rows for some in (column, size))
-        least = np.maximum(0.1, 4 / np.sqrt(rows)) * 1.5 * np.median(size)
-        found |= (np.abs(means - column.mean()) > least) | (noises > 1.2 * size.mean())
-    return np.flatnonzero(found)
-
-
-def _rates_change(
-    rates: Floats,
-    there: Mask,
-    least: float = 0.2,
-    sigmas: float = 8.0,
-    noisier: float = 1.5,
-) -> str:
-    """How rates (n, 3) differ in the runs of some rows (n,) from those in the runs between them.
-
-    Each run is compared with both of its neighbours, which takes off drift and the slow part of
-    flicker; how these differences scatter is the rest. Trimmed means leave single spikes out.
-
-    Args:
-        rates: deg/s.
-        there: The rows.
-        least: Difference of the means that matters, in standard deviations of a sample.
-        sigmas: The same, in standard errors.
-        noisier: Ratio of the standard deviations that matters.
-    """
-    finite = np.isfinite(rates).all(axis=1)
-    rates, there = rates[finite], there[finite]
-    starts = np.flatnonzero(np.diff(there.astype(int), prepend=-1))
-    if len(starts) < 12 or len(rates) < WINDOW:  # noqa: PLR2004
-        return ""
-    means = np.add.reduceat(rates, starts) / np.diff(starts, append=len(rates))[:, None]
-    apart = means[1:-1] - (means[:-2] + means[2:]) / 2
-    apart *= np.where(there[starts[1:-1]], 1, -1)[:, None]
-    sizes = trim_mean(apart, 0.1)
-    errors = _spread(apart - sizes) / np.sqrt(len(apart) / 2)  # neighbours share runs
-    deviations = rates - uniform_filter1d(rates, WINDOW, axis=0)
-    noise = np.stack([_spread(deviations[there]), _spread(deviations[~there])])
-    for axis, size in enumerate(np.abs(sizes)):
-        if size > max(sigmas * errors[axis], least * noise[:, axis].min(), 0):
-            return f"the rate about {AXES[axis]} differs by {size:.3g} deg/s"
-    ratios = noise.max(axis=0) / np.maximum(noise.min(axis=0), 1e-300)
-    enough = min(there.sum(), (~there).sum()) > 4 * WINDOW
-    if enough and ratios.max() > noisier:
-        return f"the noise about {AXES[ratios.argmax()]} differs by a factor of {ratios.max():.3g}"
-    return ""
-
-
-def _spread(values: Floats) -> Floats:
-    """Standard deviations (3,) of values (n, 3) about 0, by the mean of their sizes."""
-    return np.asarray(trim_mean(np.abs(values), 0.05) * np.sqrt(np.pi / 2))
-
-
-def _run_lengths(codes: NDArray[np.intp]) -> NDArray[np.intp]:
-    starts = np.flatnonzero(np.diff(codes, prepend=codes[:1] - 1))
-    return np.diff(starts, append=len(codes))
+def _coded(column: NDArray[Any]) -> tuple[Codes, NDArray[Any]]:
+    """Of each row the number of its value, and the values as texts."""
+    codes, values = pd.factorize(column, use_na_sentinel=False)
+    return codes, np.array([_as_text(value) for value in values], object)
 
 
 def _as_text(value: Any) -> str:
     """A value as it is typed: 1 of 1.0; an empty text of none."""
-    if isinstance(value, float):
-        return "" if np.isnan(value) else f"{value:.15g}"
-    return "" if value is None else str(value).strip()
+    return "" if pd.isna(value) else f"{value:.15g}" if isinstance(value, float) else str(value)
 
 
-def _as_texts(column: NDArray[Any]) -> NDArray[Any]:
-    return np.array([_as_text(value) for value in column.tolist()], object)
-
-
-def _counted(column: NDArray[Any], most: int = 8) -> str:
+def _counted(codes: Codes, texts: NDArray[Any], most: int = 8) -> str:
     """Values and how many rows have each, for a message."""
-    values, counts = np.unique(_as_texts(column), return_counts=True)
-    shown = [
-        f"{v or 'blank'} ({n} rows)" for v, n in zip(values[:most], counts[:most], strict=True)
-    ]
-    return ", ".join(shown) + (", …" if len(values) > most else "")
+    pairs = zip(texts[:most], np.bincount(codes), strict=False)
+    shown = [f"{text or 'blank'} ({count} rows)" for text, count in pairs]
+    return ", ".join(shown) + (", …" if len(texts) > most else "")

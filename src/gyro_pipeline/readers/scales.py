@@ -1,26 +1,38 @@
 """What one unit of the rates is, in deg/s.
 
-The header, the lines above it, the format and the options may say so; those that say it must agree.
+The options, the header, the lines above it and the format may say so; all that say it must agree.
 """
 
 import re
 from collections.abc import Sequence
 from math import isclose
+from typing import NamedTuple
 
-from gyro_pipeline.readers.formats import above_header, find_all
-from gyro_pipeline.readers.names import File, read_header
+from gyro_pipeline.readers.file import File
+from gyro_pipeline.readers.formats import find_all
+from gyro_pipeline.readers.names import read_header
 from gyro_pipeline.units import Unit, read_unit
 
 RATE_UNITS = "deg/s, rad/s, mdps, deg/h, … or raw (with scale_dps)"
 
-_RAD_PER_S_DPS = 57.29577951308232
 _SCALE = re.compile(
     r"(?im)^\W*((?:g|gyro\w*)[ _]?(?:scale|sensitivity)(?:[ _]?factor)?|scale[ _]?factor|scale)"
     r"\W+([-+]?[\d.]+(?:e[-+]?\d+)?)"
 )
 
-Stated = tuple[str, Unit]
-"""A unit as written, and what it is."""
+
+class Statement(NamedTuple):
+    """Who says what the unit is, and the unit."""
+
+    text: str
+    unit: Unit
+
+    def agrees(self, other: "Statement") -> bool:
+        """Whether units are the same; one of counts may say nothing of their size."""
+        sizes = self.unit.factor, other.unit.factor
+        of_any_size = self.unit.quantity == "count" and 1 in sizes
+        alike = of_any_size or isclose(*sizes, rel_tol=1e-6)
+        return self.unit.quantity == other.unit.quantity and alike
 
 
 def scale_of(file: File, rates: Sequence[int]) -> tuple[float, bool]:
@@ -29,91 +41,70 @@ def scale_of(file: File, rates: Sequence[int]) -> tuple[float, bool]:
     Raises:
         InputError: Nobody says the unit, or the scale of raw counts.
     """
-    asked, header = _asked(file), _of_header(file, rates)
-    above = _above(file.table.preamble)
-    lines = f"lines above the header {' and '.join(above)}"
-    if above and header and not any(_same(header[1], unit) for unit in above.values()):
-        file.contradictions.append(f"the header says {header[0]}, but {lines}; give units")
-    stated = header or (next(iter(above.items())) if len(above) == 1 else None)
-    by_format = _of_format(file, rates)
-    if by_format and not header:
-        if stated and not _same(stated[1], by_format[1]):
-            file.contradictions.append(f"the format has {by_format[0]}, but {lines}; give units")
-        elif not stated and not asked:
-            file.note("unit", f"{by_format[0]}, by the format; the file does not say")
-        stated = by_format
-    if asked and stated and not _same(asked[1], stated[1]):
-        file.contradictions.append(
-            f"the file says {stated[0]}, {file.listed(rates)}, but units of the options are "
-            f"{asked[0]}; correct units"
-        )
-    unit = asked or stated
-    names = file.listed(rates)
-    if unit is None:
-        raise file.refusal(f"expected a unit of the rates, got {names}; give units: {RATE_UNITS}")
-    raw = unit[1].quantity == "count"
-    if raw and unit[1].factor == 1 and file.options.scale_dps is None:
+    options, names = file.options, file.listed(rates)
+    by_options, by_format = _of_options(file), _of_format(file, rates)
+    by_file = [*_of_headers(file, rates), *_above(file)]
+    if not (by_options or by_file or by_format):
+        text = f"expected a unit of the rates, got {names}; give units: {RATE_UNITS}"
+        raise file.refusal(file.contradictions[0] if file.contradictions else text)
+    if not (by_options or by_file):
+        file.note("unit", f"{by_format[0].text}; the file does not say")
+    statements = [*by_options, *by_file, *by_format]
+    first = statements[0]
+    for other in statements[1:]:
+        if not other.agrees(first):
+            text = f"{first.text}, but {other.text}, of {names}"
+            if not by_options:
+                raise file.refusal(f"{text}; give units and trust: options")
+            file.contradictions.append(f"{text}; correct units")
+    counts = first.unit.quantity == "count"
+    if counts and first.unit.factor == 1 and options.scale_dps is None:
         text = f"{names} are raw counts: give units: raw and scale_dps, deg/s a count,"
         raise file.refusal(text)
-    if stated != by_format:
-        _contradict_scale_above(file, unit[1].factor)
-    return unit[1].factor, raw
+    _contradict_scale_above(file, first.unit.factor)
+    return first.unit.factor, counts
 
 
-def _asked(file: File) -> Stated | None:
+def _of_options(file: File) -> list[Statement]:
     units, scale_dps = file.options.units, file.options.scale_dps
     if scale_dps is not None:
-        return f"raw, of {scale_dps:g} deg/s", Unit("count", scale_dps)
-    return (units, read_unit(units) or Unit("rate")) if units else None
+        return [Statement(f"the options say raw, of {scale_dps:g} deg/s", Unit("count", scale_dps))]
+    unit = read_unit(units) if units else None
+    return [Statement(f"units of the options are {units}", unit)] if unit else []
 
 
-def _of_format(file: File, rates: Sequence[int]) -> Stated | None:
-    """The format's unit, of its own columns; counts, where a line above gives their scale."""
+def _of_format(file: File, rates: Sequence[int]) -> list[Statement]:
+    """Of the format's own columns."""
     form = file.form
-    if form is None or {*rates} != {find_all(file.table, name)[0] for name in form.rates}:
-        return None
-    factor = (read_unit(form.units) or Unit("rate")).factor
-    if not form.scale:
-        return form.units, Unit("rate", factor)
-    scale = above_header(file.table.preamble, form.scale)
-    return f"counts of {scale:g} {form.units}", Unit("count", factor * scale)
+    if form is None or {*rates} != {*find_all(file.table, *form.rates.split())}:
+        return []
+    return [Statement(f"the format has {form.units}", read_unit(form.units) or Unit("rate"))]
 
 
-def _same(one: Unit, other: Unit) -> bool:
-    """Whether two units agree; a header that says counts says nothing of their size."""
-    of_any_size = one.quantity == "count" and 1 in (one.factor, other.factor)
-    alike = isclose(one.factor, other.factor, rel_tol=1e-6)
-    return one.quantity == other.quantity and (of_any_size or alike)
-
-
-def _of_header(file: File, rates: Sequence[int]) -> Stated | None:
-    """The header's unit; a unit of anything but a rate contradicts that they are rates."""
+def _of_headers(file: File, rates: Sequence[int]) -> list[Statement]:
+    """Units in brackets and names; a unit of anything but a rate contradicts."""
     headers = [file.headers[number] for number in rates]
-    names = file.listed(rates)
-    inner = [read_header(header.name) for header in headers]  # gx_dps (rad/s)
-    units = {h.unit for h in headers} | {h.unit for h in inner if h.measures("rate")}
-    if len(units) > 1:
-        text = f"expected one unit of all rates, got {names}"
-        if not file.options.units:
-            raise file.refusal(f"{text}; correct the header, or give units and trust: options")
-        file.contradictions.append(f"{text}; correct the header")
-    first, increments = headers[0], file.options.increments
-    if first.unit and first.measures(*(("angle",) if increments else ("rate", "count"))):
-        return first.said, first.unit
-    if first.has_unit:
-        kind = "angle turned" if increments else "angular rate"
-        hint = "give increments: true if they are angles turned since the last row"
-        what = hint if first.measures("angle") else "give columns of angular rates"
-        file.contradictions.append(f"{names} say {first.said!r}, but that is no {kind}; {what}")
-    elif first.said and {header.said for header in headers} == {first.said}:
-        file.note("unit", f"the remark {first.said!r} in the header is no unit that is known")
-    return None
+    inner = [read_header(header.name) for header in headers if header.unit_text]
+    headers += [header for header in inner if header.measures("rate")]  # gx_dps (rad/s)
+    quantities = ("angle",) if file.options.increments else ("rate", "count")
+    strange = [h for h in headers if h.has_unit and not h.measures(*quantities)]
+    if strange:
+        kind = "angle turned" if file.options.increments else "angular rate"
+        angles = "give increments: true if they are angles turned since the last row"
+        hint = angles if strange[0].measures("angle") else "give columns of angular rates"
+        names = f"{file.listed(rates)} say {strange[0].unit_text!r}"
+        file.contradictions.append(f"{names}, but that is no {kind}; {hint}")
+    elif headers[0].unit_text and headers[0].unit is None:
+        text = f"the remark {headers[0].unit_text!r} in the header is no unit that is known"
+        file.note("unit", text)
+    units = {h.unit: h for h in headers if h.unit and h not in strange}
+    return [Statement(f"the header says {h.unit_text}", unit) for unit, h in units.items()]
 
 
-def _above(preamble: str) -> dict[str, Unit]:
-    """Units of angular rate that lines above the header name; not that of a range of 250 dps."""
-    words = re.findall(r"[^\s,;:=()\[\]\"'#%]+", preamble)
-    found: dict[str, Unit] = {}
+def _above(file: File) -> list[Statement]:
+    """The unit of angular rate that lines above name, if one; not that of a range of 250 dps."""
+    words = re.findall(r"[^\s,;:=()\[\]\"'#%]+", file.table.preamble)
+    units: dict[Unit, str] = {}
     for at, word in enumerate(words):
         if at and re.fullmatch(r"[-+±]*[\d.]+", words[at - 1]):
             continue
@@ -121,17 +112,18 @@ def _above(preamble: str) -> dict[str, Unit]:
             spelled = re.search(r"/|per|[drs]ps|rpm|-1|⁻¹", text.lower()) or word == "LSB"
             unit = read_unit(text) if spelled else None
             if unit and unit.quantity in ("rate", "count"):
-                if not any(_same(unit, other) for other in found.values()):
-                    found[text] = unit
+                units.setdefault(unit, text)
                 break
-    return found
+    statements = [Statement(f"lines above the header say {t}", u) for u, t in units.items()]
+    return statements if len(statements) == 1 else []
 
 
 def _contradict_scale_above(file: File, scale: float) -> None:
     """A factor on the rates in the lines above the header that is not the scale."""
     match = _SCALE.search(file.table.preamble)
-    factor = float(match[2]) if match else 1.0
-    readings = (1.0, scale, 1 / scale, scale / _RAD_PER_S_DPS)
+    factor = float(match[2]) if match else 0.0
+    in_rad_per_s = scale * 0.017453292519943295
+    readings = (1.0, scale, 1 / scale, in_rad_per_s)
     if match and factor and not any(isclose(factor, other, rel_tol=1e-3) for other in readings):
         file.contradictions.append(
             f"a line above the header says {match[1]} {match[2]}, but the scale is {scale:g} "
