@@ -88,7 +88,7 @@ def test_a_mutated_text_gives_the_good_rows_or_a_message(logger, edits, good, tm
 
 
 @SEVERAL
-@given(edits=EDITS, kind=st.sampled_from(["npy", "npz", "parquet", "mat"]))
+@given(edits=EDITS, kind=st.sampled_from(["npy", "npz", "parquet"]))
 def test_a_mutated_stored_file_gives_a_table_or_a_message(edits, kind, rates, frame, tmp_path):
     buffer = io.BytesIO()
     if kind == "npy":

@@ -12,16 +12,14 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.readers.lines import advice, is_sentence
+from gyro_pipeline.readers.lines import advice
 
 DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab", " ": "blanks"}
 
-_HEAD = 1 << 15
 _LEAST = 3  # numbers in a row
-_SEPARATOR_LINE = re.compile(r'"?sep=(.)"?,*', re.IGNORECASE)
-_DIGITS = re.compile(r"[\d:.,/TZ +-]+")  # of numbers, times and dates
+_COMMENT, _SENTENCE = ("#", "%", "//"), ("$", "!")  # NMEA 0183 begins sentences so
+_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
 _TOKEN = re.compile(r"[^\s(\[]\S*(?:\s+[(\[][^)\]]*[)\]])?|\S+")  # "gx (deg/s)" is one
-_WITH_BOTH = re.compile(r"\d,\d{3}\.\d|\d\.\d{3},\d")
 
 
 class _Line(NamedTuple):
@@ -42,7 +40,7 @@ class Layout:
         delimiter: Between fields; a blank stands for runs of them.
         decimal_point: A point or a comma.
         quoted: Whether fields are in quotes; if not, a stray quote is one more damaged field.
-        texts: Columns whose first field is no number.
+        texts: Columns that are not of numbers alone in the head.
     """
 
     names: tuple[str, ...]
@@ -52,14 +50,7 @@ class Layout:
     delimiter: str
     decimal_point: str
     quoted: bool
-    texts: frozenset[int]
-
-
-class _Rows(NamedTuple):
-    delimiter: str
-    at: int  # index of the first row among the lines
-    fields: Sequence[str]  # of the first undamaged one
-    numbers: int  # most in a row
+    texts: tuple[int, ...]
 
 
 def layout_of(where: str, data: bytes, delimiter: str | None) -> Layout:
@@ -68,39 +59,50 @@ def layout_of(where: str, data: bytes, delimiter: str | None) -> Layout:
     Args:
         where: For messages.
         data: The text, UTF-8.
-        delimiter: Of the options; None: told, runs of blanks last.
+        delimiter: Of the options; None: that by which a row has most numbers, blanks last.
 
     Raises:
         InputError: There are no rows, or they cannot be told safely.
     """
-    lines = _head_lines(data)
-    rows = _find_rows(where, lines, delimiter, data)
-    above = lines[: rows.at]
-    head = [split(line.text, rows.delimiter) for line in lines[rows.at : rows.at + 20]]
-    alike = [fields for fields in head if len(fields) == len(rows.fields)]
-    names, header = _header(where, above, rows.fields, rows.delimiter)
-    start = above[-1].end if above else 0
-    text = data[start : start + _HEAD].decode("utf-8", "replace")
-    first = [next(filter(None, fields), "0") for fields in zip(*alike, strict=True)]
+    lines = _head(data)
+    delimiters = (delimiter,) if delimiter else tuple(DELIMITERS)
+    visible = [d for d in delimiters if d != " "]
+    starts = [(*start, d) for d in visible if (start := _first_row(lines, d))]
+    if not starts and " " in delimiters and (start := _first_row(lines, " ")):
+        starts = [(*start, " ")]
+    if not starts:
+        shown = lines[0] if lines else _Line(1, 0, "")
+        raise InputError(
+            f"{where}: expected two rows or more of three numbers or more, separated by "
+            f"{' or '.join(DELIMITERS.get(d, repr(d)) for d in delimiters)}, got none in the "
+            f"first {len(lines)} lines; line {shown.number} begins {shown.text[:60]!r}; "
+            f"{advice([line.text for line in lines])}"
+        )
+    at, width, _, delimiter = max(starts, key=lambda start: start[2])
+    above, rows = lines[:at], [split(line.text, delimiter) for line in lines[at : at + 50]]
+    rows = [row for row in rows if len(row) == width]
+    names, header = _header(where, above, rows, delimiter)
     return Layout(
         names=names,
         preamble="\n".join(line.text for line in above if line not in header),
-        start=start,
+        start=above[-1].end if above else 0,
         line=above[-1].number + 1 if above else 1,
-        delimiter=rows.delimiter,
-        decimal_point=_decimal_point(where, text, rows.delimiter),
-        quoted='"' in lines[rows.at].text,
-        texts=frozenset(n for n, field in enumerate(first) if not is_number(field)),
+        delimiter=delimiter,
+        decimal_point=_decimal_point(where, [field for row in rows for field in row]),
+        quoted='"' in lines[at].text,
+        texts=tuple(
+            n for n, column in enumerate(zip(*rows, strict=True)) if not all(map(is_number, column))
+        ),
     )
 
 
-def _head_lines(data: bytes) -> list[_Line]:
-    """The lines in the head of a text that are not blank, and whole if others follow them."""
+def _head(data: bytes, size: int = 1 << 15) -> list[_Line]:
+    """The lines in the head of a text that are not blank, whole if others follow them."""
+    if len(data) > size:
+        size = 1 + max(data.rfind(b"\n", 0, size), data.rfind(b"\r", 0, size)) or size
     lines, end = [], 0
-    for number, line in enumerate(data[:_HEAD].splitlines(keepends=True), 1):
+    for number, line in enumerate(data[:size].splitlines(keepends=True), 1):
         end += len(line)
-        if end == _HEAD < len(data) and not line.endswith((b"\n", b"\r")):
-            break
         if line.strip():
             lines.append(_Line(number, end, line.decode("utf-8", "replace").strip("\r\n")))
     return lines
@@ -127,108 +129,99 @@ def is_number(field: str) -> bool:
 
 def is_header(fields: Sequence[str]) -> bool:
     """Whether these are names of columns rather than a row, be it a damaged one."""
-    if fields and fields[0].lower().startswith("sep="):
-        return True
     filled = [field for field in fields if field]
-    words = [field for field in filled if field[0].isalpha() and not is_number(field)]
+    words = [field for field in filled if field.lstrip("[(")[:1].isalpha() and not is_number(field)]
     return len(words) > max(1, len(filled) // 2)
 
 
-def _is_comment(line: str) -> bool:
-    return line.lstrip().startswith(("#", "%", "//"))
-
-
-def _find_rows(where: str, lines: list[_Line], delimiter: str | None, data: bytes) -> _Rows:
-    """Find rows by each delimiter: that which makes most numbers is taken, blanks come last."""
-    said = _SEPARATOR_LINE.fullmatch(lines[0].text) if lines else None
-    asked = delimiter or (said[1] if said else None)
-    tried = (asked,) if asked else tuple(DELIMITERS)
-    visible = [rows for each in tried if each != " " and (rows := _rows_by(each, lines))]
-    candidates = visible or [rows for rows in [" " in tried and _rows_by(" ", lines)] if rows]
-    if not candidates:
-        shown = lines or [_Line(1, 0, data[:_HEAD].decode("utf-8", "replace"))]
-        raise InputError(
-            f"{where}: expected two rows or more of three numbers or more, separated by "
-            f"{' or '.join(DELIMITERS.get(each, repr(each)) for each in tried)}, got none in the "
-            f"first {len(lines)} lines; line {shown[0].number} begins {shown[0].text[:60]!r}; "
-            f"{advice([line.text for line in shown])}"
-        )
-    return max(candidates, key=lambda rows: rows.numbers)
-
-
-def _rows_by(delimiter: str, lines: list[_Line]) -> _Rows | None:
-    start, width, numbers = 0, 0, 0
-    for at, line in enumerate(lines):
-        fields, count = _row(line.text, delimiter, at == 0)
-        if len(fields) != width:
-            start, width, numbers = at, len(fields), 0
-        numbers = max(numbers, count)
-        if width and at > start and numbers >= _LEAST:
-            first = split(lines[start].text, delimiter)
-            while start and _row(lines[start - 1].text, delimiter, start == 1)[1] >= _LEAST:
-                start -= 1  # damaged ones, of another width
-            return _Rows(delimiter, start, first, numbers)
-    return None
-
-
-def _row(text: str, delimiter: str, first: bool = False) -> tuple[Sequence[str], int]:
-    """Fields of a line and how many of them are numbers; no fields of a line that is no row."""
-    if delimiter not in text or _is_comment(text) or is_sentence(text):
-        return (), 0
-    fields = split(text, delimiter)
-    filled = [field for field in fields if field]
-    count = sum(map(is_number, filled))
-    if first and filled == [str(number) for number in range(len(filled))]:  # numbered columns
-        return (), 0
-    if delimiter == " ":  # words between blanks are a sentence
-        is_row = all(is_number(field) or _DIGITS.fullmatch(field) for field in filled)
+def _first_row(lines: list[_Line], delimiter: str) -> tuple[int, int, int] | None:
+    """The index of the first row, and how many fields and numbers rows have; None without rows."""
+    rows = [(0, 0)]  # fields and numbers of the lines
+    for line in lines:
+        rows.append(_counts(line.text, delimiter))
+        width, numbers = rows[-1][0], max(rows[-1][1], rows[-2][1])
+        if width and width == rows[-2][0] and numbers >= _LEAST:
+            break
     else:
-        some = count > 0 or any(map(_DIGITS.fullmatch, filled))
-        is_row = count >= _LEAST or (some and not is_header(fields))
-    return (fields, count) if is_row and len(fields) >= _LEAST else ((), 0)
+        return None
+    at = len(rows) - 3
+    while rows[at][0] == width or rows[at][1] >= _LEAST:
+        at -= 1  # a row of which numbers are missing, or a damaged one
+    first = [field for field in split(lines[at].text, delimiter) if is_number(field)]
+    numbered = at == 0 and first == [str(number) for number in range(len(first))]  # by pandas
+    return at + numbered, width, numbers
+
+
+def _counts(text: str, delimiter: str) -> tuple[int, int]:
+    """How many fields a row has, and how many of them are numbers; no fields if it is no row."""
+    if delimiter not in text or text.lstrip().startswith(_COMMENT + _SENTENCE):
+        return 0, 0
+    fields = split(text, delimiter)
+    numbers = sum(map(is_number, fields))
+    if delimiter == " ":  # words between blanks are a sentence
+        is_row = all(is_number(field) or field[0] in "+-.0123456789" for field in fields)
+    else:
+        is_row = numbers >= _LEAST or (any(fields) and not is_header(fields))
+    return (len(fields), numbers) if is_row and len(fields) >= _LEAST else (0, 0)
 
 
 def _header(
-    where: str, above: list[_Line], row: Sequence[str], delimiter: str
+    where: str, above: list[_Line], rows: list[list[str]], delimiter: str
 ) -> tuple[tuple[str, ...], list[_Line]]:
-    """The names, and the lines they are from: the line next to the rows, or one as wide as they.
+    """The names, and the lines they are from: the nearest above the rows that is as wide as they.
 
     A row of units, and a row of names that span columns, belong to it.
     """
-    width = len(row)
-    widths = [len(_fields(line.text, delimiter, width)) for line in above]
+    width = len(rows[0])
+    used = max(len(_filled(row)) for row in rows)
     for at in reversed(range(len(above))):
-        by_width = abs(widths[at] - width) <= (not _is_comment(above[at].text))
-        nearest = at == len(above) - 1 and not _is_comment(above[at].text)
-        if by_width or (nearest and widths[at] >= _LEAST):
+        fields = _fields(above[at].text, delimiter, width, used)
+        if _fits(fields, width, used):
             break
+        if len(_filled(fields)) >= _LEAST and not above[at].text.lstrip().startswith(_COMMENT):
+            shown = ", ".join(repr(name[:40]) for name in fields[:30])
+            raise InputError(
+                f"{where} line {above[at].number}: expected a header of as many columns as the "
+                f"rows, {used}, got {len(_filled(fields))}, {shown}; which is which cannot be "
+                "told: correct it"
+            )
     else:
         return ("",) * width, []
-    rows = [_fields(line.text, delimiter, width) for line in above[: at + 1]]
-    names, units = rows.pop(), [""] * widths[at]
+    end = at + 1
+    names = (_filled(fields) + [""] * width)[:width]
+    upper = [split(line.text.lstrip("#%/ "), delimiter) for line in above[:at]]
+    units = [""] * width
     # neighbours have the same unit but different axes: names repeated side by side are units
-    if rows and len(rows[-1]) == len(names) and any(a == b != "" for a, b in pairwise(names)):
-        names, units = rows.pop(), [unit.strip("[]() ") for unit in names]
-    while rows and len(rows[-1]) == len(names) and _is_incomplete(names):
-        names = _joined(rows.pop(), names)
-    names = [f"{n} [{u}]" if u else n for n, u in zip(names, units, strict=True)]
-    return _fitted(f"{where} line {above[at].number}", names, row), above[len(rows) : at + 1]
+    if upper and len(upper[-1]) == width and any(a == b != "" for a, b in pairwise(names)):
+        units, names, at = names, upper.pop(), at - 1
+    while upper and len(upper[-1]) == width and _is_incomplete(names[:used]):
+        names, at = _joined(upper.pop(), names), at - 1
+    units = [unit.strip("[]() ") for unit in units]
+    names = [f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True)]
+    return tuple(names), above[at:end]
 
 
-def _fields(text: str, delimiter: str, width: int) -> list[str]:
+def _filled(fields: list[str]) -> list[str]:
+    """Fields without empty ones at the end: a delimiter at the end of a line is no column."""
+    return fields[: max((n for n, field in enumerate(fields, 1) if field), default=0)]
+
+
+def _fits(fields: list[str], width: int, used: int) -> bool:
+    """Whether names are those of rows; a delimiter too many or too few would shift them."""
+    names = _filled(fields)
+    return len(names) == used or (len(fields) == width and "" not in names)
+
+
+def _fields(text: str, delimiter: str, width: int, used: int) -> list[str]:
     """Names in a header; NumPy and others write it as a comment, and by a delimiter of its own."""
-    text = text.lstrip("#%/ ") if _is_comment(text) else text
-    if delimiter in text and delimiter != " ":
-        return split(text, delimiter)
-    ways = [split(text, other) for other in (",", ";", "\t")]
-    ways += [_TOKEN.findall(text), re.split(r"\s{2,}|\t", text.strip())]
-    return next((names for names in ways if len(names) == width), split(text, delimiter))
+    text = text.lstrip("#%/ ")
+    ways = [split(text, d) for d in (delimiter, ",", ";", "\t")] + [_TOKEN.findall(text)]
+    return next((fields for fields in ways if _fits(fields, width, used)), ways[0])
 
 
 def _is_incomplete(names: Sequence[str]) -> bool:
     """Whether names lack the row above them: some are empty, or there more than once."""
-    filled = [name for name in names if name]
-    return len({*filled}) < len(filled) or "" in names[:-1]
+    return "" in names or len({*names}) < len(names)
 
 
 def _joined(upper: Sequence[str], lower: Sequence[str]) -> list[str]:
@@ -244,40 +237,13 @@ def _joined(upper: Sequence[str], lower: Sequence[str]) -> list[str]:
     return joined
 
 
-def _fitted(where: str, names: Sequence[str], row: Sequence[str]) -> tuple[str, ...]:
-    """Names as many as the fields of a row; a delimiter at the end of one alone does not count.
-
-    A header with a delimiter too many or too few elsewhere would shift the names: it is refused.
-    """
-    width, ends = len(row), (bool(names[-1]), bool(row[-1]))
-    if ends == (False, True) and len(names) == width + 1:
-        return tuple(names[:-1])
-    if ends == (True, False) and len(names) == width - 1:
-        return (*names, "")
-    if len(names) != width or (ends[0] != ends[1] and "" in names):
-        shown = ", ".join(repr(name[:40]) for name in names[:30])
-        raise InputError(
-            f"{where}: expected a header of as many columns as the rows, {width}, got "
-            f"{len(names)}, {shown}; which is which cannot be told: correct it"
-        )
-    return tuple(names)
-
-
-def _decimal_point(where: str, head: str, delimiter: str) -> str:
+def _decimal_point(where: str, fields: list[str]) -> str:
     """A comma where numbers have one that cannot separate thousands."""
-    if delimiter == "," or "," not in head:
-        return "."
-    field_start = rf'(?:^|[\n{re.escape(delimiter)}])\s*"?'
-    commas = re.findall(rf'{field_start}[+-]?(\d+),(\d+)(?=[eE\s"{re.escape(delimiter)}]|$)', head)
-    if _WITH_BOTH.search(head):
-        problem = "numbers with both commas and points"
-    elif not commas:  # but in texts
-        return "."
-    elif all(len(after) == 3 and before.strip("0") for before, after in commas):  # noqa: PLR2004
-        problem = "a comma before three digits each time, which may separate thousands"
-    else:
-        return ","
-    raise InputError(
-        f"{where}: expected decimal points, or decimal commas, got {problem}; export the recording "
-        "with decimal points and without thousands separators"
-    )
+    commas = [field for field in fields if "," in field and _DECIMAL_COMMA.fullmatch(field)]
+    if commas and all(re.fullmatch(r"[+-]?[1-9]\d*,\d{3}", field) for field in commas):
+        raise InputError(
+            f"{where}: expected decimal points, or decimal commas, got a comma before three digits "
+            f"each time, {commas[0]}, which may separate thousands; export the recording with "
+            "decimal points and without thousands separators"
+        )
+    return "," if commas else "."
