@@ -52,8 +52,7 @@ def read_zip(path: Path) -> Table:
     with zipfile.ZipFile(path) as archive:
         members = archive.namelist()
     if "[Content_Types].xml" in members:
-        kind = "an Excel workbook, whatever its name; save it as CSV"
-        raise InputError(f"{path}: expected a recording, got {kind}")
+        raise InputError(f"{path}: expected a recording, got an Excel workbook; save it as CSV")
     if not members or not all(name.endswith(".npy") for name in members):
         shown = ", ".join(members[:5])
         raise InputError(f"{path}: expected a recording, got a zip archive ({shown}); unpack it")

@@ -21,7 +21,6 @@ from gyro_pipeline.parameters import ReaderOptions
 IN_READER = "in `reader:` of the catalog entry in catalog.yml"
 
 _NUMBER = r"^[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|(?i:inf|infinity|nan))$"
-_THOUSANDS = r"[+-]?\d{1,3}([,' .]\d{3})+([.,]\d+)?"
 
 
 @dataclass(frozen=True)
@@ -71,12 +70,11 @@ class Table:
         texts = {row: text for row, text in enumerate(values) if text is not None}
         # where commas are decimal, a point is what makes a text of a number
         bad = {n: text for n, text in texts.items() if not re.match(_NUMBER, text)} or texts
-        thousands = any(re.fullmatch(_THOUSANDS, text) for text in bad.values())
         row, text = next(iter(bad.items()))
         raise InputError(
-            f"{self.where}: expected numbers{' without thousands separators' * thousands} in "
-            f"{name}, got {text[:40]!r} in {self.place(row)}, {len(bad)} of {len(values)} rows are "
-            f"like it; export the file anew, or give other columns, or `row:` {IN_READER}"
+            f"{self.where}: expected numbers in {name}, without thousands separators, got "
+            f"{text[:40]!r} in {self.place(row)}, {len(bad)} of {len(values)} rows are like it; "
+            f"export the file anew, or give other columns, or `row:` {IN_READER}"
         )
 
 
@@ -112,11 +110,8 @@ def columns_of(
             detail = f"{len(bad)} of {len(values)} cells of {name or f'column {number}'!r} are no "
             detail += f"numbers and are NaN: {', '.join(first)}{', …' * (len(bad) > len(first))}"
             findings.append(Finding("unreadable cells", KEPT, detail))
-    return (
-        tuple(values for values, _ in cells),
-        tuple(findings),
-        {r for _, bad in cells for r in bad},
-    )
+    rows = {row for _, bad in cells for row in bad}
+    return tuple(values for values, _ in cells), tuple(findings), rows
 
 
 def _of_texts(texts: Any, decimal_point: str = ".") -> tuple[NDArray[Any], dict[int, str]]:
@@ -127,7 +122,7 @@ def _of_texts(texts: Any, decimal_point: str = ".") -> tuple[NDArray[Any], dict[
     Returns:
         The column, and the texts in a column of numbers, by row, which are NaN in it.
     """
-    if not pa.types.is_string(texts.type):
+    if not pa.types.is_string(texts.type) or texts.null_count == len(texts):
         return texts.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False), {}
     texts = pc.utf8_trim_whitespace(texts)
     texts = points = pc.if_else(pc.equal(texts, ""), None, texts)
@@ -151,14 +146,9 @@ _ADVICE = {
     (b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd", b"7z\xbc\xaf", b"Rar!", b"\x1f\x8b"): (
         "an archive; unpack it"
     ),
-    (b"\xd0\xcf\x11\xe0",): "an Excel workbook (.xls), whatever its name; save it as CSV",
-    (b"%PDF",): "a PDF document; export the recording as CSV",
-    (b"<!DOCTYPE", b"<html"): (
-        "a web page; download the file itself (on GitHub: `Download raw file`)"
-    ),
-    (b"version https://git-lfs",): (
-        "a git LFS pointer to a file; fetch the file by `git lfs pull`"
-    ),
+    (b"\xd0\xcf\x11\xe0",): "an Excel workbook; save it as CSV",
+    (b"<!DOCTYPE", b"<html"): "a web page; download the file itself",
+    (b"version https://git-lfs",): "a git LFS pointer; fetch the file by `git lfs pull`",
     (b"RDX", b"RDA"): (
         "data of R; save its table in R by `write.csv(TABLE, 'log.csv', row.names = FALSE)`"
     ),
