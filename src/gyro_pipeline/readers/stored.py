@@ -11,6 +11,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import scipy.io
 from numpy.typing import NDArray
@@ -38,7 +39,11 @@ def read_parquet(path: Path) -> Table:
     with pq.ParquetFile(path) as file:
         table = file.read(use_threads=False)
     names = tuple(_with_unit(field.name, field.metadata or {}) for field in table.schema)
-    return Table(str(path), names, tuple(column(values.to_numpy()) for values in table.columns))
+    plain = [
+        values.cast(values.type.value_type) if pa.types.is_dictionary(values.type) else values
+        for values in table.columns
+    ]
+    return Table(str(path), names, tuple(column(values.to_numpy()) for values in plain))
 
 
 def read_npy(path: Path) -> Table:
