@@ -73,18 +73,12 @@ def _decoded(path: Path, encoding: str | None) -> tuple[bytes, str]:
             f"{path}: expected a text, got binary data, or UTF-16 without byte order mark; export "
             f"the recording as CSV in UTF-8, or give `encoding: utf-16-le` {IN_READER}"
         )
-    text = data if data.isascii() else data.decode("utf-8", "gyro_pipeline.cp1252").encode()
-    hint = f"the text is not UTF-8: if names look odd, give `encoding`, as gbk, {IN_READER}"
-    return text, hint * (text != data)
-
-
-def _as_cp1252(error: UnicodeError) -> tuple[str, int]:
-    """Read bytes that are not UTF-8 as cp1252, and all others as UTF-8."""
-    assert isinstance(error, UnicodeDecodeError)
-    return error.object[error.start : error.end].decode("cp1252", "replace"), error.end
-
-
-codecs.register_error("gyro_pipeline.cp1252", _as_cp1252)
+    try:
+        data.decode()
+    except UnicodeDecodeError:
+        hint = f"the text is not UTF-8: if names look odd, give `encoding`, as gbk, {IN_READER}"
+        return data.decode("cp1252", "replace").encode(), hint
+    return data, ""
 
 
 def _read_rows(where: str, text: bytes, delimiter: str | None) -> Table:
@@ -118,7 +112,7 @@ def _read_rows(where: str, text: bytes, delimiter: str | None) -> Table:
 
 def _odd_rows(where: str, layout: _Layout, odd: int, shown: str, rows: list[str]) -> Finding:
     """Say that a few rows have another number of fields, or refuse more."""
-    if len(rows) - odd >= 2 and few(odd, len(rows)):  # noqa: PLR2004
+    if few(odd, len(rows)) and odd < len(rows) - 1:
         detail = f"{odd} of {len(rows)} rows cannot be read and are NaN: {shown}"
         return Finding("unreadable rows", REPAIRED, detail)
     raise InputError(
