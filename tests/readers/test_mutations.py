@@ -6,8 +6,8 @@ Whatever the damage, a file ends in a table or in a message, and no value moves 
 import io
 
 import numpy as np
+import pandas as pd
 import pytest
-import scipy.io
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -15,10 +15,10 @@ from gyro_pipeline.conventions import InputError
 from gyro_pipeline.parameters import ReaderOptions
 from gyro_pipeline.readers.table import read_table
 
-LOGGERS = ["movella_dot", "movella_dot_angles", "openlog_artemis", "ngimu", "general"]
+LOGGERS = ["dot", "angles", "general"]
 PLACE = st.floats(0, 1, exclude_max=True)
 SEVERAL = settings(
-    max_examples=60,
+    max_examples=80,
     deadline=None,
     derandomize=True,  # the same files each time
     suppress_health_check=[HealthCheck.function_scoped_fixture],
@@ -26,15 +26,8 @@ SEVERAL = settings(
 BYTES = st.binary(min_size=1, max_size=8) | st.sampled_from(
     [b",", b";", b"\t", b"\n", b"\r", b'"', b"\0", b".", b"-", b"e9", b"sep=;\n", b" "]
 )
-EDITS = st.lists(
-    st.tuples(
-        st.sampled_from(["flip", "cut", "end", "insert", "drop", "repeat", "replace"]),
-        PLACE,
-        BYTES,
-    ),
-    min_size=1,
-    max_size=3,
-)
+KINDS = st.sampled_from(["flip", "cut", "end", "insert", "drop", "repeat", "replace"])
+EDITS = st.lists(st.tuples(KINDS, PLACE, BYTES), min_size=1, max_size=3)
 
 
 def mutated(data, edits):
@@ -66,12 +59,9 @@ def read_or_refused(path, data):
         return None
 
 
-def strange(values, good):
-    """How many numbers of a column are none of the good one's."""
-    return (~np.isin(values[np.isfinite(values)], good)).sum() if values.dtype == float else 0
-
-
-@pytest.mark.filterwarnings("error")  # what Arrow cannot raise, it warns of
+# What Arrow cannot raise, it warns of. Libraries leave the logs of vehicles open, which Hypothesis
+# makes of the bytes that it sees in the source.
+@pytest.mark.filterwarnings("error", "ignore:unclosed file:ResourceWarning")
 @pytest.mark.parametrize("logger", LOGGERS)
 @SEVERAL
 @given(edits=EDITS)
@@ -79,26 +69,23 @@ def test_a_mutated_text_gives_the_good_rows_or_a_message(logger, edits, good, tm
     whole = read_or_refused(tmp_path / "log.csv", good[logger].encode())
     columns = dict(zip(whole.names, whole.columns, strict=True))
     damaged = read_or_refused(tmp_path / "log.csv", mutated(good[logger].encode(), edits))
-    for name, values in zip(
-        *(damaged.names, damaged.columns) if damaged else ((), ()), strict=True
-    ):
+    for name, values in zip(damaged.names, damaged.columns, strict=True) if damaged else ():
         assert len(values) <= 60 + 5 * len(edits)
-        if name and name in columns and columns[name].dtype == float:
-            assert strange(values, columns[name]) <= 2 * len(edits)
+        if name and name in columns and values.dtype == float:
+            strange = ~np.isin(values[np.isfinite(values)], columns[name])
+            assert strange.sum() <= 2 * len(edits)
 
 
 @SEVERAL
-@given(edits=EDITS, kind=st.sampled_from(["npy", "npz", "parquet", "mat"]))
-def test_a_mutated_stored_file_gives_a_table_or_a_message(edits, kind, rates, frame, tmp_path):
+@given(edits=EDITS, kind=st.sampled_from(["npy", "npz", "parquet"]))
+def test_a_mutated_stored_file_gives_a_table_or_a_message(edits, kind, rates, tmp_path):
     buffer = io.BytesIO()
     if kind == "npy":
         np.save(buffer, rates)
     elif kind == "npz":
         np.savez(buffer, gyro_dps=rates)
-    elif kind == "mat":
-        scipy.io.savemat(buffer, {"log": {"gyro_dps": rates}, "t": rates[:, 0]})
     else:
-        frame.to_parquet(buffer)
+        pd.DataFrame(rates, columns=[*"xyz"]).to_parquet(buffer)
     log = read_or_refused(tmp_path / f"log.{kind}", mutated(buffer.getvalue(), edits))
     assert log is None or len(log.names) == len(log.columns)
 
@@ -107,7 +94,7 @@ def test_a_mutated_stored_file_gives_a_table_or_a_message(edits, kind, rates, fr
 def test_no_byte_lost_or_delimiter_added_in_a_header_moves_a_column(logger, good, tmp_path):
     data = good[logger].encode()
     whole = read_or_refused(tmp_path / "log.csv", data)
-    start = data.rindex(b"\n", 0, data.index(b"Gyr_X")) if logger == "movella_dot" else 0
+    start = data.rindex(b"\n", 0, data.index(b"Acc_X")) if logger == "dot" else 0
     delimiter = b";" if logger == "general" else b","
     read = 0
     for at in range(start + 1, data.index(b"\n", start + 1)):

@@ -14,7 +14,7 @@ from gyro_pipeline.conventions import InputError
 from gyro_pipeline.logs import KEPT, Finding
 from gyro_pipeline.readers.table import IN_READER, Table, columns_of
 
-_CHECKSUM = re.compile(r"\*[0-9A-Fa-f]{2}\s*$")
+_CHECKSUM = re.compile(r"\*[0-9A-Fa-f]{2}\s*$")  # of NMEA 0183
 _DATE, _CLOCK = r"\d{4}[-/.]\d\d[-/.]\d\d", r"\d{1,2}:\d\d(?::\d\d)?(?:[.:]\d+|,\d{3})?"
 _TIME = rf"{_DATE}(?:[T ]{_CLOCK}(?:Z|[+-]\d\d:?\d\d)?)?|{_CLOCK}"
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -22,13 +22,6 @@ _VALUE = re.compile(
     rf"(?<![\w.+:-])(?:(?P<time>{_TIME})|{_NUMBER})(?![\w.:])|(?<=:){_NUMBER}(?![\w.:])"
 )
 _LABEL = re.compile(r"([A-Za-z]\w*)[\"']?\s*[:=]\s*$")
-_JSON = re.compile(r"\s*[\[{]\s*($|[\[{\"])")
-_LEAST, _MOST = 3, 100  # numbers in a line
-
-
-def is_sentence(line: str) -> bool:
-    """Whether a line is framed as NMEA 0183 has it, ``$…*68``: its last field has a checksum."""
-    return line.startswith(("$", "!")) and _CHECKSUM.search(line) is not None
 
 
 def read_lines(where: str, data: bytes, expression: str) -> Table:
@@ -49,55 +42,53 @@ def read_lines(where: str, data: bytes, expression: str) -> Table:
         raise InputError(f"{where}: `row:` {IN_READER} is no expression: {error}") from error
     names = tuple(pattern.groupindex)
     lines = [line.decode("utf-8", "replace") for line in data.rstrip(b"\0").splitlines()]
-    filled = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
-    matches = [(number, match) for number, line in filled if (match := pattern.search(line))]
+    filled = {number: line for number, line in enumerate(lines, 1) if line.strip()}
+    matches = {number: match for number in filled if (match := pattern.search(filled[number]))}
     if not names or len(matches) < 2:  # noqa: PLR2004
         raise InputError(
             f"{where}: expected named groups, such as (?P<gx>…), in `row:` and two lines or more "
             f"that it matches, got {len(names)} groups and {len(matches)} of {len(filled)} lines; "
-            f"{advice([line for _, line in filled[:200]])}"
+            f"{advice([*filled.values()][:200])}"
         )
-    numbers = [number for number, _ in matches]
-    arrays = [pa.array([match[name] for _, match in matches], pa.string()) for name in names]
+    numbers = [*matches]
+    texts = [pa.array([match[name] for match in matches.values()], pa.string()) for name in names]
 
     def place(row: int) -> str:
         return f"row {row} (line {numbers[row]})"
 
-    columns, unread, _ = columns_of(names, arrays, place, ".")
-    findings = _skipped(filled, {*numbers}) + unread
+    columns, findings, _ = columns_of(names, texts, place)
+    skipped = [number for number in filled if number not in matches]
+    if skipped:
+        detail = f"{len(skipped)} of {len(filled)} lines do not match `row` and were skipped, the "
+        detail += f"first is line {skipped[0]}: {filled[skipped[0]][:60]!r}"
+        findings = (Finding("row", KEPT, detail), *findings)
     return Table(where, names, columns, "\n".join(lines[: numbers[0] - 1]), findings, place)
-
-
-def _skipped(filled: list[tuple[int, str]], rows: set[int]) -> tuple[Finding, ...]:
-    skipped = [(number, line) for number, line in filled if number not in rows]
-    if not skipped:
-        return ()
-    number, line = skipped[0]
-    text = f"{len(skipped)} of {len(filled)} lines do not match `row` and were skipped, the first "
-    return (Finding("row", KEPT, f"{text}is line {number}: {line[:60]!r}"),)
 
 
 def advice(lines: Sequence[str]) -> str:
     """Say how lines like these can be read: an expression to paste, if they hold numbers."""
     made = Counter(filter(None, map(expression_of, lines))).most_common(1)
-    if not made and lines and _JSON.match(lines[0]):
+    if made:
+        text = made[0][0].replace("'", "''")  # as YAML has it in quotes
+        return (
+            f"to read lines like these, write {IN_READER}: row: '{text}' – with the groups of the "
+            "angular rates named gx, gy, gz, that of the time t, and the units in `units`"
+        )
+    if lines and re.match(r"\s*[\[{]\s*($|[\[{\"])", lines[0]):
         return (
             "a document of JSON: write an object a line, or CSV, such as by "
             "`pandas.read_json(PATH).to_csv('log.csv', index=False)`"
         )
-    if not made:
-        return "export the recording as CSV"
-    text = made[0][0].replace("'", "''")  # as YAML has it in quotes
-    return (
-        f"to read lines like these, write {IN_READER}: row: '{text}' – with the groups of the "
-        "angular rates named gx, gy, gz, that of the time t, and the units in `units`"
-    )
+    return "export the recording as CSV"
 
 
-def expression_of(line: str) -> str | None:
-    """An expression that matches lines like this one, each number a group; None of few numbers.
+def expression_of(line: str, least: int = 3, most: int = 100) -> str | None:
+    """An expression that matches lines like this one, each number a group.
 
     Groups are named by the label before them (``X: 1`` and ``"X": 1`` make X), else v1, v2, ….
+
+    Returns:
+        The expression; None of a line with too few or too many numbers.
     """
     line = _CHECKSUM.sub("*", line.rstrip())
     expression, end, names = "^", 0, list[str]()
@@ -108,12 +99,11 @@ def expression_of(line: str) -> str | None:
         while name in names:
             name += "_"
         names.append(name)
-        signs = "".join(sign for sign in ",/TZ " if sign in value[0]) if value["time"] else "eE"
-        cell = rf"[-+.{':' if value['time'] else ''}{signs}\d]+"
+        signs = ":" + "".join(s for s in ",/TZ " if s in value[0]) if value["time"] else "eE"
         blanks = r"\s+" if between and not between.strip() else r"\s*"
-        expression += f"{_literal(between.rstrip())}{blanks}(?P<{name}>{cell})"
+        expression += rf"{_literal(between.rstrip())}{blanks}(?P<{name}>[-+.{signs}\d]+)"
         end = value.end()
-    if not _LEAST <= len(names) <= _MOST:
+    if not least <= len(names) <= most:
         return None
     return expression + (_literal(line[end:]) if end < len(line) else r"\s*$")
 

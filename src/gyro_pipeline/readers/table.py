@@ -3,6 +3,7 @@
 A file is a table, or the option ``row`` makes it one. What a file is, its first bytes tell.
 """
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,6 @@ from gyro_pipeline.parameters import ReaderOptions
 IN_READER = "in `reader:` of the catalog entry in catalog.yml"
 
 _NUMBER = r"^[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|(?i:inf|infinity|nan))$"
-_THOUSANDS = r"^[+-]?\d{1,3}([,' .]\d{3})+([.,]\d+)?$"
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,11 @@ class Table:
     hint: str = ""
 
     def listed(self) -> str:
-        """The names for a message, the first thirty, and what may be wrong with them."""
+        """The first thirty names for a message, and what may be wrong with them."""
         shown = ", ".join(repr(name[:40]) for name in self.names[:30])
-        more = ", …" if len(self.names) > 30 else ""  # noqa: PLR2004
-        hint = self.hint if not shown.isascii() else ""
-        return (shown + more if any(self.names) else "no header") + (hint and f" ({hint})")
+        more = ", …" * (len(self.names) > 30)  # noqa: PLR2004
+        hint = f" ({self.hint})" if self.hint and not shown.isascii() else ""
+        return (shown + more if any(self.names) else "no header") + hint
 
     def numbers(self, column: int) -> NDArray[np.float64]:
         """The values of a column, (n,), for whoever needs numbers.
@@ -67,110 +67,93 @@ class Table:
         name = repr(self.names[column] or f"column {column}")
         if values.dtype != object:
             raise InputError(f"{self.where}: expected numbers in {name}, got {values.dtype}")
-        texts = pa.array(values, pa.string())
-        bad = np.flatnonzero(numbers(texts)[1])  # none: points where commas are decimal
-        bad = bad if len(bad) else np.flatnonzero(texts.is_valid())
-        thousands = pc.any(pc.match_substring_regex(texts, _THOUSANDS)).as_py()
+        texts = {row: text for row, text in enumerate(values) if text is not None}
+        # where commas are decimal, a point is what makes a text of a number
+        bad = {n: text for n, text in texts.items() if not re.match(_NUMBER, text)} or texts
+        row, text = next(iter(bad.items()))
         raise InputError(
-            f"{self.where}: expected numbers{' without thousands separators' * bool(thousands)} in "
-            f"{name}, got {values[bad[0]][:40]!r} in {self.place(int(bad[0]))}, {len(bad)} of "
-            f"{len(values)} rows are like it; export the file anew, or give other columns, or "
-            f"`row:` {IN_READER}"
+            f"{self.where}: expected numbers in {name}, without thousands separators, got "
+            f"{text[:40]!r} in {self.place(row)}, {len(bad)} of {len(values)} rows are like it; "
+            f"export the file anew, or give other columns, or `row:` {IN_READER}"
         )
 
 
-def numbers(texts: Any, decimal_point: str = ".") -> tuple[NDArray[np.float64], NDArray[np.bool]]:
-    """Texts without outer blanks as numbers; none of those with separators of thousands.
+def column(values: NDArray[Any]) -> NDArray[Any]:
+    """Stored values, (n,), as a column of a table."""
+    if values.dtype.kind in "biuf":
+        return np.array(values, np.float64)
+    if values.dtype.kind in "mM":
+        return values.astype(f"{values.dtype.kind}8[ns]")
+    texts = [v.decode("utf-8", "replace") if isinstance(v, bytes) else v for v in values.tolist()]
+    return _of_texts(pa.array([t if t is None else str(t) for t in texts], pa.string()))[0]
+
+
+def columns_of(
+    names: Sequence[str],
+    texts: Sequence[Any],
+    place: Callable[[int], str],
+    decimal_point: str = ".",
+) -> tuple[tuple[NDArray[Any], ...], tuple[Finding, ...], set[int]]:
+    """Columns of a text; what is unreadable in those of numbers, and in which rows.
 
     Args:
-        texts: Arrow strings, (n,).
-        decimal_point: A point or a comma; where it is a comma, a point is no part of a number.
-
-    Returns:
-        The numbers, (n,), NaN for what is none; and which texts are none, (n,).
+        names: Of the columns, for the findings.
+        texts: Arrow strings, or numbers, of each column, (n,).
+        place: Where a row is.
+        decimal_point: A point or a comma.
     """
-    points = texts
-    if decimal_point != ".":
-        points = pc.replace_substring(pc.replace_substring(texts, ".", "?"), decimal_point, ".")
-    good = pc.match_substring_regex(points, _NUMBER)
-    values = pc.if_else(good, points, None).cast(pa.float64()).to_numpy(zero_copy_only=False)
-    return values, ~pc.fill_null(good, True).to_numpy(zero_copy_only=False)
+    cells = [_of_texts(column, decimal_point) for column in texts]
+    findings = []
+    for number, (name, (values, bad)) in enumerate(zip(names, cells, strict=True)):
+        if bad:
+            first = [f"{text[:40]!r} in {place(row)}" for row, text in [*bad.items()][:3]]
+            detail = f"{len(bad)} of {len(values)} cells of {name or f'column {number}'!r} are no "
+            detail += f"numbers and are NaN: {', '.join(first)}{', …' * (len(bad) > len(first))}"
+            findings.append(Finding("unreadable cells", KEPT, detail))
+    rows = {row for _, bad in cells for row in bad}
+    return tuple(values for values, _ in cells), tuple(findings), rows
 
 
-def column(values: Any, decimal_point: str = ".") -> tuple[NDArray[Any], dict[int, str]]:
-    """Arrow's values as a column of a table.
+def _of_texts(texts: Any, decimal_point: str = ".") -> tuple[NDArray[Any], dict[int, str]]:
+    """Arrow strings as numbers, if almost all of them are, else as texts.
 
-    Texts of which all but a few are numbers are numbers.
+    Numbers with separators of thousands are texts; so are those with a point beside decimal commas.
 
     Returns:
         The column, and the texts in a column of numbers, by row, which are NaN in it.
     """
-    if not pa.types.is_string(values.type):
-        return _typed(values), {}
-    texts = pc.utf8_trim_whitespace(values)
-    texts = pc.if_else(pc.equal(texts, ""), None, texts)
-    result, unread = numbers(texts, decimal_point)
-    rows = np.flatnonzero(unread)
-    if len(rows) and (
-        2 * len(rows) >= len(texts) - texts.null_count or not few(len(rows), len(texts))
-    ):
+    if not pa.types.is_string(texts.type) or texts.null_count == len(texts):
+        return texts.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False), {}
+    texts = pc.utf8_trim_whitespace(texts)
+    texts = points = pc.if_else(pc.equal(texts, ""), None, texts)
+    if decimal_point != ".":
+        points = pc.replace_substring(pc.replace_substring(texts, ".", "?"), decimal_point, ".")
+    good = pc.fill_null(pc.match_substring_regex(points, _NUMBER), False)
+    bad = np.flatnonzero(pc.and_(pc.invert(good), texts.is_valid()))
+    if 2 * len(bad) >= len(texts) - texts.null_count > 0 or not few(len(bad), len(texts)):
         return texts.to_numpy(zero_copy_only=False), {}
-    return result, dict(zip(rows.tolist(), texts.take(pa.array(rows)).to_pylist(), strict=True))
+    values = pc.if_else(good, points, None).cast(pa.float64())
+    unread = dict(zip(bad.tolist(), texts.take(pa.array(bad)).to_pylist(), strict=True))
+    return values.to_numpy(zero_copy_only=False), unread
 
 
-def columns_of(
-    names: Sequence[str], arrays: Sequence[Any], place: Callable[[int], str], decimal_point: str
-) -> tuple[tuple[NDArray[Any], ...], tuple[Finding, ...], set[int]]:
-    """Columns of a text, what is unreadable in those of numbers, and in which rows."""
-    cells = [column(values, decimal_point) for values in arrays]
-    findings = []
-    for number, (name, (values, unread)) in enumerate(zip(names, cells, strict=True)):
-        if unread:
-            first = [f"{text[:40]!r} in {place(row)}" for row, text in [*unread.items()][:3]]
-            text = f"{len(unread)} of {len(values)} cells of {name or f'column {number}'!r} are no "
-            text += f"numbers and are NaN: {', '.join(first)}{', …' * (len(unread) > len(first))}"
-            findings.append(Finding("unreadable cells", KEPT, text))
-    rows = {row for _, unread in cells for row in unread}
-    return tuple(values for values, _ in cells), tuple(findings), rows
+def few(bad: int, rows: int, least: int = 3, share: float = 0.01) -> bool:
+    """Whether so few rows are damaged that the others are trusted."""
+    return bad <= max(least, share * rows)
 
 
-def few(bad: int, rows: int) -> bool:
-    """Whether so few rows are damaged, one in a hundred or three, that the others are trusted."""
-    return bad <= max(3, 0.01 * rows)
-
-
-def _typed(values: Any) -> NDArray[Any]:
-    kind = values.type
-    if pa.types.is_dictionary(kind):
-        return column(values.cast(kind.value_type))[0]
-    if pa.types.is_time(kind):
-        values = values.cast(pa.time64("ns")).cast(pa.int64()).cast(pa.duration("ns"))
-    for to in (pa.float64(), pa.timestamp("ns", getattr(kind, "tz", None)), pa.duration("ns")):
-        try:
-            return np.array(values.cast(to, safe=to != pa.float64()).to_numpy(zero_copy_only=False))
-        except (pa.ArrowInvalid, pa.ArrowNotImplementedError):
-            continue
-    return np.array([None if value is None else str(value) for value in values.to_pylist()], object)
-
-
-_PAGE = "a web page; download the file itself (on GitHub: `Download raw file`)"
 _ADVICE = {
-    b"BZh": "a bzip2 archive; unpack it",
-    b"\xfd7zXZ": "an xz archive; unpack it",
-    b"\x28\xb5\x2f\xfd": "a zstd archive; unpack it",
-    b"7z\xbc\xaf": "a 7z archive; unpack it",
-    b"Rar!": "a RAR archive; unpack it",
-    b"\x1f\x8b": "a gzip archive; unpack it with gunzip",
-    b"\xd0\xcf\x11\xe0": "an Excel workbook (.xls), whatever its name; save it as CSV",
-    b"%PDF": "a PDF document; export the recording as CSV",
-    b"<!DOCTYPE": _PAGE,
-    b"<html": _PAGE,
-    b"version https://git-lfs": "a git LFS pointer to a file; fetch the file by `git lfs pull`",
+    (b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd", b"7z\xbc\xaf", b"Rar!", b"\x1f\x8b"): (
+        "an archive; unpack it"
+    ),
+    (b"\xd0\xcf\x11\xe0",): "an Excel workbook; save it as CSV",
+    (b"<!DOCTYPE", b"<html"): "a web page; download the file itself",
+    (b"version https://git-lfs",): "a git LFS pointer; fetch the file by `git lfs pull`",
+    (b"RDX", b"RDA"): (
+        "data of R; save its table in R by `write.csv(TABLE, 'log.csv', row.names = FALSE)`"
+    ),
 }
-_R = "data of R; save its table in R by `write.csv(TABLE, 'log.csv', row.names = FALSE)`"
 _VEHICLES = (b"ULog\x01\x12\x35", b"#ROSBAG", b"\x89MCAP", b"SQLite format 3", b"\xa3\x95")
-_HDF5 = b"\x89HDF\r\n\x1a\n"
-_USER_BLOCK = 512  # bytes of MATLAB's own header before HDF5 begins
 
 
 def read_table(path: Path, options: ReaderOptions) -> Table:
@@ -187,14 +170,8 @@ def read_table(path: Path, options: ReaderOptions) -> Table:
         from gyro_pipeline.readers import vehicles  # noqa: PLC0415 - its libraries are optional
 
         return vehicles.read(path, options)
-    for recognised, read in (
-        (head.startswith(b"PAR1"), stored.read_parquet),
-        (head.startswith(b"\x93NUMPY"), stored.read_npy),
-        (head.startswith(b"PK"), stored.read_npz),
-        (head.startswith(_HDF5) or head[_USER_BLOCK:] == _HDF5, stored.read_hdf5),
-        (head.startswith(b"MATLAB "), stored.read_mat5),
-    ):
-        if recognised:
+    for magic, read in stored.READERS.items():
+        if head.startswith(magic):
             return stored.guarded(path, read)
     return text.read_text(path, options)
 
@@ -205,14 +182,13 @@ def _head(path: Path) -> bytes | None:
         if (path / "metadata.yaml").exists():
             return None
         with path.open("rb") as file:
-            head = file.read(_USER_BLOCK + len(_HDF5))
+            head = file.read(64)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     if not head:
         raise InputError(f"{path}: expected a recording, got an empty file; copy it anew")
-    if path.suffix.lower() in (".rda", ".rdata", ".rds") or head.startswith((b"RDX", b"RDA")):
-        raise InputError(f"{path}: expected a recording, got {_R}")
+    kind = b"RDX" if path.suffix.lower() in (".rda", ".rdata", ".rds") else head  # compressed
     for magic, advice in _ADVICE.items():
-        if head.startswith(magic):
+        if kind.startswith(magic):
             raise InputError(f"{path}: expected a recording, got {advice}")
     return head

@@ -1,26 +1,46 @@
-"""Delimited text as a table: Arrow parses it, once; only damaged rows are looked at again."""
+"""Delimited text as a table: its head tells how it is laid out, then Arrow parses it, once.
 
+Two neighbouring lines of equally many fields, three of which are numbers, are rows; what is above
+them is the header and lines of text. Where that leaves a choice, the file is refused. A line below
+that has another number of fields is a damaged row.
+"""
+
+import codecs
+import csv
 import re
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.logs import KEPT, REPAIRED, Finding
+from gyro_pipeline.logs import REPAIRED, Finding
 from gyro_pipeline.parameters import ReaderOptions
-from gyro_pipeline.readers.layout import DELIMITERS, Layout, is_header, layout_of, split
 from gyro_pipeline.readers.lines import advice, read_lines
 from gyro_pipeline.readers.table import IN_READER, Table, columns_of, few
 
-_HEAD, _ZEROS = 1 << 14, 0.1  # bytes in which a larger share of zeros is none of a text
-_UTF16, _UTF8 = (b"\xff\xfe", b"\xfe\xff"), b"\xef\xbb\xbf"
-_COMMENTS = re.compile(rb"(?:\A|(?<=[\r\n]))[ \t]*(?:#|%|//)[^\r\n]*")
-_NULLS = ["", " ", "NaN", "nan", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
+DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab", " ": "blanks"}
+
+_HEAD = 1 << 15  # bytes that tell the layout
+_LEAST = 3  # numbers in a row
+_COMMENT, _SENTENCE = ("#", "%", "//"), ("$", "!")  # NMEA 0183 begins sentences so
+_MISSING = ["", " ", "NA", "N/A", "null", "NULL", "None"]
+
+
+class _Layout(NamedTuple):
+    names: tuple[str, ...]  # the header, as long as a row; all empty where there is none
+    preamble: str  # the lines above it
+    above: int  # how many lines of the file are above the rows
+    delimiter: str  # a blank stands for runs of them
+    decimal_point: str
+    quoted: bool  # if fields are not in quotes, a stray quote is one more damaged field
+    texts: list[int]  # columns that are not of numbers alone in the head
 
 
 def read_text(path: Path, options: ReaderOptions) -> Table:
@@ -29,138 +49,82 @@ def read_text(path: Path, options: ReaderOptions) -> Table:
     Raises:
         InputError: It is not a text, or not one of rows that are told apart safely.
     """
-    data, hint = _decoded(path, options.encoding)
+    text, hint = _decoded(path, options.encoding)
     try:
         if options.row is not None:
-            return read_lines(str(path), data, options.row)
-        return replace(_read_rows(str(path), data, options.delimiter), hint=hint)
+            return read_lines(str(path), text, options.row)
+        return replace(_read_rows(str(path), text, options.delimiter), hint=hint)
     except InputError as error:
-        raise InputError(f"{error}{hint and f'; {hint}'}") from error
-
-
-def _read_rows(where: str, data: bytes, delimiter: str | None) -> Table:
-    layout = layout_of(where, data, delimiter)
-    body, findings = _body(data, layout)
-    rows = _Rows(where, body, layout)
-    arrays, odd = _parse(body, layout)
-    rows.refuse_quotes_over_lines(len(arrays[0]))
-    columns, unread, damaged = columns_of(layout.names, arrays, rows.place, layout.decimal_point)
-    rows.refuse_second_header(damaged | {*odd})
-    findings += rows.check_odd(odd, len(arrays[0])) + unread
-    return Table(where, layout.names, columns, layout.preamble, findings, rows.place)
+        raise InputError(f"{error}; {hint}" if hint else str(error)) from error
 
 
 def _decoded(path: Path, encoding: str | None) -> tuple[bytes, str]:
-    """The text in UTF-8, without byte order mark, and what to say of its names if they look odd."""
+    """The text in UTF-8, and what to say of its names if they look odd."""
     data = path.read_bytes()
-    if encoding is not None or data.startswith(_UTF16):
-        try:
-            data = data.decode(encoding or "utf-16", "replace").encode()
-        except LookupError as error:
-            raise InputError(f"{path}: `encoding` {IN_READER}: {error}") from error
-    data = data.removeprefix(_UTF8)
-    head = data[:_HEAD].rstrip(b"\0")
-    if head.count(0) > len(head) * _ZEROS:
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        encoding = encoding or "utf-16"
+    try:
+        data = data.decode(encoding, "replace").encode() if encoding else data
+    except LookupError as error:
+        raise InputError(f"{path}: `encoding` {IN_READER}: {error}") from error
+    data = data.removeprefix(codecs.BOM_UTF8).rstrip(b"\0")  # those of a card that lost power
+    if b"\0" in data[:1000]:
         raise InputError(
             f"{path}: expected a text, got binary data, or UTF-16 without byte order mark; export "
             f"the recording as CSV in UTF-8, or give `encoding: utf-16-le` {IN_READER}"
         )
-    if data.isascii() or _is_utf8(data):
-        return data, ""
-    lines = data.splitlines(keepends=True)  # those with a damaged byte only are read otherwise
-    text = b"".join(
-        line if _is_utf8(line) else line.decode("cp1252", "replace").encode() for line in lines
-    )
-    return text, f"the text is not UTF-8: if names look odd, give `encoding`, as gbk, {IN_READER}"
-
-
-def _is_utf8(data: bytes) -> bool:
     try:
         data.decode()
     except UnicodeDecodeError:
-        return False
-    return True
+        hint = f"the text is not UTF-8: if names look odd, give `encoding`, as gbk, {IN_READER}"
+        return data.decode("cp1252", "replace").encode(), hint
+    return data, ""
 
 
-def _body(data: bytes, layout: Layout) -> tuple[memoryview, tuple[Finding, ...]]:
-    """The rows, without what an interrupted recording leaves behind them, and without comments."""
-    findings: tuple[Finding, ...] = ()
-    start, end = layout.start, len(data)
-    if data.endswith(b"\0"):
-        end = len(data.rstrip(b"\0"))
-        text = f"{len(data) - end} zero bytes at the end of the file were left out"
-        findings += (Finding("end of file", REPAIRED, text),)
-    line_end = b"\n" if b"\n" in data else b"\r"
-    last = max(start, 1 + data.rfind(line_end, start, end))
-    fields = split(data[last:end].decode("utf-8", "replace"), layout.delimiter)
-    if fields and len(fields) != len(layout.names):
-        text = f"the last line, of {end - last} bytes, is cut and was left out"
-        findings += (Finding("end of file", REPAIRED, text),)
-        end = last
-    body = memoryview(data)[start:end]  # not a copy
-    marks = [mark for mark in (b"#", b"%", b"/") if data.find(mark, start) >= 0]
-    if marks and (marks != [b"/"] or b"//" in data):  # each is faster than the next
-        rows, comments = _COMMENTS.subn(b"", body)  # blank lines are no rows
-        if comments:
-            body = memoryview(rows)
-            text = f"{comments} lines of comment among the rows were left out"
-            findings += (Finding("comments", KEPT, text),)
+def _read_rows(where: str, text: bytes, delimiter: str | None) -> Table:
+    layout = _layout(where, text, delimiter)
+    start = sum(map(len, text[:_HEAD].splitlines(keepends=True)[: layout.above]))
+    body = memoryview(text)[start:]  # not a copy
     if layout.delimiter == " ":
-        body = memoryview(b"\n".join(b" ".join(line.split()) for line in bytes(body).splitlines()))
-    return body, findings
+        body = memoryview(b"\n".join(b" ".join(row.split()) for row in bytes(body).splitlines()))
 
+    @cache  # needed only where rows are damaged
+    def lines() -> list[tuple[int, str]]:
+        numbered = enumerate(bytes(body).splitlines(), layout.above + 1)
+        return [(number, row.decode()) for number, row in numbered if row.strip()]
 
-@dataclass(frozen=True)
-class _Rows:
-    """The rows as lines, which are looked at only where some are damaged."""
+    def place(row: int) -> str:
+        return f"row {row} (line {lines()[row][0]})"
 
-    where: str
-    body: memoryview
-    layout: Layout
-
-    @cached_property
-    def lines(self) -> list[tuple[int, str]]:
-        """Number in the file and text of the line of each row."""
-        text = bytes(self.body).decode().replace("\r\n", "\n").replace("\r", "\n")
-        numbered = enumerate(text.split("\n"), self.layout.line)
-        return [(number, line) for number, line in numbered if line.strip()]
-
-    def place(self, row: int) -> str:
-        return f"row {row} (line {self.lines[row][0]})"
-
-    def refuse_quotes_over_lines(self, count: int) -> None:
-        if self.layout.quoted and count != len(self.lines):
+    arrays, odd = _parse(body, layout)
+    columns, findings, damaged = columns_of(layout.names, arrays, place, layout.decimal_point)
+    for row in sorted(damaged | {*odd})[:100]:
+        if _are_names(_split(lines()[row][1], layout.delimiter)):
             raise InputError(
-                f"{self.where}: expected a row on each line, got {count} rows on {len(self.lines)} "
-                "lines: a quoted field does not end on its line; correct it"
+                f"{where}: expected numbers, got a second header in {place(row)}, "
+                f"{lines()[row][1][:80]!r}: two recordings in one file? Split it"
             )
-
-    def refuse_second_header(self, damaged: set[int]) -> None:
-        for row in sorted(damaged)[:100]:
-            text = self.lines[row][1]
-            if is_header(split(text, self.layout.delimiter)):
-                raise InputError(
-                    f"{self.where}: expected numbers, got a second header in {self.place(row)}, "
-                    f"{text[:80]!r}: two recordings in one file? Split it"
-                )
-
-    def check_odd(self, odd: dict[int, str], count: int) -> tuple[Finding, ...]:
-        """Say which rows have another number of fields, or refuse so many."""
-        shown = "; ".join(f"{self.place(row)}: {text}" for row, text in [*odd.items()][:3])
-        if count - len(odd) < 2 or not few(len(odd), count):  # noqa: PLR2004
-            name = DELIMITERS.get(self.layout.delimiter, repr(self.layout.delimiter))
-            raise InputError(
-                f"{self.where}: expected rows of {len(self.layout.names)} columns, separated by "
-                f"{name}, got {len(odd)} of {count} that are not: {shown}; correct or export the "
-                "file anew, or, if other lines stand between the rows, "
-                f"{advice([text for _, text in self.lines[:200]])}"
-            )
-        text = f"{len(odd)} of {count} rows cannot be read and are NaN: {shown}"
-        return (Finding("unreadable rows", REPAIRED, text),) if odd else ()
+    if odd:
+        shown = "; ".join(f"{place(row)}: {problem}" for row, problem in [*odd.items()][:3])
+        findings += (_odd_rows(where, layout, len(odd), shown, [row for _, row in lines()]),)
+    return Table(where, layout.names, columns, layout.preamble, findings, place)
 
 
-def _parse(body: memoryview, layout: Layout) -> tuple[list[Any], dict[int, str]]:
-    """Let Arrow parse, and tell numbers from texts.
+def _odd_rows(where: str, layout: _Layout, odd: int, shown: str, rows: list[str]) -> Finding:
+    """Say that a few rows have another number of fields, or refuse more."""
+    if few(odd, len(rows)) and odd < len(rows) - 1:
+        detail = f"{odd} of {len(rows)} rows cannot be read and are NaN: {shown}"
+        return Finding("unreadable rows", REPAIRED, detail)
+    raise InputError(
+        f"{where}: expected rows of {len(layout.names)} columns, separated by "
+        f"{DELIMITERS.get(layout.delimiter, repr(layout.delimiter))}, got {odd} of {len(rows)} "
+        f"that are not: {shown}; correct or export the file anew, or, if other lines stand between "
+        f"the rows, {advice(rows[:200])}"
+    )
+
+
+def _parse(body: memoryview, layout: _Layout) -> tuple[list[Any], dict[int, str]]:
+    """Let Arrow split rows; what it does not take for a number is a text.
 
     Returns:
         Arrow's columns, and what is wrong with rows of another number of fields, by row, which are
@@ -186,27 +150,198 @@ def _parse(body: memoryview, layout: Layout) -> tuple[list[Any], dict[int, str]]
         ),
         pyarrow.csv.ConvertOptions(
             column_types={str(number): pa.string() for number in layout.texts},
-            null_values=_NULLS,
-            true_values=[],
-            false_values=[],
+            null_values=_MISSING,
             strings_can_be_null=True,
             decimal_point=layout.decimal_point,
         ),
     )
-    return _with_odd_rows(table, skipped)
-
-
-def _with_odd_rows(table: Any, skipped: list[Any]) -> tuple[list[Any], dict[int, str]]:
-    odd: dict[int, str] = {}
-    blank = 0  # lines of blanks are no rows
-    for row in skipped:
-        if row.text.strip():
-            text = f"expected {row.expected_columns} fields, got {row.actual_columns}"
-            odd[row.number - 1 - blank] = text
-        else:
-            blank += 1
+    blank = np.cumsum([not row.text.strip() for row in skipped])  # lines of blanks are no rows
+    odd = {
+        row.number - 1 - before: f"expected {row.expected_columns} fields, got {row.actual_columns}"
+        for row, before in zip(skipped, blank.tolist(), strict=True)
+        if row.text.strip()
+    }
     if not odd:
-        return table.columns, {}
-    taken = np.arange(table.num_rows + 0.0)
-    taken = np.insert(taken, np.array([*odd]) - np.arange(len(odd)), np.nan)
-    return table.take(pa.array(taken, pa.int64(), from_pandas=True)).columns, odd
+        return table.columns, odd
+    rows = np.insert(np.arange(table.num_rows + 0.0), [*odd] - np.arange(len(odd)), np.nan)
+    return table.take(pa.array(rows, pa.int64(), from_pandas=True)).columns, odd
+
+
+def _layout(where: str, text: bytes, delimiter: str | None) -> _Layout:
+    """Tell the layout of a text: by which delimiter a row has most numbers, blanks last.
+
+    Raises:
+        InputError: There are no rows, or they cannot be told safely.
+    """
+    numbered = _head(text)
+    lines = [*numbered.values()]
+    delimiters = [delimiter] if delimiter else [*DELIMITERS]
+    starts: dict[str, tuple[int, int, int]] = {}
+    for sign in delimiters:
+        if (sign != " " or not starts) and (start := _first_row(lines, sign)):
+            starts[sign] = start
+    if not starts:
+        number, line = next(iter(numbered.items()), (1, ""))
+        raise InputError(
+            f"{where}: expected two rows or more of three numbers or more, separated by "
+            f"{' or '.join(DELIMITERS.get(d, repr(d)) for d in delimiters)}, got none in the "
+            f"first {len(lines)} lines; line {number} begins {line[:60]!r}; {advice(lines)}"
+        )
+    delimiter = max(starts, key=lambda sign: starts[sign][-1])
+    first, width, _ = starts[delimiter]
+    rows = [_split(line, delimiter) for line in lines[first : first + 50]]
+    rows = [row for row in rows if len(row) == width]
+    names, above = _header(where, lines[:first], rows, delimiter)
+    return _Layout(
+        names=names,
+        preamble="\n".join(above),
+        above=[0, *numbered][first],
+        delimiter=delimiter,
+        decimal_point=_decimal_point(where, [field for row in rows for field in row]),
+        quoted='"' in lines[first],
+        texts=[n for n in range(width) if not all(_is_number(row[n]) for row in rows)],
+    )
+
+
+def _head(text: bytes) -> dict[int, str]:
+    """The lines in the head of a text that are not blank, whole if others follow them."""
+    head = text[:_HEAD]
+    if len(text) > _HEAD:
+        head = head[: 1 + max(head.rfind(b"\n"), head.rfind(b"\r"))] or head
+    lines = enumerate(head.decode("utf-8", "replace").encode().splitlines(), 1)
+    return {number: line.decode() for number, line in lines if line.strip()}
+
+
+def _split(line: str, delimiter: str) -> list[str]:
+    """Fields without quotes and outer blanks; none if the line cannot be split."""
+    if delimiter == " ":
+        return line.split()
+    try:
+        return [field.strip() for field in next(csv.reader([line], delimiter=delimiter), [])]
+    except csv.Error:  # a field beyond csv's limit
+        return []
+
+
+def _is_number(field: str) -> bool:
+    """Whether it is a number, with a point or a comma, or NaN or infinity."""
+    try:
+        float(field.replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+def _are_names(fields: Sequence[str]) -> bool:
+    """Whether these are names of columns rather than a row, be it a damaged one."""
+    filled = [field.lstrip("[(") for field in fields if field]
+    words = [field for field in filled if field[:1].isalpha() and not _is_number(field)]
+    return len(words) > max(1, len(filled) // 2)
+
+
+def _first_row(lines: list[str], delimiter: str) -> tuple[int, int, int] | None:
+    """The index of the first row, and how many fields and numbers rows have; None without rows."""
+    rows = [(0, 0)]  # fields and numbers of the lines
+    for line in lines:
+        rows.append(_counts(line, delimiter))
+        width, numbers = rows[-1][0], max(rows[-1][1], rows[-2][1])
+        if width == rows[-2][0] and numbers >= _LEAST:
+            break
+    else:
+        return None
+    at = len(rows) - 3
+    while rows[at][0]:  # a row of which numbers are missing, or a damaged one
+        at -= 1
+    first = [field for field in _split(lines[at], delimiter) if _is_number(field)]
+    numbered = at == 0 and first == [str(number) for number in range(len(first))]  # by pandas
+    return at + numbered, width, numbers
+
+
+def _counts(text: str, delimiter: str) -> tuple[int, int]:
+    """How many fields a row has, and how many of them are numbers; no fields if it is no row."""
+    if delimiter not in text or text.lstrip().startswith(_COMMENT + _SENTENCE):
+        return 0, 0
+    fields = _split(text, delimiter)
+    numbers = sum(map(_is_number, fields))
+    figures = [field[:1] in "+-.0123456789" for field in fields if field]  # times and dates, too
+    if delimiter == " ":  # words between blanks are a sentence
+        is_row = all(figures) or numbers == len(fields)
+    else:
+        is_row = numbers >= _LEAST or (any(figures) and not _are_names(fields))
+    return (len(fields), numbers) if is_row and len(fields) >= _LEAST else (0, 0)
+
+
+def _header(
+    where: str, above: list[str], rows: list[list[str]], delimiter: str
+) -> tuple[tuple[str, ...], list[str]]:
+    """The names, of the nearest line above the rows that is as wide as they, and the lines left.
+
+    A row of units, and a row of names that span columns, belong to it.
+    """
+    width, used = len(rows[0]), max(len(_filled(row)) for row in rows)
+    for at in reversed(range(len(above))):
+        fields = _names(above[at], delimiter, width, used)
+        names = _filled(fields)
+        if _fit(fields, width, used):
+            break
+        if len(names) >= _LEAST and not above[at].lstrip().startswith(_COMMENT):
+            raise InputError(
+                f"{where}: expected a header of as many columns as the rows, {used}, got "
+                f"{len(names)}, {', '.join(map(repr, names[:30]))}; which is which cannot be told: "
+                "correct it"
+            )
+    else:
+        return ("",) * width, above
+    names, units = (names + [""] * width)[:width], [""] * width
+    upper = [_split(line.lstrip("#%/ "), delimiter) for line in above[:at]]
+    # neighbours have the same unit but different axes: names repeated side by side are units
+    if upper and len(upper[-1]) == width and any(a == b != "" for a, b in pairwise(names)):
+        names, units = upper.pop(), [unit.strip("[]() ") for unit in names]
+    while upper and len(upper[-1]) == width and len({*names[:used]} - {""}) < used:
+        names = _joined(upper.pop(), names)  # some are empty, or there more than once
+    names = [f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True)]
+    return tuple(names), above[: len(upper)] + above[at + 1 :]
+
+
+def _filled(fields: list[str]) -> list[str]:
+    """Fields without empty ones at the end: a delimiter at the end of a line is no column."""
+    return fields[: max((n for n, field in enumerate(fields, 1) if field), default=0)]
+
+
+def _fit(fields: list[str], width: int, used: int) -> bool:
+    """Whether names are those of rows; a delimiter too many or too few would shift them."""
+    names = _filled(fields)
+    return len(names) == used or (len(fields) == width and "" not in names)
+
+
+def _names(text: str, delimiter: str, width: int, used: int) -> list[str]:
+    """Names in a header; NumPy and others write it as a comment, and by a delimiter of its own."""
+    text = text.lstrip("#%/ ")
+    ways = [_split(text, d) for d in (delimiter, ",", ";", "\t")]
+    ways.append(re.findall(r"[^\s(\[]\S*(?:\s+[(\[][^)\]]*[)\]])?", text))  # gx (deg/s) is one
+    return next((fields for fields in ways if _fit(fields, width, used)), ways[0])
+
+
+def _joined(upper: Sequence[str], lower: Sequence[str]) -> list[str]:
+    """Two rows of a header as one: a name carries on over the empty fields beside it.
+
+    Its unit stays behind the axis: ``Gyro (rad/s)`` above ``X`` is ``Gyro X (rad/s)``.
+    """
+    joined, span = [], ""
+    for name, axis in zip(upper, lower, strict=True):
+        span = name or (span if axis else "")
+        stem, *unit = re.split(r"(?=\s*[(\[])", span, maxsplit=1)
+        joined.append(" ".join(filter(None, (stem, axis))) + "".join(unit))
+    return joined
+
+
+def _decimal_point(where: str, fields: list[str]) -> str:
+    """A comma where numbers have one that cannot separate thousands."""
+    pattern = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
+    commas = [field for field in fields if "," in field and pattern.fullmatch(field)]
+    if commas and all(re.fullmatch(r"[+-]?[1-9]\d*,\d{3}", field) for field in commas):
+        raise InputError(
+            f"{where}: expected decimal points, or decimal commas, got a comma before three digits "
+            f"each time, {commas[0]}, which may separate thousands; export the recording with "
+            "decimal points and without thousands separators"
+        )
+    return "," if commas else "."
