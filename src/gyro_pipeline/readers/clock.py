@@ -2,16 +2,18 @@
 
 A missing sample makes all later stamps late; a sample that is written late, a stall, a burst and
 rounding make only some late. So the lower envelope of ``stamp - row * step``, which is the least of
-it among the stamps that follow, rises only where samples are missing. Where it falls for good, a row
-is written twice.
+it among the stamps that follow, rises only where samples are missing. The other way round, it falls
+for good where a row is written twice.
 
-Not seen is what is lost within the resolution of the stamps or their scatter: a sample beside
-jitter of half a step, some of a burst, or one of the last five. Nor are a sample in whose place a
-row is repeated, and losses so regular that they look like a slower clock. Of a clock that ticks as
-fast as samples come, fewer than ten longer steps may be rounding, and are no gaps.
+Not seen is what is lost within the resolution of the stamps or their scatter: a sample of a clock
+that ticks as fast as samples come, one beside jitter of half a step, some of a burst. Nor are a
+sample in whose place a row is repeated, losses so regular that they look like a slower clock, and
+those before the last five stamps. On a clock that ticks as fast as samples come, rows written twice
+count as samples.
 """
 
 from dataclasses import dataclass, field
+from math import isclose
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,19 +56,17 @@ def from_stamps(stamps: Floats, unit_s: float | None) -> Timing:
     if not usual > 0:
         text = "timestamps do not advance: the rate is not measured"
         return Timing(None, rows[back], (*findings, Finding("timestamps", KEPT, text)))
-    # of the rows with one stamp, the last one is in time
+    # of the rows that share a stamp, the last one is in time
     first = np.diff(times, prepend=-np.inf) > usual / 10
     last = np.append(first[1:], True)
     step, losses, even = _fit(times[last], rows[last], stamps[rows])
     gaps = rows[first][losses > 0]
-    findings += _at("gaps", gaps, f"samples are missing, about {losses.sum():.0f}", REPAIRED)
-    if len(rows) > 1.5 * first.sum():
-        text = "timestamps are coarse or come in bursts: the rate is the count over the duration"
-        findings.append(Finding("timestamps", KEPT, text))
-    else:
-        repeats = rows[np.flatnonzero(np.diff(times) == 0) + 1]
-        findings += _at("duplicated timestamps", repeats, "a timestamp repeats")
-    findings += _regularity(even, rows[last], losses == 0)
+    text = "the timestamp of the row before, as a coarse clock, bursts and doubled rows have it"
+    findings += [
+        *_at("gaps", gaps, f"samples are missing, about {losses.sum():.0f}", REPAIRED),
+        *_at("timestamps", rows[~first], text),
+        *_regularity(even, rows[last], losses == 0),
+    ]
     rate_hz = None if unit_s is None else 1 / (step * unit_s)
     return Timing(rate_hz, np.union1d(gaps, rows[back]), tuple(findings))
 
@@ -79,20 +79,20 @@ def _fit(times: Floats, rows: Rows, stamps: Floats) -> tuple[float, Floats, Floa
         rows: (k,), the last row with each.
         stamps: (n,), as written.
     """
-    step = _first_step(times, rows)
-    tick = _tick(times, rows, stamps, step)
-    if tick:
-        step = _slope(times, rows, min(200, len(rows) // 10))
-    even, losses = times, np.zeros(len(times))
-    for _ in range(3):  # the step shows the gaps, and these the step
+    step = _usual_step(times, rows)
+    resolution = _resolution(stamps, np.diff(times), np.diff(rows), step)
+    doubled = np.diff(rows, prepend=rows[0]) > 1
+    for _ in range(4):  # the step shows the gaps, and these the step
         delays = times - step * rows
-        least = max(step / 2, 1.25 * tick, 1.2 * np.ptp(np.quantile(np.diff(delays), [0.15, 0.85])))
+        scatter = np.ptp(np.quantile(np.diff(delays), [0.15, 0.85]))
+        least = max(step / 2, 1.25 * resolution, 2 * scatter)
         losses = _rises(delays, least, step) / step
         losses = np.where(losses < 100, np.rint(losses), losses)  # a pause may be of any length
-        falls = _rises(-delays, least, step) * (np.diff(rows, prepend=rows[0]) > 1)
-        repeats = np.rint(falls / step)
+        repeats = doubled * np.rint(_rises(-delays, least, step) / step)
         even = times - step * np.cumsum(losses - repeats)
-        step = _slope(even, rows, 9 * len(rows) // 10) or step
+        earlier, step = step, _slope(even, rows, 9 * len(rows) // 10) or step
+        if isclose(step, earlier, rel_tol=1e-4):
+            break
     return step, losses, even
 
 
@@ -117,38 +117,44 @@ def _rises(delays: Floats, least: float, step: float) -> Floats:
     return rises
 
 
-def _first_step(times: Floats, rows: Rows) -> float:
-    """Mean step from row to row without far longer ones, over as few stamps as let it scatter little."""
+def _usual_step(times: Floats, rows: Rows) -> float:
+    """Mean step from row to row, without far longer ones.
+
+    It is measured over as few stamps as let it scatter by less than a quarter: one, but for bursts,
+    rounded stamps and steps at random.
+    """
     lag = 1
     while True:
         slopes = (times[lag:] - times[:-lag]) / (rows[lag:] - rows[:-lag])
         low, step, high = np.quantile(slopes, [0.2, 0.5, 0.8], method="lower")
         if high - low <= step / 4 or 4 * lag > len(times):
-            return slopes[np.abs(slopes - step) < step / 2].mean()
+            return float(slopes[np.abs(slopes - step) < step / 2].mean())
         lag *= 2
 
 
-def _tick(times: Floats, rows: Rows, stamps: Floats, step: float, few: int = 10) -> float:
-    """What all steps are whole multiples of, if it makes some longer; 0 if losses do.
+def _resolution(stamps: Floats, steps: Floats, rows: Rows, step: float, few: int = 5) -> float:
+    """What rounds the stamps; 0 if that is less than a hundredth of a step.
 
-    Ticks make steps longer at regular intervals, or others shorter; samples are lost at random. A few
-    longer steps are of ticks if these are a decimal unit.
+    It is a decimal unit that all stamps are multiples of, and at least the usual step if all others
+    are multiples of it and uneven ones come at regular intervals. Losses come at random: there, the
+    relative change from one interval to the next is 1/2 on average.
+
+    Args:
+        stamps: (n,), as written.
+        steps: (k - 1,), between those that differ.
+        rows: (k - 1,), how many rows such a step takes.
+        step: The usual step from row to row.
     """
-    steps = np.diff(times)
-    rounded = 16 * np.spacing(np.abs(stamps).max())
-    differences = np.diff(np.sort(steps), prepend=0.0)
-    tick = differences[differences > rounded].min()
-    if not 0.4 * step < tick < 1.5 * step:
-        return tick if tick > step else 0.0
-    delays = steps - step * np.diff(rows)
-    short, long = delays < -tick / 4, (delays > tick / 4) & (delays < 1.5 * tick)
-    if short.sum() + long.sum() < few:
-        unit = 10.0 ** np.rint(np.log10(tick))
-        remainders = np.abs(stamps - unit * np.rint(stamps / unit))
-        return tick if abs(tick - unit) < rounded and remainders.max() < rounded else 0.0
-    intervals = np.diff(np.flatnonzero(short | long))
-    change = np.mean(np.abs(np.diff(intervals)) / (intervals[1:] + intervals[:-1]))  # 1/2 at random
-    return tick if change < 0.25 or min(short.sum(), long.sum()) > 0.1 * len(intervals) else 0.0
+    noise = 4 * np.spacing(np.abs(stamps).max())
+    units = 10.0 ** (np.ceil(np.log10(np.median(steps)) - 1e-6) - np.arange(3))
+    errors = (np.abs(stamps - unit * np.rint(stamps / unit)).max() for unit in units)
+    decimal = next((unit for unit, error in zip(units, errors) if error <= noise), 0.0)
+    multiples = steps / step
+    intervals = np.diff(np.flatnonzero(np.rint(multiples) != rows))
+    if len(intervals) < few or np.abs(multiples - np.rint(multiples)).max() > 0.01:
+        return decimal
+    change = np.abs(np.diff(intervals)) / (intervals[1:] + intervals[:-1])
+    return max(decimal, step) if change.mean() < 0.25 else decimal
 
 
 def _slope(times: Floats, rows: Rows, lag: int) -> float:
@@ -236,7 +242,11 @@ def from_counter(counts: Floats, bits: int) -> Timing:
         gap_rows=rows[skips],
         findings=(
             *_at("packet counter", strays, "a number is far from those beside it, and ignored"),
-            *_at("wrap-around", rows[~skips & (steps < 0)], f"the {bits}-bit packet counter starts anew"),
+            *_at(
+                "wrap-around",
+                rows[~skips & (steps < 0)],
+                f"the {bits}-bit packet counter starts anew",
+            ),
             *_at("packet counter", rows[skips], text, REPAIRED),
         ),
     )
