@@ -1,15 +1,15 @@
 """Sample rate and gaps, from timestamps and packet counters.
 
-A missing sample makes all later stamps late; a sample that is written late, a stall, a burst and
-rounding make only some late. So the lower envelope of ``stamp - row * step``, which is the least of
-it among the stamps that follow, rises only where samples are missing. The other way round, it falls
-for good where a row is written twice.
+A missing sample makes all later stamps late. A sample that is written late, a stall, a burst and
+rounding make only some late. So the lower envelope of ``stamp - row * step``, the least of it among
+the stamps that follow, rises only where samples are missing. In the same way, the upper envelope
+falls only where a row is written twice.
 
-Not seen is what is lost within the resolution of the stamps or their scatter: a sample of a clock
-that ticks as fast as samples come, one beside jitter of half a step, some of a burst. Nor are a
-sample in whose place a row is repeated, losses so regular that they look like a slower clock, and
-those before the last five stamps. On a clock that ticks as fast as samples come, rows written twice
-count as samples.
+Not seen are losses within the resolution of the stamps or their scatter: single samples of a clock
+that ticks as fast as samples come, a sample beside jitter of a third of a step, some of a burst.
+Nor are a sample in whose place a row is repeated, losses so regular that they look like a slower
+clock, and those beside the last five stamps. Where samples are written twice on a clock that ticks
+as fast as they come, the rate counts them all.
 """
 
 from dataclasses import dataclass, field
@@ -71,13 +71,16 @@ def from_stamps(stamps: Floats, unit_s: float | None) -> Timing:
     return Timing(rate_hz, np.union1d(gaps, rows[back]), tuple(findings))
 
 
-def _fit(times: Floats, rows: Rows, stamps: Floats) -> tuple[float, Floats, Floats]:
+def _fit(
+    times: Floats, rows: Rows, stamps: Floats, pause: int = 100
+) -> tuple[float, Floats, Floats]:
     """The step from sample to sample, samples missing before each stamp, and times without gaps.
 
     Args:
         times: (k,), increasing.
         rows: (k,), the last row with each.
         stamps: (n,), as written.
+        pause: So many samples are not rounded: a pause need not last a whole number of steps.
     """
     step = _usual_step(times, rows)
     resolution = _resolution(stamps, np.diff(times), np.diff(rows), step)
@@ -87,7 +90,7 @@ def _fit(times: Floats, rows: Rows, stamps: Floats) -> tuple[float, Floats, Floa
         scatter = np.ptp(np.quantile(np.diff(delays), [0.15, 0.85]))
         least = max(step / 2, 1.25 * resolution, 2 * scatter)
         losses = _rises(delays, least, step) / step
-        losses = np.where(losses < 100, np.rint(losses), losses)  # a pause may be of any length
+        losses = np.where(losses < pause, np.rint(losses), losses)
         repeats = doubled * np.rint(_rises(-delays, least, step) / step)
         even = times - step * np.cumsum(losses - repeats)
         earlier, step = step, _slope(even, rows, 9 * len(rows) // 10) or step
@@ -96,24 +99,27 @@ def _fit(times: Floats, rows: Rows, stamps: Floats) -> tuple[float, Floats, Floa
     return step, losses, even
 
 
-def _rises(delays: Floats, least: float, step: float) -> Floats:
-    """How far the lower envelope of delays rises before each stamp, (k,); 0 if by less than `least`.
+def _rises(delays: Floats, least: float, step: float, near: int = 50, few: int = 5) -> Floats:
+    """How far the lower envelope of delays rises before each stamp, (k,).
 
-    A delay may take ten times as long to end as it is large. It is compared with the median of those
-    before, of which some are late themselves.
+    Args:
+        delays: (k,).
+        least: Smaller rises are 0.
+        step: A delay of so long may end within ten stamps more.
+        near: The envelope is the least delay of so many stamps, if later ones are not even less.
+        few: It is compared with the median of so many before; so many must follow.
     """
     excess = np.diff(delays, prepend=delays[0])
     rows = np.flatnonzero(excess > least)
-    rows = rows[rows < len(delays) - 5]  # behind these, too few follow to show whether all are late
+    rows = rows[rows < len(delays) - few]
     rises = np.zeros(len(delays))
     if len(rows):
-        ahead = np.minimum(rows + 51 + 10 * excess[rows] / step, len(delays)).astype(np.intp)
-        near = np.minimum(rows + 50, ahead - 1)
-        spans = np.stack([rows, near, ahead], axis=1).ravel()
+        ends = np.minimum(rows + near + 10 * excess[rows] / step, len(delays)).astype(np.intp)
+        spans = np.stack([rows, np.minimum(rows + near, ends - 1), ends], axis=1).ravel()
         lowest = np.minimum.reduceat(np.append(delays, np.inf), spans)
-        before = np.median([delays[np.maximum(rows - n, 0)] for n in range(1, 6)], axis=0)
+        before = np.median([delays[np.maximum(rows - n, 0)] for n in range(1, few + 1)], axis=0)
         for_good = np.minimum(lowest[::3], lowest[1::3]) - before > least
-        rises[rows] = np.where(for_good, np.minimum(lowest[::3] - before, excess[rows]), 0.0)
+        rises[rows] = for_good * np.minimum(lowest[::3] - before, excess[rows])
     return rises
 
 
@@ -128,33 +134,33 @@ def _usual_step(times: Floats, rows: Rows) -> float:
         slopes = (times[lag:] - times[:-lag]) / (rows[lag:] - rows[:-lag])
         low, step, high = np.quantile(slopes, [0.2, 0.5, 0.8], method="lower")
         if high - low <= step / 4 or 4 * lag > len(times):
-            return float(slopes[np.abs(slopes - step) < step / 2].mean())
+            return float(slopes[np.abs(slopes - step) < step / 3].mean())
         lag *= 2
 
 
-def _resolution(stamps: Floats, steps: Floats, rows: Rows, step: float, few: int = 5) -> float:
+def _resolution(stamps: Floats, steps: Floats, rows: Rows, step: float) -> float:
     """What rounds the stamps; 0 if that is less than a hundredth of a step.
 
-    It is a decimal unit that all stamps are multiples of, and at least the usual step if all others
-    are multiples of it and uneven ones come at regular intervals. Losses come at random: there, the
-    relative change from one interval to the next is 1/2 on average.
+    It is a decimal unit that all stamps are multiples of, or the usual step, if all steps are
+    multiples of it and those that are not as long as their rows come at regular intervals.
 
     Args:
         stamps: (n,), as written.
         steps: (k - 1,), between those that differ.
         rows: (k - 1,), how many rows such a step takes.
-        step: The usual step from row to row.
+        step: The usual one from row to row.
     """
+    units = 10.0 ** (np.ceil(np.log10(np.median(steps)) - 1e-6) - np.arange(3))[:, None]
+    errors = np.abs(stamps - units * np.rint(stamps / units)).max(axis=1)
     noise = 4 * np.spacing(np.abs(stamps).max())
-    units = 10.0 ** (np.ceil(np.log10(np.median(steps)) - 1e-6) - np.arange(3))
-    errors = (np.abs(stamps - unit * np.rint(stamps / unit)).max() for unit in units)
-    decimal = next((unit for unit, error in zip(units, errors) if error <= noise), 0.0)
-    multiples = steps / step
-    intervals = np.diff(np.flatnonzero(np.rint(multiples) != rows))
-    if len(intervals) < few or np.abs(multiples - np.rint(multiples)).max() > 0.01:
+    decimal = max(units[errors <= noise, 0], default=0.0)
+    multiples = np.rint(steps / step)
+    intervals = np.diff(np.flatnonzero(multiples != rows))
+    if len(intervals[4:]) == 0 or np.abs(steps - step * multiples).max() > noise:
         return decimal
+    # from one interval to the next, those of losses at random change by half of their mean
     change = np.abs(np.diff(intervals)) / (intervals[1:] + intervals[:-1])
-    return max(decimal, step) if change.mean() < 0.25 else decimal
+    return max(decimal, step * (change.mean() < 1 / 4))
 
 
 def _slope(times: Floats, rows: Rows, lag: int) -> float:
@@ -165,23 +171,26 @@ def _slope(times: Floats, rows: Rows, lag: int) -> float:
     return float(np.median((times[lag:] - times[:-lag]) / (rows[lag:] - rows[:-lag])))
 
 
-def _regularity(times: Floats, rows: Rows, whole: NDArray[np.bool_]) -> list[Finding]:
-    """Whether steps scatter by a tenth, or change by 2 % and more than they scatter.
+def _regularity(
+    times: Floats, rows: Rows, whole: NDArray[np.bool_], jitter: float = 0.1, least: float = 0.02
+) -> list[Finding]:
+    """Whether the steps of times without gaps scatter, or change along the recording.
 
-    The mean steps of five parts are compared with what the ten blocks in each differ by.
+    A change is one of the mean steps of five parts, by `least` of them and by more than the ten
+    blocks in each differ.
     """
     findings = []
     steps = np.diff(times)[(np.diff(rows) == 1) & whole[1:]]
     scatter = np.std(steps) / np.mean(steps) if len(steps) > len(rows) / 2 else 0.0
-    if scatter > 0.1:
+    if scatter > jitter:
         text = f"steps scatter by {scatter:.0%} of their mean"
         findings.append(Finding("jitter", KEPT, text))
     ends = np.linspace(0, len(rows) - 1, 51).astype(np.intp)
     if len(rows) >= len(ends):
         blocks = (np.diff(times[ends]) / np.diff(rows[ends])).reshape(5, 10)
-        blocks /= blocks.mean()
-        change = np.ptp(blocks.mean(axis=1))
-        if change > max(0.02, 6 * np.sqrt(blocks.var(axis=1, ddof=1).mean() / 10)):
+        change = np.ptp(blocks.mean(axis=1)) / blocks.mean()
+        error = np.sqrt(blocks.var(axis=1, ddof=1).mean() / 10) / blocks.mean()
+        if change > max(least, 6 * error):
             text = f"the step between timestamps changes by {change:.0%} along the recording"
             findings.append(Finding("sample rate", REJECTED, f"{text}: split the file"))
     return findings
@@ -190,28 +199,30 @@ def _regularity(times: Floats, rows: Rows, whole: NDArray[np.bool_]) -> list[Fin
 def _increasing(stamps: Floats, unit_s: float | None) -> tuple[Floats, Rows, Rows]:
     """Times since the first stamp, where a counter starts anew, and where time goes back.
 
-    Counters are of 16, 24 and 32 bits, or of a day: there, an ordinary step is left.
+    Counters have 16, 24 or 32 bits, or last a day; unwrapped, the step is an ordinary one.
     """
     steps = np.diff(stamps, prepend=stamps[:1])
     steps[np.abs(steps) <= 4 * np.spacing(np.abs(stamps).max(initial=1e-90))] = 0.0
     back = np.flatnonzero(steps < 0)
-    wraps = back[:0]
-    if len(back):
-        usual = np.median(steps[steps > 0]) if (steps > 0).any() else 0.0
-        periods = np.array([2.0**16, 2.0**24, 2.0**32, 86_400 / (unit_s or np.inf)])
-        left = steps[back, None] + periods
-        ends = (0 <= left) & (left <= 2 * usual) & (periods > 10 * usual)
-        steps[back] = np.where(ends.any(axis=1), np.max(left * ends, axis=1), usual)
-        wraps, back = back[ends.any(axis=1)], back[~ends.any(axis=1)]
-    return np.cumsum(steps), wraps, back
+    if not len(back):
+        return np.cumsum(steps), back, back
+    usual = np.median(steps[steps > 0]) if (steps > 0).any() else 0.0
+    periods = np.array([2.0**16, 2.0**24, 2.0**32, 86_400 / (unit_s or np.inf)])
+    unwrapped = steps[back, None] + periods[periods > 10 * usual]
+    ends = np.abs(unwrapped - usual) <= usual
+    wraps = ends.any(axis=1)
+    steps[back] = np.where(wraps, np.max(unwrapped * ends, axis=1), usual)
+    return np.cumsum(steps), back[wraps], back[~wraps]
 
 
-def _without_strays(stamps: Floats, far: float = 10.0) -> tuple[Floats, Rows]:
+def _without_strays(
+    stamps: Floats, far: float = 10.0, largest: float = 1e100
+) -> tuple[Floats, Rows]:
     """Stamps, NaN where one is so many steps from those beside it, which are near; and where.
 
     Of these the time is not known, but the samples may be whole.
     """
-    stamps = np.where(np.abs(stamps) < 1e100, stamps, np.nan)
+    stamps = np.where(np.abs(stamps) < largest, stamps, np.nan)
     rows = np.flatnonzero(np.isfinite(stamps))
     before, here, after = (stamps[rows[n : len(rows) - 2 + n]] for n in range(3))
     away = np.maximum(before - here, here - after)
@@ -269,7 +280,7 @@ def _at(check: str, rows: Rows, text: str, outcome: str = KEPT) -> list[Finding]
     """How often something is so, and where first; no finding if it never is."""
     if not len(rows):
         return []
-    listed = ", ".join(map(str, rows[:3])) + (", …" if len(rows) > 3 else "")
+    listed = ", ".join(map(str, rows[:3])) + (", …" if len(rows[3:]) else "")
     count = "once, at row" if len(rows) == 1 else f"{len(rows)} times, at rows"
     cut = ", cut there" if outcome == REPAIRED else ""
     return [Finding(check, outcome, f"{text}: {count} {listed}{cut}")]
