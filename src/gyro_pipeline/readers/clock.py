@@ -77,10 +77,10 @@ def _fit(
     """The step from sample to sample, samples missing before each stamp, and times without gaps.
 
     Args:
-        times: (k,), increasing.
+        times: (k,), increasing, of the stamps that differ.
         rows: (k,), the last row with each.
         stamps: (n,), as written.
-        pause: So many samples are not rounded: a pause need not last a whole number of steps.
+        pause: A gap of so many samples need not last a whole number of steps.
     """
     step = _usual_step(times, rows)
     resolution = _resolution(stamps, np.diff(times), np.diff(rows), step)
@@ -138,25 +138,19 @@ def _usual_step(times: Floats, rows: Rows) -> float:
         lag *= 2
 
 
-def _resolution(stamps: Floats, steps: Floats, rows: Rows, step: float) -> float:
-    """What rounds the stamps; 0 if that is less than a hundredth of a step.
+def _resolution(stamps: Floats, steps: Floats, counts: Rows, step: float, few: int = 5) -> float:
+    """What the stamps (n,) are rounded to; 0 if that is less than a hundredth of a step.
 
-    It is a decimal unit that all stamps are multiples of, or the usual step, if all steps are
-    multiples of it and those that are not as long as their rows come at regular intervals.
-
-    Args:
-        stamps: (n,), as written.
-        steps: (k - 1,), between those that differ.
-        rows: (k - 1,), how many rows such a step takes.
-        step: The usual one from row to row.
+    It is a decimal unit that all stamps are multiples of, or the usual step, if all k steps are
+    multiples of it and those that do not last as many as they count rows come at regular intervals.
     """
     units = 10.0 ** (np.ceil(np.log10(np.median(steps)) - 1e-6) - np.arange(3))[:, None]
     errors = np.abs(stamps - units * np.rint(stamps / units)).max(axis=1)
     noise = 4 * np.spacing(np.abs(stamps).max())
     decimal = max(units[errors <= noise, 0], default=0.0)
     multiples = np.rint(steps / step)
-    intervals = np.diff(np.flatnonzero(multiples != rows))
-    if len(intervals[4:]) == 0 or np.abs(steps - step * multiples).max() > noise:
+    intervals = np.diff(np.flatnonzero(multiples != counts))
+    if len(intervals) < few or np.abs(steps - step * multiples).max() > noise:
         return decimal
     # from one interval to the next, those of losses at random change by half of their mean
     change = np.abs(np.diff(intervals)) / (intervals[1:] + intervals[:-1])
