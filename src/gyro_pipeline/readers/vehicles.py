@@ -6,7 +6,6 @@ guessed: where several have angular rates, options pick. The libraries are an ex
 
 import io
 import re
-import struct
 from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -20,7 +19,7 @@ from gyro_pipeline.logs import KEPT, Finding
 from gyro_pipeline.parameters import ReaderOptions
 from gyro_pipeline.readers.table import Table
 
-Columns = dict[str, NDArray[np.float64]]
+Columns = dict[str, NDArray]
 Stream = tuple[str, int | None]
 """A topic, and the instance of it in formats that number devices."""
 
@@ -30,7 +29,8 @@ PX4 = {  # https://docs.px4.io/main/en/msg_docs: the first one that is there is 
     "sensor_combined": ("gyro_rad[0]", "gyro_rad[1]", "gyro_rad[2]"),
     "vehicle_angular_velocity": ("xyz[0]", "xyz[1]", "xyz[2]"),
 }
-_RATES, _ACCELERATIONS = "gyro.{} [rad/s]", "accel.{} [m/s^2]"
+RATES = tuple(f"gyro.{axis} [rad/s]" for axis in AXES)
+ACCELERATIONS = tuple(f"accel.{axis} [m/s^2]" for axis in AXES)
 
 
 def read(path: Path, options: ReaderOptions) -> Table:
@@ -65,7 +65,8 @@ def read(path: Path, options: ReaderOptions) -> Table:
             f"{path}: is damaged, cut or of an unknown version ({type(error).__name__}: {error}); "
             "copy it anew, of a bag with its metadata.yaml"
         ) from error
-    return Table(str(path), tuple(columns), tuple(columns.values()), findings=tuple(findings))
+    values = tuple(column.astype(np.float64) for column in columns.values())
+    return Table(str(path), tuple(columns), values, findings=tuple(findings))
 
 
 def _px4(path: Path, options: ReaderOptions) -> tuple[Columns, list[Finding]]:
@@ -73,25 +74,19 @@ def _px4(path: Path, options: ReaderOptions) -> tuple[Columns, list[Finding]]:
 
     log = ULog(str(path), list(PX4))
     data = {(topic.name, topic.multi_id): topic.data for topic in log.data_list}
-    present = [name for name in PX4 if any(name == topic for topic, _ in data)]
-    preferred = {key: rows for key, rows in data.items() if key[0] in present[:1]}
-    topic, instance = _pick(path, options, list(data if options.topic else preferred))
+    first = next((name for name in PX4 if any(name == topic for topic, _ in data)), None)
+    streams = [key for key in data if options.topic or key[0] == first]
+    topic, instance = _pick(path, options, streams)
     rows = data[topic, instance]
-    stamps = rows.get("timestamp_sample", rows["timestamp"])
-    columns = {
-        "time [us]": stamps,
-        **{_RATES.format(axis): rows[name] for axis, name in zip(AXES, PX4[topic], strict=True)},
-    }
-    for n, axis in enumerate(AXES):
-        if f"accelerometer_m_s2[{n}]" in rows:
-            columns[_ACCELERATIONS.format(axis)] = rows[f"accelerometer_m_s2[{n}]"]
-    if "temperature" in rows:
-        columns["temperature [degC]"] = rows["temperature"]
+    stamps = "timestamp_sample" if "timestamp_sample" in rows else "timestamp"
+    names = {stamps: "time [us]", **dict(zip(PX4[topic], RATES, strict=True))}
+    names |= {f"accelerometer_m_s2[{n}]": name for n, name in enumerate(ACCELERATIONS)}
+    names |= {"temperature": "temperature [degC]"}
     text = f"{topic} holds rates freed of the autopilot's bias; sensor_gyro is the sensor's own"
     findings = [Finding("corrected rates", KEPT, text)] if topic != "sensor_gyro" else []
     if log.file_corruption:
         findings.append(Finding("damaged file", KEPT, "parts of the log cannot be read"))
-    return {name: values.astype(np.float64) for name, values in columns.items()}, findings
+    return {name: rows[key] for key, name in names.items() if key in rows}, findings
 
 
 def _ardupilot(path: Path, options: ReaderOptions) -> tuple[Columns, list[Finding]]:
@@ -99,7 +94,7 @@ def _ardupilot(path: Path, options: ReaderOptions) -> tuple[Columns, list[Findin
     from pymavlink.DFReader import DFReader_binary  # noqa: PLC0415 - an extra
 
     class Log(DFReader_binary):
-        init_arrays_fast = DFReader_binary.init_arrays  # whose words can be caught
+        init_arrays_fast = DFReader_binary.init_arrays  # what the fast one prints cannot be caught
 
     log = Log(str(path))
     streams: dict[Stream, Columns] = {}
@@ -112,9 +107,8 @@ def _ardupilot(path: Path, options: ReaderOptions) -> tuple[Columns, list[Findin
                 streams[name, int(instance)] = {key: rows[key][here] for key in rows}
     rows = streams[_pick(path, options, list(streams))]
     names = {"SampleUS" if "SampleUS" in rows else "TimeUS": "time [us]", "T": "temperature [degC]"}
-    for axis in AXES:
-        names[f"Gyr{axis.upper()}"] = _RATES.format(axis)
-        names[f"Acc{axis.upper()}"] = _ACCELERATIONS.format(axis)
+    names |= dict(zip(("GyrX", "GyrY", "GyrZ"), RATES, strict=True))
+    names |= dict(zip(("AccX", "AccY", "AccZ"), ACCELERATIONS, strict=True))
     text = "the autopilot has taken off the bias that it measured at its start (INS_GYR…OFFS)"
     columns = {column: rows[name] for name, column in names.items() if name in rows}
     return columns, [Finding("corrected rates", KEPT, text)]
@@ -123,17 +117,15 @@ def _ardupilot(path: Path, options: ReaderOptions) -> tuple[Columns, list[Findin
 def _fields(log: Any, number: int) -> Columns:
     """The numeric fields of all whole messages of a type, (n,) each, by their names."""
     message = log.formats[number]
+    codes = re.findall(r"\d*\w", message.msg_struct)
+    kinds = [f"<{code}" if code.isalpha() else f"S{code[:-1]}" for code in codes]
+    row = np.dtype(list(zip(message.columns, kinds, strict=True)))
     starts = np.asarray(log.offsets[number], np.intp) + 3  # behind two bytes and the type's number
-    starts = starts[starts + message.len - 3 <= log.data_len]
-    data, codes = np.frombuffer(log.data_map, np.uint8), re.findall(r"\d*\w", message.msg_struct)
-    columns, at = {}, 0
-    for name, code, factor in zip(message.columns, codes, message.msg_mults, strict=True):
-        size = struct.calcsize(f"<{code}")
-        if code.isalpha():
-            values = data[starts[:, None] + np.arange(at, at + size)].view(f"<{code}")[:, 0]
-            columns[name] = values.astype(np.float64) * (factor or 1)
-        at += size
-    return columns
+    starts = starts[starts + row.itemsize <= log.data_len]
+    data = np.frombuffer(log.data_map, np.uint8)[starts[:, None] + np.arange(row.itemsize)]
+    scales = dict(zip(message.columns, message.msg_mults, strict=True))
+    rows = data.view(row)[:, 0]
+    return {key: rows[key] * (scales[key] or 1) for key in scales if row[key].kind != "S"}
 
 
 def _ros(path: Path, options: ReaderOptions) -> tuple[Columns, list[Finding]]:
@@ -144,19 +136,18 @@ def _ros(path: Path, options: ReaderOptions) -> tuple[Columns, list[Finding]]:
     bag_path = path if path.is_dir() or path.suffix == ".bag" else path.parent
     with AnyReader([bag_path], default_typestore=get_typestore(Stores.LATEST)) as bag:
         imus = [link for link in bag.connections if link.msgtype == "sensor_msgs/msg/Imu"]
-        topics = list(dict.fromkeys(imu.topic for imu in imus))
+        topics = dict.fromkeys(imu.topic for imu in imus)
         topic, _ = _pick(path, options, [(topic, None) for topic in topics])
-        rows = []
+        stamps_ns, rows = [], []
         for imu, received_ns, raw in bag.messages([imu for imu in imus if imu.topic == topic]):
             message: Any = bag.deserialize(raw, imu.msgtype)
             stamp = message.header.stamp
-            stamp_ns = stamp.sec * 10**9 + stamp.nanosec
+            stamps_ns.append(stamp.sec * 10**9 + stamp.nanosec or received_ns)
             vectors = message.angular_velocity, message.linear_acceleration
-            numbers = (getattr(vector, axis) for vector in vectors for axis in AXES)
-            rows.append((stamp_ns or received_ns, *numbers))
-    times = np.array([row[0] for row in rows], np.int64)
-    names = [name.format(axis) for name in (_RATES, _ACCELERATIONS) for axis in AXES]
-    values = np.array([row[1:] for row in rows], np.float64).reshape(len(rows), len(names))
+            rows.append([getattr(vector, axis) for vector in vectors for axis in AXES])
+    names = (*RATES, *ACCELERATIONS)
+    values = np.array(rows, float).reshape(len(rows), len(names))
+    times = np.array(stamps_ns, np.int64)
     since_s = (times - times[:1]) / 1e9  # from the first: float64 would round nanoseconds of today
     return {"time [s]": since_s, **dict(zip(names, values.T, strict=True))}, []
 
@@ -180,8 +171,8 @@ def _pick(path: Path, options: ReaderOptions, streams: Sequence[Stream]) -> Stre
         f"topic: {topic}" + ("" if instance is None else f" with instance: {instance}")
         for topic, instance in streams
     )
-    asked = f", got topic: {options.topic}, instance: {options.instance}" if not allowed else ""
+    got = "" if allowed else f", got topic: {options.topic}, instance: {options.instance}"
     raise InputError(
-        f"{path}: expected one device's angular rates{asked}; the log has {listed}; give these in "
+        f"{path}: expected one device's angular rates{got}; the log has {listed}; give these in "
         "`reader:` of the catalog entry in catalog.yml"
     )
