@@ -8,6 +8,7 @@ import io
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.io
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -77,13 +78,15 @@ def test_a_mutated_text_gives_the_good_rows_or_a_message(logger, edits, good, tm
 
 
 @SEVERAL
-@given(edits=EDITS, kind=st.sampled_from(["npy", "npz", "parquet"]))
+@given(edits=EDITS, kind=st.sampled_from(["npy", "npz", "parquet", "mat"]))
 def test_a_mutated_stored_file_gives_a_table_or_a_message(edits, kind, rates, tmp_path):
     buffer = io.BytesIO()
     if kind == "npy":
         np.save(buffer, rates)
     elif kind == "npz":
         np.savez(buffer, gyro_dps=rates)
+    elif kind == "mat":
+        scipy.io.savemat(buffer, {"log": {"gyro_dps": rates}, "t": rates[:, 0]})
     else:
         pd.DataFrame(rates, columns=[*"xyz"]).to_parquet(buffer)
     log = read_or_refused(tmp_path / f"log.{kind}", mutated(buffer.getvalue(), edits))

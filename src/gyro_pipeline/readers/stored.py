@@ -17,6 +17,7 @@ import scipy.io
 from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import AXES, InputError
+from gyro_pipeline.readers import mat5
 from gyro_pipeline.readers.table import Table, column
 
 
@@ -71,6 +72,7 @@ def read_zip(path: Path) -> Table:
 
 def read_mat(path: Path) -> Table:
     """Read arrays and structures of MATLAB 5 to 7."""
+    mat5.check(path.read_bytes())
     variables = scipy.io.loadmat(path, simplify_cells=True)
     return _of_arrays(path, {k: v for k, v in variables.items() if not k.startswith("__")})
 
