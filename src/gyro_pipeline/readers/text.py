@@ -73,12 +73,14 @@ def _decoded(path: Path, encoding: str | None) -> tuple[bytes, str]:
             f"{path}: expected a text, got binary data, or UTF-16 without byte order mark; export "
             f"the recording as CSV in UTF-8, or give `encoding: utf-16-le` {IN_READER}"
         )
+    if data.isascii():
+        return data, ""
     try:
-        data.decode()
+        data[: data.rfind(b"\n", 0, _HEAD) + 1].decode()
     except UnicodeDecodeError:
         hint = f"the text is not UTF-8: if names look odd, give `encoding`, as gbk, {IN_READER}"
         return data.decode("cp1252", "replace").encode(), hint
-    return data, ""
+    return data.decode("utf-8", "replace").encode(), ""  # a damaged byte is no other encoding
 
 
 def _read_rows(where: str, text: bytes, delimiter: str | None) -> Table:
