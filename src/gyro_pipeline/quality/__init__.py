@@ -84,7 +84,7 @@ def inspect(log: Log, rate_hz: float, quality: Quality) -> Inspected:
         step(recording)
         if recording.rejected:
             break
-    recording.keep(*recording.ends())
+    recording.trim()
     outcomes = [finding.outcome for finding in recording.findings]
     outcome = max(outcomes, key=(KEPT, REPAIRED, REJECTED).index, default=KEPT)
     masked, start = recording.masked, recording.start

@@ -50,14 +50,14 @@ def _mask_samples(recording: Recording, check: str, samples: Mask) -> None:
 
 def keep_longest_stretch(recording: Recording) -> None:
     """Keep the rows between two gaps of which most can be used."""
-    edges = np.unique([0, *recording.log.gap_rows, recording.masked.size])
-    if len(edges) > 2:  # noqa: PLR2004 - the ends
-        used = np.add.reduceat(~recording.masked, edges[:-1], dtype=np.intp)
-        start, stop = edges[used.argmax() :][:2]
-        recording.keep(int(start), int(stop))
+    edges = np.unique([0, *recording.log.gap_rows, recording.masked.size]).astype(np.intp)
+    used = np.add.reduceat(~recording.masked, edges[:-1], dtype=np.intp)
+    start, stop = edges[used.argmax() :][:2] if used.size else (0, 0)
+    recording.masked[:start] = recording.masked[stop:] = True
+    if used.size > 1:
         detail = f"rows {start} to {stop - 1}, of {edges[-1]}, are the longest stretch"
         recording.add("gaps", REPAIRED, detail)
-    recording.keep(*recording.ends())
+    recording.trim()
 
 
 def require_length(recording: Recording) -> None:
@@ -91,8 +91,8 @@ def mask_bursts(recording: Recording, few: int = 3) -> None:
         shocks[first:last], kind[first:last] = False, True
     level = np.median(recording.blocks.means, axis=1, keepdims=True)
     kinds = {"motion": motion, "start": start, "shocks": shocks, "spikes": spikes}
-    for check, rows in kinds.items():
-        rows &= ~recording.masked
+    for check, chosen in kinds.items():
+        rows = chosen & ~recording.masked
         if rows.any() and not recording.rejected:
             far = np.abs(recording.rates[:, rows] - level).max(axis=1)
             detail = f"up to {far.max():.3g} deg/s from the level, axis {AXES[far.argmax()]}, "
@@ -106,17 +106,16 @@ def beyond_noise(recording: Recording) -> Mask:
     White noise has any row with a probability of ``false_alarm``, however many there are.
     """
     rates, (starts, means, _, sigma, noise) = recording.filled, recording.blocks
-    # a slope goes on beyond the ends, whatever the first and the last block hold
-    before = 2 * np.median(means[:, :3], axis=1, keepdims=True) - means[:, 6:2:-1]
-    after = 2 * np.median(means[:, -3:], axis=1, keepdims=True) - means[:, -4:-8:-1]
-    padded = np.hstack([before, means, after])
-    levels = np.median(np.lib.stride_tricks.sliding_window_view(padded, 9, axis=1), axis=2)
+    before, after = (np.median(ends, axis=1)[:, None] for ends in (means[:, :3], means[:, -3:]))
+    padded = np.hstack([before.repeat(4, axis=1), means, after.repeat(4, axis=1)])
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 9, axis=1)
+    levels = np.partition(windows, 4)[..., 4]
+    lengths = np.diff(np.r_[0, starts[1:], rates.shape[1]])
+    apart = rates - levels.repeat(lengths, axis=1)
     normal = -NormalDist().inv_cdf(recording.quality.false_alarm / (2 * rates.size))
     limits = normal * np.sqrt(1 + np.pi / (18 * recording.size)) * sigma
-    edges = np.r_[0, starts[1:], rates.shape[1]]
-    far = np.abs(rates - levels.repeat(np.diff(edges), axis=1)) > limits[:, None]
-    rows = far.any(axis=0)
-    blocks = np.abs(means - levels) > recording.quality.least_change_dps + 6 * noise[:, None]
-    # a few rows move the mean of theirs
-    blocks = blocks.any(axis=0) & ~np.logical_or.reduceat(rows, edges[:-1])
-    return rows | blocks.repeat(np.diff(edges))
+    rows = (np.abs(apart) > limits[:, None]).any(axis=0)
+    apart[:, rows] = 0  # a few of them would move the mean of their block
+    shifts = np.add.reduceat(apart, np.cumsum(lengths) - lengths, axis=1) / lengths
+    blocks = np.abs(shifts) > recording.quality.least_change_dps + 6 * noise[:, None]
+    return rows | blocks.any(axis=0).repeat(lengths)

@@ -33,7 +33,7 @@ def check_bias(recording: Recording, least_dps: float = 3e-3, longest: int = 8) 
             recording.add("bias taken off", REJECTED, detail)
 
 
-def fit_drift(recording: Recording, shortest: float = 2.0) -> Array:
+def fit_drift(recording: Recording, shortest: float = 0.5) -> Array:
     """Fit decays of one sign from the first block on, and a line, by least squares: (axis, block).
 
     An axis has no drift, 0, if none of them is significant by itself, which white noise is with a
@@ -62,22 +62,21 @@ def fit_drift(recording: Recording, shortest: float = 2.0) -> Array:
 def check_rest(recording: Recording) -> None:
     """A drift too large for a bias, or a mean or a noise that changes beside the drift."""
     blocks, q, drift = recording.blocks, recording.quality, fit_drift(recording)
-    left, rise = blocks.means - drift, np.sqrt(blocks.variances) / blocks.sigma[:, None]
-    apart = np.abs(left - np.median(left, axis=1, keepdims=True))
-    changed, noisier = alarms(recording, left)
+    changed, noisier = alarms(recording, blocks.means - drift)
     if np.ptp(drift, axis=1).max() > q.largest_drift_dps:
-        axis = np.ptp(drift, axis=1).argmax()
-        detail = (
-            f"the rate drifts by {np.ptp(drift[axis]):.2g} deg/s, axis {AXES[axis]}; a bias by "
-        )
-        detail += f"at most {q.largest_drift_dps:g} (quality.largest_drift_dps)"
+        sizes = np.ptp(drift, axis=1)
+        detail = f"the rate drifts by {sizes.max():.2g} deg/s, axis {AXES[sizes.argmax()]}; a bias "
+        detail += f"by at most {q.largest_drift_dps:g} (quality.largest_drift_dps)"
     elif changed.any():
+        apart = blocks.means - drift
+        apart = np.abs(apart - np.median(apart, axis=1, keepdims=True))
         axis, rows = evidence(recording, apart / (q.least_change_dps + 6 * blocks.noise[:, None]))
         change = apart[axis].max()
         detail = f"the rate changes by up to {change:.2g} deg/s, axis {AXES[axis]}, {rows}"
         if change < 10 * q.least_change_dps:
             detail += f"; a bias by at most {q.least_change_dps:g} (quality.least_change_dps)"
     elif noisier.any():
+        rise = np.sqrt(blocks.variances) / blocks.sigma[:, None]
         axis, rows = evidence(recording, rise * noisier)
         detail = f"the noise rises up to {rise[axis].max():.2g}-fold, axis {AXES[axis]}, {rows}"
     else:

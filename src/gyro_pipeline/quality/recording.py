@@ -17,17 +17,13 @@ Mask = NDArray[np.bool_]
 
 
 class Blocks(NamedTuple):
-    """First rows, (block,); (axis, block): means, variances and mean distances about them, deg/s.
+    """Averages of blocks; medians of them, so that nearly half may be odd."""
 
-    Noise of a sample, and of a mean: of white noise, or more where neighbours differ by more. Both
-    are medians, so nearly half of the blocks may be odd.
-    """
-
-    starts: NDArray[np.integer]
-    means: Array
-    variances: Array
-    sigma: Array
-    noise: Array
+    starts: NDArray[np.integer]  # (block,), first rows
+    means: Array  # (axis, block), deg/s
+    variances: Array  # (axis, block), (deg/s)^2, of a sample about the mean
+    sigma: Array  # (axis,), deg/s, noise of a sample
+    noise: Array  # (axis,), deg/s, of a mean: of white noise, or more if neighbours differ by more
 
 
 class Recording:
@@ -56,6 +52,17 @@ class Recording:
         return np.diff(self.used, axis=1)
 
     @cached_property
+    def steps(self) -> Array:
+        """(axis,), deg/s, in which values are written; 0 where they are well below the noise."""
+        sizes = np.abs(self.changes)
+        steps = np.zeros(len(sizes))
+        # white noise repeats a tenth of its samples at a step of 0.36 sigma
+        for axis in np.flatnonzero(np.count_nonzero(sizes == 0, axis=1) > 0.1 * sizes.shape[1]):
+            # a few values that lie off the grid, as interpolated ones do, are below the quantile
+            steps[axis] = np.quantile(sizes[axis][sizes[axis] > 0], 0.01, method="lower")
+        return steps
+
+    @cached_property
     def filled(self) -> Array:
         """(axis, row), deg/s, with a straight line in place of masked rows."""
         if not self.masked.any():
@@ -82,15 +89,12 @@ class Recording:
         noise = np.maximum(noise, sigma / np.sqrt(size))
         return Blocks(np.flatnonzero(chosen) * size, means, variances, sigma, noise)
 
-    def ends(self) -> tuple[int, int]:
-        """First unmasked row, and the row after the last; 0, 0 if there is none."""
+    def trim(self) -> None:
+        """Leave out what is masked at the ends."""
         used = np.flatnonzero(~self.masked)
-        return (int(used[0]), int(used[-1]) + 1) if used.size else (0, 0)
-
-    def keep(self, start: int, stop: int) -> None:
-        """Leave out all rows but those from ``start`` to before ``stop``."""
-        self.start += start
-        self.rates, self.masked = self.rates[:, start:stop], self.masked[start:stop]
+        rows = slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0, 0)
+        self.start += rows.start
+        self.rates, self.masked = self.rates[:, rows], self.masked[rows]
         self._forget()
 
     def mask(self, check: str, rows: Mask, detail: str, outcome: str = REPAIRED) -> None:
@@ -98,11 +102,11 @@ class Recording:
         if rows.any():
             self.masked = self.masked | rows
             self._forget()
-            done = "cut" if check in {"zero rows", "start"} else "masked"
-            self.add(check, outcome, f"{detail}{self.where(rows)}, {done}")
+            done = {"zero rows": ", cut", "start": ", cut", "motion": ""}.get(check, ", masked")
+            self.add(check, outcome, f"{detail}{self.where(rows)}{done}")
 
     def _forget(self) -> None:
-        for name in ("used", "changes", "filled", "blocks"):
+        for name in ("used", "changes", "steps", "filled", "blocks"):
             self.__dict__.pop(name, None)
 
     def add(self, check: str, outcome: str, detail: str) -> None:

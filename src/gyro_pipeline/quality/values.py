@@ -24,24 +24,13 @@ def check_repeats(recording: Recording, reported: float = 0.01, most: float = 0.
     if share > most:
         detail += f", {1 / (1 - share):.3g} rows a sample; type `repeats: drop` {READER}"
         recording.add("repeated rows", REJECTED, detail)
-    elif share > reported:
+    elif share > reported + 4 * np.sqrt(chance / same.shape[1]):
         recording.add("repeated rows", KEPT, detail)
-
-
-def quantisation(recording: Recording) -> Array:
-    """(axis,), deg/s, steps in which values are written; 0 where they are well below the noise."""
-    changes = np.abs(recording.changes)
-    steps = np.zeros(len(changes))
-    # white noise repeats a tenth of its samples at a step of 0.36 sigma
-    for axis in np.flatnonzero(np.count_nonzero(changes == 0, axis=1) > 0.1 * changes.shape[1]):
-        # a few values that lie off the grid, as interpolated ones do, are below the quantile
-        steps[axis] = np.quantile(changes[axis][changes[axis] > 0], 0.01, method="lower")
-    return steps
 
 
 def check_steps(recording: Recording) -> None:
     """A quantisation step above the noise, on the coarsest axis."""
-    steps, largest = quantisation(recording) / MDPS, recording.quality.largest_step
+    steps, largest = recording.steps / MDPS, recording.quality.largest_step
     # rounding to a step adds step^2 / 12 to the variance (Sheppard)
     variances = np.median(recording.blocks.variances, axis=1) / MDPS**2 - steps**2 / 12
     noise = np.sqrt(np.maximum(variances, 0))
@@ -86,33 +75,34 @@ def check_levels(recording: Recording, least: int = 8) -> None:
                 recording.add("dead band", REJECTED, detail)
 
 
-def check_turns(recording: Recording, least: float = 0.5, period: int = 12) -> None:
+def check_turns(recording: Recording, least: float = 0.5, period: int = 60) -> None:
     """Rows of several levels, as of several devices: in turn, or in any order if far apart.
 
     In turn, changes of rows that are a ``period`` or a divisor of it apart have means of their own,
     beyond ``least`` times the noise and beyond chance.
     """
     changes = np.diff(recording.filled, axis=1)
-    turns = changes[:, : changes.shape[1] // period * period].reshape(len(changes), -1, period)
-    means, variances = turns.mean(axis=1), changes.var(axis=1)
+    count = changes.shape[1] // period
+    means = changes[:, : count * period].reshape(len(changes), count, period).mean(axis=1)
+    squares = np.einsum("as,as->a", changes, changes) / changes.shape[1]
+    within = np.maximum(squares - means.var(axis=1), 0.01 * squares) / max(1 - 1 / count, 1e-6)
     jumps = np.ptp(means, axis=1) / 2
-    noise = np.sqrt(np.maximum(variances - means.var(axis=1), 0.01 * variances) / 2)
-    jumps *= jumps > max(least, 6 / np.sqrt(turns.shape[1])) * noise
-    jumps = np.maximum(jumps, list(map(jump_apart, changes, quantisation(recording))))
+    jumps *= jumps > max(least, 6 / np.sqrt(count)) * np.sqrt(within / 2)
+    widths = np.maximum(0.4 * np.sqrt(squares), recording.steps)
+    jumps = np.maximum(jumps, list(map(jump_apart, changes, widths)))
     if jumps.any():
         detail = f"axis {AXES[jumps.argmax()]} jumps by {jumps.max():.2g} deg/s from row to row"
         device = f"several sensors in one file? Pick one by `rows: {{COLUMN: VALUE}}` {READER}"
         recording.add("mixed rows", REJECTED, f"{detail}: {device}")
 
 
-def jump_apart(changes: Array, step: float, hollow: float = 0.1, share: float = 0.02) -> float:
+def jump_apart(changes: Array, width: float, hollow: float = 0.1, share: float = 0.02) -> float:
     """How far rows jump where hardly a change, (n - 1,), is smaller but for small ones; 0: nowhere.
 
-    A bin of sizes of changes holds less than ``hollow`` of a later one, which holds a ``share`` of
-    all. Noise has no such bin, nor a vibration. No bin is narrower than the quantisation step.
+    A bin of sizes of changes, of a ``width`` that is not below a quantisation step, holds less than
+    ``hollow`` of a later one, which holds a ``share`` of all. Neither noise nor a vibration has it.
     """
-    width = max(0.3 * changes.std(), step)
-    counts = np.bincount(np.rint(np.abs(changes) / width).astype(np.intp))
+    counts = np.bincount((np.abs(changes) * (1 / width) + 0.5).astype(np.intp))
     later = np.maximum.accumulate(counts[::-1])[::-1]
     clear = np.sqrt(later) - np.sqrt(counts) > 4  # noqa: PLR2004 - they scatter by a half
     low = np.flatnonzero(clear & (counts < hollow * later) & (later > share * changes.size))
@@ -120,14 +110,14 @@ def jump_apart(changes: Array, step: float, hollow: float = 0.1, share: float = 
 
 
 def check_noise(recording: Recording, least_mdps_rts: float = 0.2) -> None:
-    """More noise of a sample, or less N, than a MEMS gyroscope has: the best have 0.33 mdps sqrt(s)."""
+    """More noise than a MEMS gyroscope has, or a smaller N: the best have 0.33 mdps sqrt(s)."""
     # of changes, not of samples: a swing is a motion, and no noise
     sigma = np.sqrt((recording.changes**2).mean(axis=1).max() / 2)
     density = recording.blocks.noise.max() * np.sqrt(recording.size / recording.rate_hz) / MDPS
     largest = recording.quality.largest_noise_dps
     if sigma > largest:
-        detail = f"{sigma:.3g} deg/s; expected at most {largest:g} of a gyroscope at rest (check "
-        recording.add("noise level", REJECTED, f"{detail} the unit; quality.largest_noise_dps)")
+        detail = f"{sigma:.3g} deg/s, expected at most {largest:g} of a gyroscope at rest; check "
+        recording.add("noise level", REJECTED, f"{detail}the unit (quality.largest_noise_dps)")
     elif density < least_mdps_rts:
         detail = f"N is {density:.2g} mdps sqrt(s), less noise than any MEMS gyroscope has; check "
-        recording.add("little noise", KEPT, f"{detail} the unit (`units` {READER})")
+        recording.add("little noise", KEPT, f"{detail}the unit (`units` {READER})")
