@@ -115,7 +115,7 @@ def beyond_noise(recording: Recording) -> Mask:
     normal = -NormalDist().inv_cdf(recording.quality.false_alarm / (2 * rates.size))
     limits = normal * np.sqrt(1 + np.pi / (18 * recording.size)) * sigma
     rows = (np.abs(apart) > limits[:, None]).any(axis=0)
-    apart[:, rows] = 0  # a few of them would move the mean of their block
+    apart[:, rows | recording.masked] = 0  # a few of them would move the mean of their block
     shifts = np.add.reduceat(apart, np.cumsum(lengths) - lengths, axis=1) / lengths
     blocks = np.abs(shifts) > recording.quality.least_change_dps + 6 * noise[:, None]
     return rows | blocks.any(axis=0).repeat(lengths)

@@ -3,8 +3,8 @@
 One rule for two series, the means and the cube roots of the variances (nearly normal: Wilson and
 Hilferty 1931): the last blocks may differ from those before by the least change that matters and
 by what chance allows. The error probability is spent over all blocks that may ever come, so the
-limits hold at any time. Beside it, the means may not scatter more than those of coloured noise. Quality
-control feeds it a file at once, a live stream block by block; NumPy is all it needs.
+limits hold at any time. Beside it, the means may not scatter more than those of coloured noise.
+Quality control feeds it a file at once, a live stream block by block; NumPy is all it needs.
 """
 
 from functools import cache
