@@ -32,7 +32,8 @@ from gyro_pipeline.conventions import AXES, InputError
 from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding, Log
 from gyro_pipeline.parameters import Quality
 from gyro_pipeline.quality import masks, motion, values
-from gyro_pipeline.quality.recording import Mask, Recording
+from gyro_pipeline.quality.recording import Recording
+from gyro_pipeline.quality.rest import Mask
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ import numpy as np
 from gyro_pipeline.conventions import AXES
 from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED
 from gyro_pipeline.parameters import LEAST_BLOCKS
-from gyro_pipeline.quality.recording import Mask, Recording, runs
+from gyro_pipeline.quality.recording import Recording, runs
+from gyro_pipeline.quality.rest import Mask
 
 
 def cut_zero_rows(recording: Recording) -> None:
@@ -96,7 +97,10 @@ def mask_bursts(recording: Recording, few: int = 3) -> None:
         if rows.any() and not recording.rejected:
             far = np.abs(recording.rates[:, rows] - level).max(axis=1)
             detail = f"up to {far.max():.3g} deg/s from the level, axis {AXES[far.argmax()]}, "
-            recording.mask(check, rows, detail, REJECTED if check == "motion" else REPAIRED)
+            if check == "motion":
+                recording.add(check, REJECTED, f"{detail}{recording.where(rows)} (quality.shock_s)")
+            else:
+                recording.mask(check, rows, detail)
 
 
 def beyond_noise(recording: Recording) -> Mask:

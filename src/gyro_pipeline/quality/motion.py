@@ -10,8 +10,8 @@ from scipy import optimize
 
 from gyro_pipeline.conventions import AXES, MDPS
 from gyro_pipeline.logs import KEPT, REJECTED
-from gyro_pipeline.quality.recording import Array, Mask, Recording
-from gyro_pipeline.quality.rest import RestDetector
+from gyro_pipeline.quality.recording import Recording
+from gyro_pipeline.quality.rest import Array, Mask, RestDetector
 
 
 def check_bias(recording: Recording, least_dps: float = 3e-3, longest: int = 8) -> None:

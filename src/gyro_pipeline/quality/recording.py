@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 
 from gyro_pipeline.logs import REJECTED, REPAIRED, Finding, Log
 from gyro_pipeline.parameters import Quality
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from gyro_pipeline.quality.rest import Array, Mask
 
 
 class Blocks(NamedTuple):
@@ -102,8 +100,8 @@ class Recording:
         if rows.any():
             self.masked = self.masked | rows
             self._forget()
-            done = {"zero rows": ", cut", "start": ", cut", "motion": ""}.get(check, ", masked")
-            self.add(check, outcome, f"{detail}{self.where(rows)}{done}")
+            done = "cut" if check in {"zero rows", "start"} else "masked"
+            self.add(check, outcome, f"{detail}{self.where(rows)}, {done}")
 
     def _forget(self) -> None:
         for name in ("used", "changes", "steps", "filled", "blocks"):

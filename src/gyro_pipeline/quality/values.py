@@ -4,7 +4,8 @@ import numpy as np
 
 from gyro_pipeline.conventions import AXES, MDPS
 from gyro_pipeline.logs import KEPT, REJECTED
-from gyro_pipeline.quality.recording import Array, Recording
+from gyro_pipeline.quality.recording import Recording
+from gyro_pipeline.quality.rest import Array
 
 READER = "in `reader:` of the catalog entry in catalog.yml"
 
