@@ -142,7 +142,7 @@ DISTURBED: dict[str, tuple[Disturb, set[str]]] = {
     "0.5 deg/s from midway, within 5 s": (slow_onset, {"motion"}),
     "0.1 deg/s from midway": (step(0.1), {"motion"}),
     "0.05 deg/s from midway": (step(0.05), {"motion"}),
-    "shock, 3 to 50 deg/s": (shock, {"motion", "shocks", "spikes"}),
+    "shock, 3 to 50 deg/s": (shock, {"motion", "shocks", "spikes", "start"}),
     "carried throughout, 2 deg/s": (carried, {"motion", "noise level"}),
     "vibration for 2 s, 4 sigma": (vibration, {"motion", "shocks"}),
     "one sample of 9 sigma": (spike, {"shocks", "spikes"}),

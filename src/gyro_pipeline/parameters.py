@@ -261,7 +261,6 @@ class Quality(Parameter):
         description="of the mean within half a minute, for motion, deg/s; the bias moves by less",
     )
     shock_s: float = Field(gt=0, description="a burst at least so long, in seconds, is a motion")
-    stuck_s: float = Field(ge=0, description="values may repeat for less than this, seconds")
     largest_step: float = Field(
         gt=0, description="quantisation step over noise, of a mean that can be trusted"
     )

@@ -4,7 +4,6 @@ One rule for two series, the means and the cube roots of the variances (nearly n
 Hilferty 1931): the last blocks may differ from those before by the least change that matters and
 by what chance allows. The error probability is spent over all blocks that may ever come, so the
 limits hold at any time. Beside it, the means may not scatter more than those of coloured noise.
-
 Quality control feeds it a file at once, a live stream block by block; NumPy is all it needs.
 """
 
@@ -15,9 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
-
-KNOWN_BLOCKS = 1e9
-"""What a stated noise is worth."""
+Mask = NDArray[np.bool_]
 
 
 class RestDetector:
@@ -37,25 +34,21 @@ class RestDetector:
 
     lags, reference = (1, 4, 16), 40  # blocks, the last ones and those before them
 
-    def __init__(  # noqa: PLR0917 - in the order of the docstring
-        self, size: int, false_alarm: float, least_dps: float, least_rise: float = 1.5,
+    def __init__(
+        self, size: int, false_alarm: float, least_dps: float, *, least_rise: float = 1.5,
         noise_dps: ArrayLike | None = None,
     ) -> None:  # fmt: skip
         self.size, self.false_alarm, self.least_dps = size, false_alarm, least_dps
         self.growth = least_rise ** (2 / 3)  # of the cube root of the variance
-        self.known = 0.0 if noise_dps is None else KNOWN_BLOCKS
-        self.known_variance = 0.0 if noise_dps is None else np.square(noise_dps)
+        self.known = 0.0 if noise_dps is None else 1e9  # blocks that a known noise is worth
+        self.known_variance = np.square(0.0 if noise_dps is None else noise_dps)
         self.blocks, self._last, self._sums = 0, np.empty((0, 0)), np.empty((0, 0))
 
-    def update(self, means: Array, variances: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def update(self, means: Array, variances: Array) -> tuple[Mask, Mask]:
         """Take the next blocks; how they are dealt to calls changes no bit.
 
-        Args:
-            means: (block, axis), deg/s, finite.
-            variances: (block, axis), (deg/s)^2, of the samples about the mean of their block.
-
-        Returns:
-            Whether the mean changes, and whether the noise rises: (block, axis).
+        All are (block, axis): the means in deg/s, finite; the variances of the samples about the
+        mean of their block; whether the mean changes; and whether the noise rises.
         """
         axes, sums = means.shape[1], self._add(means, variances)
         count = self.blocks - len(sums) + 1 + np.arange(len(sums))  # blocks up to each row
@@ -78,13 +71,13 @@ class RestDetector:
     def _add(self, means: Array, variances: Array) -> Array:
         """Sums up to each block of both series, of half their squared differences, of variances."""
         series = np.hstack([means, np.cbrt(variances)])
-        steps = np.diff(np.vstack([self._last if self.blocks else series[:1], series]), axis=0)
+        steps = np.diff(series, axis=0, prepend=self._last if self.blocks else series[:1])
         new = np.hstack([series, steps**2 / 2, variances])
         sums = self._sums if self.blocks else np.zeros((1, new.shape[1]))
         self.blocks, self._last = self.blocks + len(series), series[-1:]
         return np.vstack([sums[:-1], np.add.accumulate(np.vstack([sums[-1:], new]))])
 
-    def _limits(self, sums: Array, count: NDArray[np.integer]) -> tuple[NDArray, ...]:
+    def _limits(self, sums: Array, count: NDArray[np.integer]) -> tuple[Array, Array, Array, Mask]:
         """After each row: what chance allows one block of both series, noise, its worth, sways."""
         axes, known = sums.shape[1] // 5, self.known
         worth = np.maximum(count, 1)[:, None] + known
@@ -98,7 +91,7 @@ class RestDetector:
         shown = (sums[:, 2 * axes : 4 * axes] + known * white) / np.maximum(worth - 1, 1)
         freedom = np.maximum(worth - 1, 1e-3) * 2 / 3  # of differences between neighbours
         tests = 8 * axes * len(self.lags)  # two sides of the mean, noise, sways; two limits each
-        z = _spent(self.false_alarm / tests)[np.frexp(np.maximum(count, 1))[1] - 1][:, None]
+        z = spent_limits(self.false_alarm / tests)[np.frexp(np.maximum(count, 1))[1] - 1][:, None]
         chance = np.minimum(
             student_limits(z, freedom) * np.sqrt(np.maximum(shown, white)),
             student_limits(z, worth * (self.size - 1)) * np.sqrt(largest),
@@ -108,7 +101,7 @@ class RestDetector:
 
 
 @cache
-def _spent(probability: float) -> Array:
+def spent_limits(probability: float) -> Array:
     """Normal limits for 1, 2-3, 4-7, ... blocks, which are given 1/(1*2), 1/(2*3), ... of it."""
     epochs = [e * (e + 1) * 2 ** (e - 1) for e in range(1, 40)]
     return np.array([-NormalDist().inv_cdf(probability / blocks) for blocks in epochs])

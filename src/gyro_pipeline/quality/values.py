@@ -1,155 +1,119 @@
-"""Values that no gyroscope at rest gives, each told by a function of its own.
-
-Rates are (axis, n), deg/s, finite; sigma is the standard deviation of a sample, (axis,), deg/s. A
-check returns its finding, or none.
-"""
-
-from itertools import combinations
+"""Values that no gyroscope at rest gives, each told by a function of its own."""
 
 import numpy as np
 
 from gyro_pipeline.conventions import AXES, MDPS
-from gyro_pipeline.logs import KEPT, REJECTED, Finding
-from gyro_pipeline.quality.blocks import Array
+from gyro_pipeline.logs import KEPT, REJECTED
+from gyro_pipeline.quality.recording import Recording
+from gyro_pipeline.quality.rest import Array
 
 READER = "in `reader:` of the catalog entry in catalog.yml"
 
 
-def check_axes(rates: Array) -> list[Finding]:
-    """Two axes of the same values: one column was taken twice."""
-    for i, j in combinations(range(len(AXES)), 2):
-        if np.array_equal(rates[i], rates[j]):
-            detail = (
-                f"axes {AXES[i]} and {AXES[j]} have the same values: correct `columns` {READER}"
-            )
-            return [Finding("equal axes", REJECTED, detail)]
-    return []
-
-
-def check_repeats(rates: Array, reported: float = 0.01, most: float = 0.2) -> list[Finding]:
+def check_repeats(recording: Recording, reported: float = 0.01, most: float = 0.2) -> None:
     """A share of rows that repeat the one before, beyond what chance makes of coarse axes."""
-    same = rates[:, 1:] == rates[:, :-1]
+    same = recording.changes == 0
     shares = np.count_nonzero(same, axis=1) / same.shape[1]
     if shares.min() <= reported:
-        return []
+        return
     # an axis repeats by chance as often as where the one that repeats least does not
     rarest = int(np.argmin(shares))
-    alone = np.delete(same, rarest, axis=0)[:, ~same[rarest]]
-    chance = shares[rarest] * np.prod(alone.mean(axis=1)) if alone.size else 0.0
-    share = (np.logical_and.reduce(same).mean() - chance) / (1 - chance)
-    if share <= reported:
-        return []
+    others = np.delete(same, rarest, axis=0)[:, ~same[rarest]]
+    chance = shares[rarest] * np.prod(others.mean(axis=1))
+    share = (same.all(axis=0).mean() - chance) / (1 - chance)
     detail = f"{share:.1%} of the rows repeat the one before"
-    if share <= most:
-        return [Finding("repeated rows", KEPT, detail)]
-    detail += f": each sample is written {1 / (1 - share):.3g} times; type `repeats: drop` {READER}"
-    return [Finding("repeated rows", REJECTED, detail)]
+    if share > most:
+        detail += f", {1 / (1 - share):.3g} rows a sample; type `repeats: drop` {READER}"
+        recording.add("repeated rows", REJECTED, detail)
+    elif share > reported + 4 * np.sqrt(chance / same.shape[1]):
+        recording.add("repeated rows", KEPT, detail)
 
 
-def check_turns(rates: Array, sigma: Array, least: float = 0.5, period: int = 12) -> list[Finding]:
-    """Rows of levels in turn, ``period`` or a divisor of it, apart by ``least`` of the noise."""
-    turns = rates[:, : rates.shape[1] // period * period].reshape(len(rates), -1, period)
-    slope = (turns[:, -1].mean(axis=1) - turns[:, 0].mean(axis=1)) / rates.shape[1]
-    trend = slope[:, None] * np.arange(period)
-
-    def excess(levels: Array) -> Array:
-        about = np.sqrt(np.maximum(sigma**2 - levels.var(axis=1), 0.01 * sigma**2))
-        chance = 8 / np.sqrt(turns.shape[1])  # the range of so many means or medians, at most
-        return np.ptp(levels, axis=1) - max(least, chance) * about
-
-    if not (excess(turns.mean(axis=1) - trend) > 0).any():
-        return []
-    levels = np.median(turns, axis=1) - trend  # a shock moves no median
-    axis = int(np.argmax(excess(levels)))
-    if excess(levels)[axis] <= 0:
-        return []
-    size = np.ptp(levels[axis])
-    ranges = {p: np.ptp(levels[axis].reshape(-1, p), axis=0).max() for p in (2, 3, 4, 6, 12)}
-    every = min(p for p in ranges if ranges[p] < size / 2)
-    detail = (
-        f"every {every} rows axis {AXES[axis]} is at another level, {size:.3g} deg/s off: several "
-        f"sensors in one file? Pick one by `rows: {{COLUMN: VALUE}}` {READER}"
-    )
-    return [Finding("alternating rows", REJECTED, detail)]
-
-
-def check_zeros(rates: Array, least: int = 8) -> list[Finding]:
-    """A dead band: ``least`` exact zeros or more, far more than of any value near, none between."""
-    for axis in np.flatnonzero(np.count_nonzero(rates == 0, axis=1) >= least):
-        sizes = np.abs(rates[axis][rates[axis] != 0])
-        zeros, band = rates.shape[1] - sizes.size, sizes.min()
-        near = np.round(sizes[sizes < 1.5 * band] / band, 3)
-        counts = np.unique(near, return_counts=True)[1]
-        # a quantisation step has one level there, noise far from zero more samples
-        if counts.size > 2 and zeros > max(2 * counts.max(), near.size / 3):  # noqa: PLR2004
-            detail = (
-                f"axis {AXES[axis]} has {zeros} zeros in a dead band of ± {band:.2g} deg/s; the "
-                "mean is pulled to zero. Record without it"
-            )
-            return [Finding("dead band", REJECTED, detail)]
-    return []
-
-
-def check_tops(rates: Array, least: int = 8, times: int = 4) -> list[Finding]:
-    """A flat top: the extreme value is there ``least`` times, and twice as often as the next one.
-
-    The tail of noise thins out instead. Behind a low-pass filter a peak lasts, but comes once, not
-    ``times``. A step above 0.2 sigma hides a cut at 2 sigma, which shifts the mean by 0.008 sigma.
-    """
-    for sign, tops in ((1, rates.max(axis=1)), (-1, rates.min(axis=1))):
-        at_top = rates == tops[:, None]
-        for axis in np.flatnonzero(np.count_nonzero(at_top, axis=1) >= least):
-            count, below = np.count_nonzero(at_top[axis]), sign * rates[axis][~at_top[axis]]
-            if not below.size or below.min() == below.max():
-                continue  # of two values alone, the step is too coarse to speak of tails
-            came = np.count_nonzero(at_top[axis][1:] & ~at_top[axis][:-1])
-            if count >= 2 * np.count_nonzero(below == below.max()) and came >= times:
-                detail = f"axis {AXES[axis]} is cut off at {tops[axis]:.4g} deg/s, {count} times"
-                return [Finding("saturation", REJECTED, f"{detail}; the mean is pulled from there")]
-    return []
-
-
-def check_steps(rates: Array, sigma: Array, largest: float, reported: float = 1.0) -> list[Finding]:
-    """The coarsest axis, if its quantisation step is above ``reported`` times the noise."""
-    steps, changes = np.zeros(len(rates)), np.abs(np.diff(rates, axis=1))
-    # white noise repeats a tenth of its samples at a step of 0.36 sigma
-    for axis in np.flatnonzero(np.count_nonzero(changes == 0, axis=1) > 0.1 * changes.shape[1]):
-        # a few values that lie off the grid, as interpolated ones do, are below the quantile
-        steps[axis] = np.quantile(changes[axis][changes[axis] > 0], 0.01, method="lower")
+def check_steps(recording: Recording) -> None:
+    """A quantisation step above the noise, on the coarsest axis."""
+    steps, largest = recording.steps / MDPS, recording.quality.largest_step
     # rounding to a step adds step^2 / 12 to the variance (Sheppard)
-    noise = np.sqrt(np.maximum(sigma**2 - steps**2 / 12, 0))
+    variances = np.median(recording.blocks.variances, axis=1) / MDPS**2 - steps**2 / 12
+    noise = np.sqrt(np.maximum(variances, 0))
     axis = np.argmax(steps - largest * noise)
-    if steps[axis] <= noise[axis]:
-        return []
-    detail = (
-        f"axis {AXES[axis]} has a step of {steps[axis] / MDPS:.4g} mdps beside a noise of "
-        f"{noise[axis] / MDPS:.4g} mdps; a mean can be trusted up to {largest:g} times the noise "
-        "(quality.largest_step)"
-    )
-    outcome = KEPT if steps[axis] <= largest * noise[axis] else REJECTED
-    return [Finding("coarse quantisation", outcome, detail)]
-
-
-def check_noise(
-    rates: Array, density: Array, largest_dps: float, least_mdps_rts: float = 0.2
-) -> list[Finding]:
-    """More noise of a sample, or less N, than a MEMS gyroscope has; the best have 0.02 deg/sqrt(h).
-
-    ``density`` is N, (axis,), in deg/s sqrt(s); 0.02 deg/sqrt(h) are 0.33 mdps sqrt(s).
-    """
-    steps = np.diff(rates, axis=1)  # not the samples: a swing is a motion, and no noise
-    sigma = np.sqrt(np.einsum("as,as->a", steps, steps) / (2 * steps.shape[1]))
-    axis = int(np.argmax(sigma))
-    if sigma[axis] > largest_dps:
+    if steps[axis] > noise[axis]:
         detail = (
-            f"axis {AXES[axis]} has a noise of {sigma[axis]:.3g} deg/s; expected at most "
-            f"{largest_dps:g} of a gyroscope at rest (check the unit; quality.largest_noise_dps)"
+            f"axis {AXES[axis]} has a step of {steps[axis]:.4g} mdps and a noise of "
+            f"{noise[axis]:.4g} mdps; a mean can be trusted up to {largest:g} times the noise "
+            "(quality.largest_step)"
         )
-        return [Finding("noise level", REJECTED, detail)]
-    if density.max() >= least_mdps_rts * MDPS:
-        return []
-    detail = (
-        f"N is {density.max() / MDPS:.2g} mdps sqrt(s), less noise than any MEMS gyroscope has; "
-        f"check the unit (`units` {READER})"
-    )
-    return [Finding("little noise", KEPT, detail)]
+        outcome = KEPT if steps[axis] <= largest * noise[axis] else REJECTED
+        recording.add("coarse quantisation", outcome, detail)
+
+
+def check_levels(recording: Recording, least: int = 8) -> None:
+    """A value that comes ``least`` times and twice as often as the next: a flat top, a dead band.
+
+    The tail of noise thins out, and behind a low-pass filter a peak lasts, but comes once. A step
+    above 0.2 sigma hides a top at 2 sigma, which shifts the mean by 0.008 sigma. A dead band is a
+    gap on both sides of zero, five times as wide as others.
+    """
+    for name, rates in zip(AXES, recording.used, strict=True):
+        if max(np.count_nonzero(rates == value) for value in (rates.min(), rates.max(), 0)) < least:
+            continue
+        values, counts = np.unique(rates[1:][np.diff(rates) != 0], return_counts=True)
+        gaps, zero = np.diff(values), np.searchsorted(values, 0)
+        if gaps.size < 2:  # noqa: PLR2004 - of two values alone, nothing is a tail
+            continue
+        for end, following in ((0, 1), (-1, -2)):
+            if counts[end] >= max(least, 2 * counts[following]):
+                detail = f"axis {name} is cut off at {values[end]:.4g} deg/s, {counts[end]} times"
+                recording.add("saturation", REJECTED, f"{detail}; the mean is pulled from there")
+        if 0 < zero < gaps.size and values[zero] == 0 and counts[zero] >= least:
+            band = gaps[zero - 1 : zero + 1].min()
+            if band > 5 * np.median(gaps):
+                detail = f"± {band:.2g} deg/s on axis {name}; the mean is pulled to zero"
+                recording.add("dead band", REJECTED, detail)
+
+
+def check_turns(recording: Recording, least: float = 0.5, period: int = 60) -> None:
+    """Rows of several levels, as of several devices: in turn, or in any order if far apart.
+
+    In turn, changes of rows that are a ``period`` or a divisor of it apart have means of their own,
+    beyond ``least`` times the noise and beyond chance.
+    """
+    changes = np.diff(recording.filled, axis=1)
+    count = changes.shape[1] // period
+    means = changes[:, : count * period].reshape(len(changes), count, period).mean(axis=1)
+    squares = np.einsum("as,as->a", changes, changes) / changes.shape[1]
+    within = np.maximum(squares - means.var(axis=1), 0.01 * squares) / max(1 - 1 / count, 1e-6)
+    jumps = np.ptp(means, axis=1) / 2
+    jumps *= jumps > max(least, 6 / np.sqrt(count)) * np.sqrt(within / 2)
+    widths = np.maximum(0.4 * np.sqrt(squares), recording.steps)
+    jumps = np.maximum(jumps, list(map(jump_apart, changes, widths)))
+    if jumps.any():
+        detail = f"axis {AXES[jumps.argmax()]} jumps by {jumps.max():.2g} deg/s from row to row"
+        device = f"several sensors in one file? Pick one by `rows: {{COLUMN: VALUE}}` {READER}"
+        recording.add("mixed rows", REJECTED, f"{detail}: {device}")
+
+
+def jump_apart(changes: Array, width: float, hollow: float = 0.1, share: float = 0.02) -> float:
+    """How far rows jump where hardly a change, (n - 1,), is smaller but for small ones; 0: nowhere.
+
+    A bin of sizes of changes, of a ``width`` that is not below a quantisation step, holds less than
+    ``hollow`` of a later one, which holds a ``share`` of all. Neither noise nor a vibration has it.
+    """
+    counts = np.bincount((np.abs(changes) * (1 / width) + 0.5).astype(np.intp))
+    later = np.maximum.accumulate(counts[::-1])[::-1]
+    clear = np.sqrt(later) - np.sqrt(counts) > 4  # noqa: PLR2004 - they scatter by a half
+    low = np.flatnonzero(clear & (counts < hollow * later) & (later > share * changes.size))
+    return width * (low[-1] + np.argmax(counts[low[-1] :])) if low.size else 0.0
+
+
+def check_noise(recording: Recording, least_mdps_rts: float = 0.2) -> None:
+    """More noise than a MEMS gyroscope has, or a smaller N: the best have 0.33 mdps sqrt(s)."""
+    # of changes, not of samples: a swing is a motion, and no noise
+    sigma = np.sqrt((recording.changes**2).mean(axis=1).max() / 2)
+    density = recording.blocks.noise.max() * np.sqrt(recording.size / recording.rate_hz) / MDPS
+    largest = recording.quality.largest_noise_dps
+    if sigma > largest:
+        detail = f"{sigma:.3g} deg/s, expected at most {largest:g} of a gyroscope at rest; check "
+        recording.add("noise level", REJECTED, f"{detail}the unit (quality.largest_noise_dps)")
+    elif density < least_mdps_rts:
+        detail = f"N is {density:.2g} mdps sqrt(s), less noise than any MEMS gyroscope has; check "
+        recording.add("little noise", KEPT, f"{detail}the unit (`units` {READER})")

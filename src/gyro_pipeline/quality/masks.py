@@ -1,0 +1,125 @@
+"""Rows that hold no measurement are masked, and the others must be long enough."""
+
+from statistics import NormalDist
+
+import numpy as np
+
+from gyro_pipeline.conventions import AXES
+from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED
+from gyro_pipeline.parameters import LEAST_BLOCKS
+from gyro_pipeline.quality.recording import Recording, runs
+from gyro_pipeline.quality.rest import Mask
+
+
+def cut_zero_rows(recording: Recording) -> None:
+    """Rows of zeros at the ends, which loggers write before the first sample."""
+    zeros, all_so_far = ~np.any(recording.rates, axis=0), np.logical_and.accumulate
+    zeros = all_so_far(zeros) | all_so_far(zeros[::-1])[::-1]
+    recording.mask("zero rows", zeros, "", KEPT)
+
+
+def mask_non_finite(recording: Recording, largest: float = 1e12) -> None:
+    """No numbers, and garbage bytes read as a number whose square may overflow."""
+    _mask_samples(recording, "non-finite values", ~(np.abs(recording.rates) < largest))
+
+
+def mask_stuck(recording: Recording, least_s: float = 0.1) -> None:
+    """Runs of equal values of an axis, for ``least_s`` and longer than chance allows.
+
+    Where a sample equals the one before with probability p, n samples hold a run of more than k
+    with a probability of at most n p^k. p is the axis's own, from its samples outside the longest
+    run, so a coarse quantisation allows longer runs.
+    """
+    rates, held = recording.rates, np.zeros(recording.rates.shape, bool)
+    least = max(round(least_s * recording.rate_hz), 2)
+    same = rates[:, 1:] == rates[:, :-1]
+    for axis in np.flatnonzero(np.count_nonzero(same, axis=1) + 1 >= least):
+        lengths = np.diff(np.flatnonzero(np.concatenate([[True], ~same[axis], [True]])))
+        others = lengths.sum() - lengths.max()
+        p = (others - lengths.size + 2) / (others + 2)  # Laplace's: never 0 or 1
+        chance = np.ceil(np.log(recording.quality.false_alarm / rates.shape[1]) / np.log(p))
+        held[axis] = np.repeat(lengths > max(least - 1, chance), lengths)
+    _mask_samples(recording, "stuck values", held)
+
+
+def _mask_samples(recording: Recording, check: str, samples: Mask) -> None:
+    """Mask rows that have a sample, (axis, n), of no measurement, and were not masked before."""
+    rows = samples.any(axis=0) & ~recording.masked
+    axes = ", ".join(np.array(AXES)[samples[:, rows].any(axis=1)])
+    recording.mask(check, rows, f"{'axes' if ',' in axes else 'axis'} {axes}, ")
+
+
+def keep_longest_stretch(recording: Recording) -> None:
+    """Keep the rows between two gaps of which most can be used."""
+    edges = np.unique([0, *recording.log.gap_rows, recording.masked.size]).astype(np.intp)
+    used = np.add.reduceat(~recording.masked, edges[:-1], dtype=np.intp)
+    start, stop = edges[used.argmax() :][:2] if used.size else (0, 0)
+    recording.masked[:start] = recording.masked[stop:] = True
+    if used.size > 1:
+        detail = f"rows {start} to {stop - 1}, of {edges[-1]}, are the longest stretch"
+        recording.add("gaps", REPAIRED, detail)
+    recording.trim()
+
+
+def require_length(recording: Recording) -> None:
+    """Reject where too few rows, or too small a share of the stretch, can be used."""
+    used, q, rate_hz = int((~recording.masked).sum()), recording.quality, recording.rate_hz
+    least = max(q.least_s * rate_hz, LEAST_BLOCKS * recording.size)
+    enough = used >= max(least, q.least_share * recording.masked.size)
+    if not enough or recording.blocks.starts.size < LEAST_BLOCKS:
+        detail = (
+            f"{used} of {len(recording.log.samples)} rows can be used, {used / rate_hz:.4g} s; "
+            f"expected at least {least / rate_hz:.4g} s (quality.least_s) and {q.least_share:.0%} "
+            "of the rows between two gaps (quality.least_share)"
+        )
+        recording.add("too short", REJECTED, detail)
+
+
+def mask_bursts(recording: Recording, few: int = 3) -> None:
+    """Mask spikes, fewer than ``few`` rows, and shocks, with a block about where they may ring.
+
+    A shock of the first rows is a start. What lasts longer than a shock may is a motion.
+    """
+    spikes, shocks, start, motion = np.zeros((4, recording.masked.size), bool)
+    for first, last in runs(beyond_noise(recording)):
+        if last - first < few:
+            spikes[first:last] = True
+        else:
+            shocks[max(first - recording.size, 0) : last + recording.size] = True
+    longest = recording.quality.shock_s * recording.rate_hz + 2 * recording.size
+    for first, last in runs(shocks):
+        kind = motion if last - first >= longest else shocks if first else start
+        shocks[first:last], kind[first:last] = False, True
+    level = np.median(recording.blocks.means, axis=1, keepdims=True)
+    kinds = {"motion": motion, "start": start, "shocks": shocks, "spikes": spikes}
+    for check, chosen in kinds.items():
+        rows = chosen & ~recording.masked
+        if rows.any() and not recording.rejected:
+            far = np.abs(recording.rates[:, rows] - level).max(axis=1)
+            detail = f"up to {far.max():.3g} deg/s from the level, axis {AXES[far.argmax()]}, "
+            if check == "motion":
+                recording.add(check, REJECTED, f"{detail}{recording.where(rows)} (quality.shock_s)")
+            else:
+                recording.mask(check, rows, detail)
+
+
+def beyond_noise(recording: Recording) -> Mask:
+    """Rows farther from the level about them than noise explains, and blocks whose mean is.
+
+    The level is the median of the means of nine blocks, so that a movement does not hide itself.
+    White noise has any row with a probability of ``false_alarm``, however many there are.
+    """
+    rates, (starts, means, _, sigma, noise) = recording.filled, recording.blocks
+    before, after = (np.median(ends, axis=1)[:, None] for ends in (means[:, :3], means[:, -3:]))
+    padded = np.hstack([before.repeat(4, axis=1), means, after.repeat(4, axis=1)])
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 9, axis=1)
+    levels = np.partition(windows, 4)[..., 4]
+    lengths = np.diff(np.r_[0, starts[1:], rates.shape[1]])
+    apart = rates - levels.repeat(lengths, axis=1)
+    normal = -NormalDist().inv_cdf(recording.quality.false_alarm / (2 * rates.size))
+    limits = normal * np.sqrt(1 + np.pi / (18 * recording.size)) * sigma
+    rows = (np.abs(apart) > limits[:, None]).any(axis=0)
+    apart[:, rows | recording.masked] = 0  # a few of them would move the mean of their block
+    shifts = np.add.reduceat(apart, np.cumsum(lengths) - lengths, axis=1) / lengths
+    blocks = np.abs(shifts) > recording.quality.least_change_dps + 6 * noise[:, None]
+    return rows | blocks.any(axis=0).repeat(lengths)
