@@ -343,6 +343,7 @@ def test_kind_39_several_samples_a_row(path: Path) -> None:
     header = ",".join(["dt", "scale", "samples", *names])
     text(path, header, np.full(800, 8e4), np.full(800, 1.0), np.full(800, 8), values)
     refused(ending(path, units="deg/s"), "row")
+    refused(ending(path, units="deg/s", columns=["x[0]", "y[0]", "z[0]"]), "8 samples")
 
 
 def test_kind_40_two_sensors_side_by_side(path: Path) -> None:

@@ -13,7 +13,7 @@ from gyro_pipeline.conventions import AXES, InputError
 from gyro_pipeline.parameters import Column
 from gyro_pipeline.readers.file import File
 from gyro_pipeline.readers.formats import find_all
-from gyro_pipeline.readers.names import ATTITUDE, RATE, Header, triples
+from gyro_pipeline.readers.names import ATTITUDE, INDEX, RATE, Header, triples
 from gyro_pipeline.readers.scales import RATE_UNITS
 
 Columns = Sequence[int]
@@ -65,6 +65,13 @@ def _by_options(file: File, columns: Sequence[Column]) -> Columns:
         file.contradictions.append(
             f"columns of the options are {file.listed(rates)}, but by their names "
             f"{file.listed((same or others)[0])} belong {together}; give these, or no columns"
+        )
+    arrays = [INDEX.sub("", header.name) for header in file.headers]
+    samples = min(arrays.count(arrays[number]) for number in rates)
+    if samples > 1 and len({arrays[number] for number in rates}) == len(AXES):
+        file.contradictions.append(
+            f"a row holds {samples} samples, {file.listed(rates)} and so on, of which the options "
+            "name one; write a row for each sample"
         )
     strange = [n for n in rates if not _may_be_rate(file, file.headers[n])]
     if strange:

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import trim_mean
 
 from gyro_pipeline.conventions import AXES
 from gyro_pipeline.readers.file import File
@@ -92,18 +91,17 @@ def lost_decimal_points(values: Floats, digits: tuple[int, int] = (6, 9), most: 
     )
 
 
-def implausible_level(rates: Floats, most_dps: float = 100.0, trimmed: float = 0.1) -> str:
-    """A mean that no MEMS gyroscope at rest has; of rates in deg/s."""
-    if (np.abs(rates) > most_dps).mean() < trimmed / 3:  # most recordings, at a glance
+def implausible_level(rates: Floats, most_dps: float = 100.0) -> str:
+    """A level that no MEMS gyroscope at rest has; of rates in deg/s."""
+    if (np.abs(rates) > most_dps).mean() < 1 / 6:  # most recordings, at a glance
         return ""
-    rates = _finite(rates)
-    means = trim_mean(rates, trimmed, axis=0) if len(rates) else np.zeros(1)
-    axis = int(np.abs(means).argmax())
-    if abs(means[axis]) <= most_dps:
+    levels = np.median(_finite(rates), axis=0)
+    axis = int(np.abs(levels).argmax())
+    if not abs(levels[axis]) > most_dps:
         return ""
     return (
-        f"a mean of {means[axis]:.4g} deg/s about {AXES[axis]}, and no MEMS gyroscope at rest has "
-        f"more than {most_dps:g}; check units and scale_dps, or give offset, the count at rest"
+        f"a level of {levels[axis]:.4g} deg/s about {AXES[axis]}, and no MEMS gyroscope at rest "
+        f"has more than {most_dps:g}; check units and scale_dps, or give offset, the count at rest"
     )
 
 

@@ -27,7 +27,7 @@ _AXIS_WORDS = [
 ]
 _BRACKETS = re.compile(r"\s*[(\[]((?:[^()\[\]]|[(\[][^()\[\]]*[)\]])*)[)\]]")
 _BEHIND_UNIT = re.compile(r"(?i)[\W_]*([xyz]|[xyz][\W_]?axis|cal|raw|since .*)?[\W_]*")
-_INDEX = re.compile(r"[\[.](\d+)\]?$")
+INDEX = re.compile(r"[\[.](\d+)\]?$")
 _CLOCK_UNITS_S = (1.0, 1e-3, 1e-6, 1e-9, 60.0, 3600.0)
 _LONGEST = 200  # characters of a name that is looked into
 
@@ -104,7 +104,7 @@ def _in_brackets(text: str, match: re.Match[str]) -> Header:
 def _stands_without_brackets(unit: Unit, text: str, alone: bool) -> bool:
     """Whether it is a unit rather than a word that pint knows, such as ``a``, ``fs``, ``cal``."""
     if unit.quantity == "time":
-        return unit.factor in _CLOCK_UNITS_S and (len(text) > 1 or text == "s")
+        return unit.factor in _CLOCK_UNITS_S and (len(text) > 1 or text in "sS")
     if unit.quantity == "temperature":
         return len(text) > 1
     return unit.quantity == "rate" or (not alone and unit.quantity != "other")
@@ -133,6 +133,6 @@ def _axes_in(name: str) -> Iterator[tuple[str, str]]:
     for kind, words in enumerate(_AXIS_WORDS):
         for match in re.finditer("|".join(words), name.lower()):
             yield f"{name[: match.start()]}*{kind}{name[match.end() :]}", words[match[0]]
-    if index := _INDEX.search(name):
+    if index := INDEX.search(name):
         number = int(index[1])
         yield f"{name[: index.start()]}[*]", AXES[number] if number < len(AXES) else index[1]

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy import special
 from scipy.ndimage import uniform_filter1d
-from scipy.stats import t as student
 
 from gyro_pipeline.conventions import AXES
 from gyro_pipeline.readers.file import File
@@ -169,7 +169,7 @@ def _change(rates: Floats, codes: Codes, least: float = 0.3, chance: float = 1e-
         for code in np.flatnonzero(np.bincount(runs) > 2):  # noqa: PLR2004
             some = apart[runs == code]
             sizes, errors = np.abs(some.mean(axis=0)), some.std(axis=0) / np.sqrt(len(some))
-            limits = student.isf(chance / 2, len(some) - 1) * errors
+            limits = -special.stdtrit(len(some) - 1, chance / 2) * errors
             excess = sizes - np.maximum(limits, least * noise.mean(axis=0))
             if excess.max() > 0:
                 size = f"{AXES[excess.argmax()]} changes by {sizes[excess.argmax()]:.3g} deg/s"
