@@ -30,7 +30,7 @@ SENSORS = {
     name: Sensor(**entry)
     for name, entry in yaml.safe_load((CONF / "globals.yml").read_text())["sensors"].items()
 }
-FLICKER = 3 * MDPS
+FLICKER, SAMPLES = 3 * MDPS, 13_000
 
 Samples = NDArray[np.float64]
 Disturb = Callable[[np.random.Generator, Samples, float], None]
@@ -40,25 +40,23 @@ def at_rest(
     generator: np.random.Generator,
     sensor: Sensor,
     flicker_dps: float = 0.0,
-    lag1: float | None = None,
     warm_up_mdps: float = 0.0,
     warm_up_s: float = 30.0,
-    samples: int = 13_000,
 ) -> Samples:
     """One recording at rest, (n, 3), deg/s."""
     simulated, rate_hz = sensor.simulated, sensor.rate_hz
     rates = simulate_noise(
         generator,
-        (len(AXES), samples),
+        (len(AXES), SAMPLES),
         rate_hz,
         np.array(simulated.noise_mdps_rts) * MDPS,
-        simulated.lag1_correlation if lag1 is None else lag1,
+        simulated.lag1_correlation,
         flicker_dps,
     ).T.astype(np.float64)
     if warm_up_mdps:
         signs = generator.choice([-1, 1], len(AXES))
         amplitudes = signs * warm_up_mdps * MDPS * generator.normal(1, 0.25, len(AXES))
-        rates += warm_up(amplitudes, warm_up_s, samples, rate_hz).T
+        rates += warm_up(amplitudes, warm_up_s, SAMPLES, rate_hz).T
     return rates + generator.uniform(-1, 1, len(AXES)) * simulated.unit_bias_dps
 
 
@@ -72,14 +70,8 @@ def turn(generator: np.random.Generator, rates: Samples, rate_hz: float) -> None
     )
 
 
-def rotation(generator: np.random.Generator, rates: Samples, rate_hz: float) -> None:
-    """0.5 deg/s about some axis, from between a tenth and nine tenths of the recording on."""
-    start = int(generator.uniform(0.1, 0.9) * rates.shape[0])
-    rates[start:, generator.integers(3)] += generator.choice([-1, 1]) * 0.5
-
-
 def slow_onset(generator: np.random.Generator, rates: Samples, rate_hz: float) -> None:
-    """The same, but reached within 5 s."""
+    """0.5 deg/s about some axis, reached within 5 s."""
     start = int(generator.uniform(0.1, 0.9) * rates.shape[0])
     ramp = np.clip((np.arange(rates.shape[0]) - start) / (5 * rate_hz), 0, 1)
     rates[:, generator.integers(3)] += generator.choice([-1, 1]) * 0.5 * ramp
@@ -138,7 +130,7 @@ def sway(amplitude_dps: float, period_s: float) -> Disturb:
 
 DISTURBED: dict[str, tuple[Disturb, set[str]]] = {
     "2 s turn, 5 to 60 deg/s": (turn, {"motion"}),
-    "0.5 deg/s from midway": (rotation, {"motion"}),
+    "0.5 deg/s from midway": (step(0.5), {"motion"}),
     "0.5 deg/s from midway, within 5 s": (slow_onset, {"motion"}),
     "0.1 deg/s from midway": (step(0.1), {"motion"}),
     "0.05 deg/s from midway": (step(0.05), {"motion"}),

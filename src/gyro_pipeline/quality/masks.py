@@ -8,7 +8,7 @@ from gyro_pipeline.conventions import AXES
 from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED
 from gyro_pipeline.parameters import LEAST_BLOCKS
 from gyro_pipeline.quality.recording import Recording, runs
-from gyro_pipeline.quality.rest import Mask
+from gyro_pipeline.quality.rest import Array, Mask
 
 
 def cut_zero_rows(recording: Recording) -> None:
@@ -104,22 +104,28 @@ def mask_bursts(recording: Recording, few: int = 3) -> None:
 
 
 def beyond_noise(recording: Recording) -> Mask:
-    """Rows farther from the level about them than noise explains, and blocks whose mean is.
+    """Rows farther from the level about them than noise explains, and blocks whose other rows are.
 
-    The level is the median of the means of nine blocks, so that a movement does not hide itself.
     White noise has any row with a probability of ``false_alarm``, however many there are.
     """
     rates, (starts, means, _, sigma, noise) = recording.filled, recording.blocks
-    before, after = (np.median(ends, axis=1)[:, None] for ends in (means[:, :3], means[:, -3:]))
-    padded = np.hstack([before.repeat(4, axis=1), means, after.repeat(4, axis=1)])
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 9, axis=1)
-    levels = np.partition(windows, 4)[..., 4]
     lengths = np.diff(np.r_[0, starts[1:], rates.shape[1]])
-    apart = rates - levels.repeat(lengths, axis=1)
+    apart = rates - local_levels(means).repeat(lengths, axis=1)
     normal = -NormalDist().inv_cdf(recording.quality.false_alarm / (2 * rates.size))
     limits = normal * np.sqrt(1 + np.pi / (18 * recording.size)) * sigma
     rows = (np.abs(apart) > limits[:, None]).any(axis=0)
-    apart[:, rows | recording.masked] = 0  # a few of them would move the mean of their block
-    shifts = np.add.reduceat(apart, np.cumsum(lengths) - lengths, axis=1) / lengths
-    blocks = np.abs(shifts) > recording.quality.least_change_dps + 6 * noise[:, None]
+    others, edges = ~(rows | recording.masked), np.cumsum(lengths) - lengths
+    counts = np.maximum(np.add.reduceat(others, edges, dtype=np.intp), 1)
+    shifts = np.abs(np.add.reduceat(apart * others, edges, axis=1) / counts)
+    blocks = shifts > recording.quality.least_change_dps + 6 * noise[:, None]
     return rows | blocks.any(axis=0).repeat(lengths)
+
+
+def local_levels(means: Array) -> Array:
+    """Medians of nine block means, (axis, block), so that a movement does not hide itself."""
+    # a slope goes on beyond the ends, whatever two of the first or of the last blocks hold
+    before = 2 * np.median(means[:, :5], axis=1, keepdims=True) - means[:, 8:4:-1]
+    after = 2 * np.median(means[:, -5:], axis=1, keepdims=True) - means[:, -6:-10:-1]
+    padded = np.hstack([before, means, after])
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 9, axis=1)
+    return np.partition(windows, 4)[..., 4]
