@@ -78,10 +78,11 @@ def check_turns(recording: Recording, least: float = 0.5, period: int = 60) -> N
     beyond ``least`` times the noise and beyond chance.
     """
     changes = np.diff(recording.filled, axis=1)
+    period = period if changes.shape[1] > 10 * period else period // 5
     count = changes.shape[1] // period
     means = changes[:, : count * period].reshape(len(changes), count, period).mean(axis=1)
     squares = np.einsum("as,as->a", changes, changes) / changes.shape[1]
-    within = np.maximum(squares - means.var(axis=1), 0.01 * squares) / max(1 - 1 / count, 1e-6)
+    within = np.maximum(squares - means.var(axis=1), 0.01 * squares) / (1 - 1 / count)
     jumps = np.ptp(means, axis=1) / 2
     jumps *= jumps > max(least, 6 / np.sqrt(count)) * np.sqrt(within / 2)
     widths = np.maximum(0.4 * np.sqrt(squares), recording.steps)
