@@ -12,7 +12,6 @@ X = np.random.default_rng(0).normal((0.7, -0.4, 0.15), 0.05, (6000, 3))
 N = len(X)
 S = np.arange(N) / 100
 RATES = "gx (deg/s),gy (deg/s),gz (deg/s)"
-CLOCK = [f"10:{k // 6000:02d}:{k // 100 % 60:02d}.{k % 100:02d}" for k in range(N)]
 STEPS = np.random.default_rng(0).normal(10, 0.5, N)
 STEPS *= 10 / STEPS[1:].mean()
 
@@ -27,12 +26,9 @@ STEPS *= 10 / STEPS[1:].mean()
         ("Zeit (s)", [S], {}),
         ("T (degC),t [s]", [S * 0 + 25, S], {}),
         ("delta_time (s),time (s)", [STEPS / 1e3, S], {}),
-        ("time,seconds_elapsed", [1.7e18 + S * 1e9, S], {}),
         ("time,seconds_elapsed", [1.7e18 + S * 1e9, S], {"time_units": "ns"}),
-        ("when", [CLOCK], {}),
         ("stamp", [pd.Timestamp("2024-03-01").to_datetime64() + (S * 1e9).astype("m8[ns]")], {}),
         ("k", [S], {"time_column": "k", "time_units": "s"}),
-        ("dt (ms)", [STEPS], {"time_is": "steps"}),
         ("k,t (s)", [STEPS, S], {"time_is": "steps", "time_column": "k", "time_units": "ms"}),
     ],
 )
