@@ -111,11 +111,6 @@ def test_an_order_that_the_shape_contradicts_is_refused(tmp_path, shape, order, 
     assert message.endswith(f"recordings or gyroscopes: {shown}")
 
 
-def test_axes_order_reads_shapes_that_do_not_look_like_logs(tmp_path):
-    np.save(tmp_path / "all.npy", made(50, 3, 60))
-    assert rates(array_logs(tmp_path, axes_order=LAYOUT)).shape == (1, 50, 3, 60)
-
-
 @pytest.mark.parametrize(
     ("shape", "dtype"),
     [
