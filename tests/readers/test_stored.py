@@ -13,7 +13,7 @@ import pytest
 import scipy.io
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.readers import mat5, vehicles
+from gyro_pipeline.readers import mat5
 
 T = np.arange(60) / 100
 
@@ -161,13 +161,3 @@ def test_a_workspace_of_matlab_is_not_shown(monkeypatch, table):
     monkeypatch.setattr(mat5, "check", lambda data: None)
     with pytest.raises(InputError, match=r"got float64 \(1,\) a;"):
         table(lambda path: path.write_bytes(b"MATLAB 5.0 MAT-file"))
-
-
-@pytest.mark.parametrize(
-    "magic", [b"ULog\x01\x12\x35", b"#ROSBAG V2.0\n", b"\x89MCAP0", b"SQLite format 3", b"\xa3\x95"]
-)
-def test_logs_of_vehicles_are_read_elsewhere(magic, monkeypatch, table):
-    monkeypatch.setattr(vehicles, "read", lambda path, options: path.name)
-    assert table(magic + bytes(100)) == "log.csv"
-    folder = lambda path: (path.mkdir(), (path / "metadata.yaml").touch())  # noqa: E731
-    assert table(folder, name="bag") == "bag"

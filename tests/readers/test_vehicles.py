@@ -9,6 +9,7 @@ import pytest
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.parameters import ReaderOptions
 from gyro_pipeline.readers import vehicles
+from gyro_pipeline.readers.table import read_table
 
 N = 50
 RATES = np.random.default_rng(3).normal([0.01, -0.02, 0.03], 1e-3, (N, 3)).astype(np.float32)
@@ -96,7 +97,7 @@ def bag(path, topics, version):
 
 
 def read(path, **options):
-    table = vehicles.read(path, ReaderOptions(**options))
+    table = read_table(path, ReaderOptions(**options))
     columns = dict(zip(table.names, table.columns, strict=True))
     return table, columns, np.stack([columns[name] for name in NAMES]).T
 
@@ -175,7 +176,7 @@ def test_damaged_logs_end_in_a_refusal_or_a_table(tmp_path, kind, seed, capfd):
         data[at] = draws.integers(256)
     path.write_bytes(data)
     try:
-        read(path)
+        vehicles.read(path, ReaderOptions())
     except InputError as error:
         assert str(path) in str(error)
     assert capfd.readouterr() == ("", "")
