@@ -108,7 +108,7 @@ def test_of_sensors_side_by_side_names_of_two_are_not_mixed(read):
 
 
 @pytest.mark.parametrize("name", ["calibrated_gyro_# (dps)", "uncalibrated_gyro_# (dps)"])
-def test_rates_that_are_free_of_their_bias_are_details(name, read):
+def test_rates_that_are_free_of_their_bias_are_said(name, read):
     assert ("left of a bias" in str(read(axes(name), S, X).findings)) == name.startswith("cal")
 
 
