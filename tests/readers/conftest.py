@@ -1,10 +1,11 @@
-"""Small good files as three loggers write them, and a reader of whatever can be written."""
+"""Files of three loggers, and readers of files and tables that tests write."""
 
 import numpy as np
 import pytest
 
 from gyro_pipeline.parameters import ReaderOptions
-from gyro_pipeline.readers.table import read_table
+from gyro_pipeline.readers import log_of
+from gyro_pipeline.readers.table import Table, read_table
 
 
 @pytest.fixture(scope="session")
@@ -51,3 +52,24 @@ def table(tmp_path):
         return read_table(path, ReaderOptions(**options))
 
     return table
+
+
+@pytest.fixture(scope="session")
+def read():
+    """Read a recording from a header between commas and columns: vectors, matrices, lists."""
+
+    def read(header, *columns, preamble="", rate_hz=None, imu=None, **options):
+        arrays = [np.array(c, object) if isinstance(c, list) else np.asarray(c) for c in columns]
+        split = [vector for array in arrays for vector in (array.T if array.ndim > 1 else [array])]
+        typed = tuple(c if c.dtype.kind in "OmM" else c.astype(float) for c in split)
+        table = Table("log.csv", tuple(header.split(",")), typed, preamble)
+        assert len(table.names) == len(typed)
+        return log_of(table, ReaderOptions(**options), rate_hz, imu)
+
+    return read
+
+
+@pytest.fixture(scope="session")
+def details():
+    """Details of the findings of a check."""
+    return lambda log, check: [f.detail for f in log.findings if f.check == check]

@@ -98,12 +98,28 @@ def test_lost_samples_are_gaps_and_do_not_change_the_rate(lost, clock):
     assert f"samples are missing, about {len(lost)}: " in gaps.detail
 
 
-def test_a_hole_in_bursts_is_a_gap():
-    stamps = np.ceil((np.arange(N) + 1) / 10) * 10 / 250
-    stamps[500:] += 2
-    timing = from_stamps(stamps, 1.0)
-    assert timing.gap_rows.tolist() == [500]
-    assert timing.rate_hz == pytest.approx(250, rel=1e-3)
+BURSTS = np.ceil((np.arange(N) + 1) / 10) * 10 / 250 + 2.0 * (np.arange(N) >= 500)
+SWAPPED = np.r_[EVEN[:400], EVEN[401], EVEN[400], EVEN[402:]]
+ROUNDED = 1.7e9 + np.repeat(EVEN, 2) + np.tile([0, -2e-7], N)
+BACK, STILL = "time order", "timestamps"
+ODD = {  # stamps, their unit, the rate, gaps, findings
+    "a hole in bursts": (BURSTS, 1.0, 250, [500], ["gaps", STILL]),
+    "time that goes back": (np.r_[EVEN, EVEN], 1.0, 120, [N], [BACK]),
+    "two rows swapped": (SWAPPED, 1.0, 120, [400, 401, 402], [BACK, "gaps"]),
+    "steps back that floats make": (ROUNDED, 1.0, 240, [], [STILL]),
+    "no unit": (np.delete(np.r_[EVEN, EVEN], 100) * 7.3, None, None, [100, N - 1], [BACK, "gaps"]),
+    "equal": (np.zeros(9), 1.0, None, [], [STILL]),
+    "missing": (np.full(9, np.nan), 1.0, None, [], [STILL]),
+    "backwards": (np.arange(9.0)[::-1], 1.0, None, list(range(1, 9)), [BACK, STILL]),
+}
+
+
+@pytest.mark.parametrize(("stamps", "unit_s", "rate", "gaps", "findings"), ODD.values(), ids=ODD)
+def test_gaps_and_findings_of_odd_stamps(stamps, unit_s, rate, gaps, findings):
+    timing = from_stamps(stamps, unit_s)
+    assert timing.rate_hz == (rate and pytest.approx(rate, rel=1e-3))
+    assert timing.gap_rows.tolist() == gaps
+    assert checks(timing) == findings
 
 
 @pytest.mark.parametrize("rate", [100, 1000])
@@ -140,21 +156,6 @@ def test_doubled_rows_are_said_and_do_not_change_the_rate(tick, rel):
     assert f"{N // 20} times" in timing.findings[-1].detail
 
 
-def test_time_that_goes_back_is_a_gap():
-    timing = from_stamps(np.r_[EVEN, EVEN], 1.0)
-    assert timing.gap_rows.tolist() == [N]
-    assert timing.rate_hz == pytest.approx(120)
-    assert checks(timing) == ["time order"]
-    swapped = EVEN.copy()
-    swapped[[400, 401]] = swapped[[401, 400]]
-    assert 401 in from_stamps(swapped, 1.0).gap_rows
-
-
-def test_what_rounding_of_floats_takes_back_is_no_step_back():
-    stamps = 1.7e9 + np.repeat(EVEN, 2) + np.tile([0, -2e-7], N)
-    assert "time order" not in checks(from_stamps(stamps, 1.0))
-
-
 @pytest.mark.parametrize(
     ("period", "step", "unit_s", "burst"),
     [
@@ -174,20 +175,6 @@ def test_counters_of_time_and_midnight_are_unwrapped(period, step, unit_s, burst
     assert timing.findings[0].detail.endswith("once, at row 500")
 
 
-@pytest.mark.parametrize("stamps", [np.zeros(9), np.full(9, np.nan), np.arange(9.0)[::-1]])
-def test_stamps_that_do_not_advance_give_no_rate(stamps):
-    timing = from_stamps(stamps, 1.0)
-    assert timing.rate_hz is None
-    assert checks(timing)[-1] == "timestamps"
-    assert timing.gap_rows.tolist() == (list(range(1, 9)) if stamps[0] > stamps[1] else [])
-
-
-def test_stamps_of_an_unknown_unit_give_gaps_and_order_but_no_rate():
-    timing = from_stamps(np.delete(np.r_[EVEN, EVEN], 100) * 7.3, None)
-    assert timing.rate_hz is None
-    assert timing.gap_rows.tolist() == [100, N - 1]
-
-
 @pytest.mark.parametrize(
     "steps",
     [
@@ -205,7 +192,7 @@ def test_a_rate_that_changes_is_rejected(steps):
 
 
 @pytest.mark.parametrize("bits", [8, 16])
-def test_a_packet_counter_may_wrap_but_not_skip(bits):
+def test_a_packet_counter_may_wrap_but_not_repeat_go_back_or_skip(bits):
     counts = np.mod(np.arange(1000) + 2**bits - 100, 2**bits).astype(float)
     whole = from_counter(counts, bits)
     assert not len(whole.gap_rows)
@@ -213,17 +200,13 @@ def test_a_packet_counter_may_wrap_but_not_skip(bits):
     skipped = from_counter(np.delete(counts, [300, 301]), bits)
     assert skipped.gap_rows.tolist() == [300]
     assert checks(skipped) == ["wrap-around", "packet counter"]
+    for short in ([5, 6, 6, 7], [5, 6, 3, 4], [5, 6, 8, 9]):
+        timing = from_counter(np.array(short, float), bits)
+        assert (timing.gap_rows.tolist(), timing.rate_hz) == ([2], None)
+        assert checks(timing) == ["packet counter"]
     for stray in (np.nan, 60_000):
         counts[300] = stray
         assert not len(from_counter(counts, bits).gap_rows)
-
-
-@pytest.mark.parametrize("counts", [[5, 6, 6, 7], [5, 6, 3, 4], [5, 6, 8, 9]])
-def test_a_packet_that_repeats_or_goes_back_or_skips_is_a_gap(counts):
-    timing = from_counter(np.array(counts, float), 16)
-    assert timing.gap_rows.tolist() == [2]
-    assert checks(timing) == ["packet counter"]
-    assert timing.rate_hz is None
 
 
 @pytest.mark.parametrize(

@@ -2,18 +2,21 @@
 
 import numpy as np
 import pytest
-from device_tables import BIAS, read, still
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.readers.counts import implausible_level, wrapped
 
 RAW = {"units": "raw", "scale_dps": 0.00875}
-LOW = np.array([-0.5, -0.9, -0.7])
+BIAS, LOW = np.array([[0.7, -0.4, 0.15], [-0.5, -0.9, -0.7]])
+
+
+def still(bias=BIAS):
+    return np.random.default_rng(0).normal(bias, 0.05, (6000, 3))
 
 
 @pytest.mark.parametrize("bits", [12, 14, 24])
 @pytest.mark.parametrize("bias", [LOW, BIAS, 0 * BIAS, LOW + [0.5, 0, 0]])
-def test_signed_counts_that_were_written_as_unsigned_ones(bits, bias):
+def test_signed_counts_that_were_written_as_unsigned_ones(bits, bias, read):
     counts = np.round(still(bias=bias) / RAW["scale_dps"])
     assert not wrapped(counts)
     with pytest.raises(InputError, match=f"if they are signed counts.*signed_bits: {bits};.*trust"):
@@ -40,7 +43,7 @@ def test_a_level_is_one_of_most_samples():
     assert "no MEMS gyroscope at rest has more than 100" in implausible_level(rates)
 
 
-def test_counts_of_many_digits_have_lost_no_decimal_points():
+def test_counts_of_many_digits_have_lost_no_decimal_points(read):
     counts = np.round(still() * 1e6)
     with pytest.raises(InputError, match="whole numbers of 6 to 9 digits.*decimal points are lost"):
         read("gx (deg/s),gy (deg/s),gz (deg/s)", counts)

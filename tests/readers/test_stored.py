@@ -13,7 +13,7 @@ import pytest
 import scipy.io
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.readers import mat5, vehicles
+from gyro_pipeline.readers import mat5
 
 T = np.arange(60) / 100
 
@@ -128,11 +128,12 @@ def zipped(*names):
 
 
 REFUSED = [
+    (lambda path: None, "cannot be read: No such file"),
+    (lambda path: path.mkdir(), "cannot be read: Is a directory"),
     (gzip.compress(b"text"), "an archive; unpack it"),
     (zipped("log.csv"), r"a zip archive \(log.csv\); unpack it"),
     (zipped("[Content_Types].xml", "xl/workbook.xml"), "an Excel workbook"),
     (b"\xd0\xcf\x11\xe0" + bytes(600), "an Excel workbook"),
-    (b"RDX3\nX\n", r"data of R; save its table in R by `write.csv\("),
     (b"<!DOCTYPE html>\n<html>", "a web page; download the file itself"),
     (zipped("log.csv")[:700], "copy the file anew"),
     (written(lambda b: pd.DataFrame({"x": T}).to_parquet(b))[:700], "copy the file anew"),
@@ -145,12 +146,12 @@ REFUSED = [
 
 @pytest.mark.parametrize(("content", "message"), REFUSED)
 def test_what_is_not_read_comes_with_advice(content, message, table):
-    with pytest.raises(InputError, match=f"log.csv: expected .*{message}"):
+    with pytest.raises(InputError, match=f"log.csv: (expected )?.*{message}"):
         table(content)
 
 
 def test_compressed_data_of_r_are_told_by_their_name(table):
-    with pytest.raises(InputError, match="data of R"):
+    with pytest.raises(InputError, match=r"data of R; save its table in R by `write.csv\("):
         table(gzip.compress(b"RDX3\n"), name="log.rda")
 
 
@@ -160,20 +161,3 @@ def test_a_workspace_of_matlab_is_not_shown(monkeypatch, table):
     monkeypatch.setattr(mat5, "check", lambda data: None)
     with pytest.raises(InputError, match=r"got float64 \(1,\) a;"):
         table(lambda path: path.write_bytes(b"MATLAB 5.0 MAT-file"))
-
-
-@pytest.mark.parametrize(
-    "magic", [b"ULog\x01\x12\x35", b"#ROSBAG V2.0\n", b"\x89MCAP0", b"SQLite format 3", b"\xa3\x95"]
-)
-def test_logs_of_vehicles_are_read_elsewhere(magic, monkeypatch, table):
-    monkeypatch.setattr(vehicles, "read", lambda path, options: path.name)
-    assert table(magic + bytes(100)) == "log.csv"
-    folder = lambda path: (path.mkdir(), (path / "metadata.yaml").touch())  # noqa: E731
-    assert table(folder, name="bag") == "bag"
-
-
-def test_a_missing_file_and_a_folder_are_refused(table):
-    with pytest.raises(InputError, match="cannot be read: No such file"):
-        table(lambda path: None)
-    with pytest.raises(InputError, match="cannot be read: Is a directory"):
-        table(lambda path: path.mkdir())

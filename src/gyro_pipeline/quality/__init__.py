@@ -13,12 +13,12 @@ and does not end the recording; a gap in time does. Limits know how many samples
 | repeated rows | rows repeat the one before, beyond chance | above 20 % rejected, else kept |
 | coarse quantisation | the step is above the noise | above `largest_step` rejected, else kept |
 | bias taken off | a level goes to zero on all axes | rejected |
+| start | a shock of the first rows, as of what settles faster than a bias | cut, repaired |
 | shocks, spikes | a burst beyond the noise with a block about; one or two rows | masked, repaired |
 | dead band | exact zeros, and nothing near them | rejected |
 | saturation | the largest or the least value comes too often | rejected |
 | mixed rows | rows jump between levels, as those of several devices do | rejected |
 | noise level, little noise | more noise, or less, than a MEMS gyroscope has | rejected, kept |
-| start | the first blocks settle faster than a bias | cut, repaired |
 | motion | the mean or the noise changes; a burst is too long, a drift too large | rejected |
 | warm-up, drift | the level moves and settles, or does not | kept |
 
