@@ -146,10 +146,10 @@ def test_keys_of_a_catalog_entry(mine, change, words):
 @pytest.mark.parametrize(
     ("array", "words"),
     [
-        (good()[0], ["expected 3 axes", "got shape (3, 1300)"]),
+        (good()[0], ["along 3 axes", "got float32 of shape (3, 1300)"]),
         (with_one((6, 2), 0.25), ["IMU 1 recording 7", "mine.npy recording 7", "stuck", "axis z"]),
         (np.array([{"a": 1}]), ["pickled objects", "never loaded", "delete"]),
-        (good()[:, :2], ["(7, 2, 1300)", "divisible by 3"]),
+        (good()[:, :2], ["(7, 2, 1300)", "gyroscopes in threes"]),
         (good()[..., :200], ["0 of 7 recordings", "too short", "8 s", "quality.least_s"]),
         (good()[..., :300], ["window of 30 s is 750 samples", "has 300", "windows_s"]),
     ],

@@ -107,8 +107,10 @@ def test_axes_order_reads_shapes_that_do_not_look_like_logs(tmp_path):
 def test_an_order_that_the_shape_contradicts_is_refused(tmp_path, shape, order, shown):
     np.save(tmp_path / "all.npy", made(*shape))
     message = refusal(array_logs(tmp_path, axes_order=order))
-    assert "axes_order in the catalog entry: expected recording or gyroscope or sample" in message
-    assert message.endswith(f"recordings or gyroscopes: {shown}")
+    assert (
+        "axes_order in the catalog entry in catalog.yml: expected [recording, gyroscope" in message
+    )
+    assert message.endswith(f"they can be {shown}")
 
 
 @pytest.mark.parametrize(

@@ -119,9 +119,10 @@ class ArrayLogs(LogSource):
         listed = [f"[{', '.join(order)}]" for order in plausible]
         raise InputError(
             f"{self._sensor} {', '.join(f'{name} of shape {s}' for name, s in shapes.items())}: "
-            f"axes_order in the catalog entry: expected {' or '.join(LAYOUT)} of each axis, got "
-            f"{list(given) if given else 'none'}. Orders with gyroscopes in threes and far more "
-            f"samples than recordings or gyroscopes: {' or '.join(listed) or 'none'}"
+            "axes_order in the catalog entry in catalog.yml: expected "
+            f"[{', '.join(LAYOUT)}] in the order of the file's axes, got {list(given or [])}. By "
+            "their lengths, gyroscopes in threes and far more samples than recordings or "
+            f"gyroscopes, they can be {' or '.join(listed) or 'none'}"
         )
 
     def _entries(

@@ -7,6 +7,7 @@ around them. An expression with named groups finds them; all other lines are ski
 import re
 from collections import Counter
 from collections.abc import Sequence
+from itertools import islice
 
 import pyarrow as pa
 
@@ -92,7 +93,7 @@ def expression_of(line: str, least: int = 3, most: int = 100) -> str | None:
     """
     line = _CHECKSUM.sub("*", line.rstrip())
     expression, end, names = "^", 0, list[str]()
-    for value in _VALUE.finditer(line):
+    for value in islice(_VALUE.finditer(line), most + 1):
         between = line[end : value.start()]
         label = _LABEL.search(between)
         name = "t" if value["time"] else label[1] if label else f"v{len(names) + 1}"
