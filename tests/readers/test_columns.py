@@ -87,7 +87,13 @@ def test_what_is_not_said_is_asked_for(header, options, words, read):
         (axes("g# (deg/s)*100"), BY_NUMBER, "no angular rate"),
         (f"{T}gx (deg/s),gy (rad/s),gz (deg/s)", BY_NUMBER, "are deg/s, but the header says rad/s"),
         (axes("g#_dps (rad/s)"), BY_NUMBER, "are deg/s, but the header says rad/s"),
-        (axes("g#"), DEG | {"preamble": "Gyro sensitivity: 131"}, "says Gyro sensitivity 131, but"),
+        (
+            axes("g#"),
+            DEG | {"preamble": "Gyro sensitivity: 131"},
+            "says 'Gyro sensitivity: 131', but",
+        ),
+        (axes("10*g# (deg/s)"), {}, "name a factor"),
+        (axes("g#_x10 (deg/s)"), {}, "name a factor"),
     ],
 )
 def test_contradictions_are_refused_unless_the_options_are_trusted(
@@ -99,6 +105,47 @@ def test_contradictions_are_refused_unless_the_options_are_trusted(
     assert "overruled: " in details(log, "trust: options")[0]
     factor = 100 if options.get("increments") else options.get("scale_dps", 1)
     np.testing.assert_allclose(log.samples, X / 100 * factor)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "LSB/dps = 14.2857", "gyro_lsb_per_dps,14.2857", "Gyroscope scale (deg/s per LSB): 0.07",
+        "gyr_scale 0.07", "Sensitivity: 0.07", "resolution: 0.07 deg/s", "gain: 0.07", "gres,0.07",
+        "factor: 0.07", "multiplier,0.07", "gyro sensitivity 70 mdps/LSB", "14.2857 LSB/dps",
+    ],
+)  # fmt: skip
+def test_a_scale_that_the_file_states_is_named_for_typing(line, read):
+    raw = {"units": "raw", "scale_dps": 0.07}
+    with pytest.raises(InputError, match=r"give units: raw, scale_dps: 0\.07\d* if it is"):
+        read(axes("g#"), S, X, preamble=line, **DEG)
+    assert not read(axes("g#"), S, X, preamble=line, **raw).findings
+    name, _, number = line.rpartition(",")
+    if name and number == "0.07":
+        with pytest.raises(InputError, match=f"column '{name}' is 0.07, but.*scale_dps: 0.07"):
+            read(f"{axes('g#')},{name}", S, X, 0 * S + 0.07, **DEG)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "Gyro full scale: 250 dps", "acc sensitivity: 0.061", "ascale,0.0004", "gyro scale: 1.0",
+        "Resolution: 16 bit", "magnetometer gain 0.15", "fs_sel: 2", "again 5",
+    ],
+)  # fmt: skip
+def test_ranges_and_scales_of_other_sensors_are_none_of_the_rates(line, read):
+    assert not read(axes("g#"), S, X, preamble=line, **DEG).findings
+
+
+@pytest.mark.parametrize(
+    ("dps", "taken"), [(0.00106423, "deg/s a count"), (0.0609759, "rad/s a count")]
+)
+def test_of_a_scale_with_two_readings_the_one_taken_is_said(dps, taken, read, details):
+    above = {"preamble": "tscale,0.001\ngscale,0.00106423", "time_units": 1e-3}
+    with pytest.raises(InputError, match="0.00106423 if it is deg/s.*0.0609759 if it is rad/s a"):
+        read("t,gx,gy,gz", S * 1e3, X, **above, **DEG)
+    log = read("t,gx,gy,gz", S * 1e3, X, units="raw", scale_dps=dps, **above)
+    assert taken in details(log, "scale")[0]
 
 
 def test_of_sensors_side_by_side_names_of_two_are_not_mixed(read):

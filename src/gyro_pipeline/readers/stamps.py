@@ -32,6 +32,7 @@ _STATED_RATE = re.compile(
     r"(?i)\b(?:(?:sampl\w*|output|update|data)[ _-]?(?:rate|freq\w*)|odr|fs)\b"
     r"[^\w\n]{0,20}(?:hz)?[^\w\n.]{0,20}(\d+(?:\.\d+)?)[ ]{0,3}(k?)(?:hz|\s|$|[,;\"])"
 )
+_TIME_SCALE = re.compile(r"(?im)^\W*t(?:ime)?[ _]?scale\W+([\d.]+(?:e[-+]?\d+)?)\s*$")
 
 
 def names_time(header: Header) -> bool:
@@ -109,9 +110,12 @@ def _measured(file: File, number: int, unit_s: float | None, times: Floats) -> T
     if file.table.columns[number].dtype.kind != "f":
         return from_stamps(times, 1.0)
     name, options_s = file.listed([number]), _options_s(file)
+    scale = _TIME_SCALE.search(file.table.preamble)
+    stated_s = float(scale[1]) if scale else 0.0
     timing = from_stamps(times, options_s or unit_s)
     if not (options_s or unit_s):
         text = f"{name} has no unit: the rate is not measured; give time_units"
+        text += f": {stated_s:g}, as a line above the header says" if stated_s else ""
         if file.options.time_column is not None:
             raise file.refusal(text)
         return replace(timing, findings=(*timing.findings, Finding("timestamps", KEPT, text)))
@@ -120,6 +124,12 @@ def _measured(file: File, number: int, unit_s: float | None, times: Floats) -> T
             f"{name} has a unit of {unit_s:g} s, which makes "
             f"{timing.rate_hz * options_s / unit_s:.6g} Hz, but time_units of the options "
             f"{options_s:g} s, which makes {timing.rate_hz:.6g} Hz"
+        )
+    used_s = options_s or unit_s or stated_s
+    if stated_s not in (0.0, 1.0) and not isclose(stated_s, used_s):
+        file.contradictions.append(
+            f"a line above the header says {scale and scale[0].strip()!r}, but a unit of {name} is "
+            f"{used_s:g} s; give time_units: {stated_s:g}"
         )
     return timing
 
