@@ -60,6 +60,22 @@ def test_devices_tell_by_their_name_by_small_biases_by_their_noise_and_by_texts(
 
 
 @pytest.mark.parametrize(
+    ("kinds", "value"),
+    [
+        (("acc", "gyr"), "gyr"), (("LINEAR_ACCELERATION", "GYROSCOPE"), "GYROSCOPE"),
+        (("acc", "ω"), "ω"), (("acc", "mag"), "…"), (("acc", "B"), "B"), (("B", "A", "A"), "A"),
+    ],
+)  # fmt: skip
+def test_the_rows_to_pick_are_never_of_another_quantity(kinds, value, read_beside):
+    column = [kinds[row % len(kinds)] for row in ROWS]
+    with pytest.raises(InputError, match=f"such as rows: {{k: {value}}}"):
+        read_beside("k", column, WHITE)
+    if "acc" in kinds:
+        with pytest.raises(InputError, match="pick acc in 'k', by its name no angular rate"):
+            read_beside("k", column, WHITE, rows={"k": "acc"})
+
+
+@pytest.mark.parametrize(
     "rates",
     [
         WHITE,

@@ -56,7 +56,7 @@ class Header(NamedTuple):
 
 @lru_cache(1 << 10)
 def _quantity_of(name: str) -> str:
-    text = " ".join(re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)).lower()
+    text = " ".join(re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name.replace("ω", "omega"))).lower()
     matches = (name for name, word in _QUANTITIES if re.search(rf"\b({word})\b", text))
     return next(matches, "")
 

@@ -137,7 +137,7 @@ def _stated_scales(file: File, rates: Sequence[int]) -> list[tuple[str, dict[str
         Where each stands, and deg/s a count by what it may be.
     """
     lines = [
-        (f"a line above the header says {line.strip()!r}", line)
+        (f"a line above the header says {line[:200].strip()!r}", line[:200])
         for line in file.table.preamble.splitlines()
     ]
     for number, (name, column) in enumerate(zip(file.table.names, file.table.columns, strict=True)):
