@@ -36,6 +36,9 @@ def axes(name, order="xyz"):
         (f"{T}roll (deg/s),pitch (deg/s),yaw (deg/s)", X, {"columns": (1, 2, 3)}),
         (f"{T}yaw_rate (deg/s),pitch_rate (deg/s),roll_rate (deg/s)", X[:, ::-1], {}),
         (f"{T}p,q,r", X, DEG | {"columns": ("p", "q", "r")}),
+        (f"{T}r (dps),q (dps),p (dps)", X[:, ::-1], {}),
+        (f"{T}gyro3,gyro2,gyro1", X[:, ::-1], DEG),
+        (f"{T}adc1,adc2,adc3", X, BY_NUMBER),
         (f"{T}delta_angle[0],delta_angle[1],delta_angle[2]", X * RAD / 100,
          {"units": "rad", "columns": (1, 2, 3), "increments": True}),
         (axes("g#"), X * RAD, {"preamble": "# gyroscope in rad/s, range 250 dps"}),
@@ -77,6 +80,10 @@ def test_what_is_not_said_is_asked_for(header, options, words, read):
     ("header", "options", "words"),
     [
         (f"{T}yaw (dps),pitch (dps),roll (dps)", BY_NUMBER, "but by their names 'roll .dps.', 'pi"),
+        *[
+            (f"{T}{names}", BY_NUMBER, "belong in this order")
+            for names in ("r,q,p", "gyro3,gyro2,gyro1", "w2,w1,w0", "gyro 3,gyro 2,gyro 1")
+        ],
         (axes("a#"), BY_NUMBER | {"increments": True, "units": "deg"}, "by name no angular rate"),
         (axes("g# (LSB)"), DEG, "but the header says LSB"),
         (axes("g# (deg/s)"), {"units": "raw", "scale_dps": 0.1}, "raw, of 0.1 deg/s, but the head"),
@@ -152,6 +159,18 @@ def test_of_sensors_side_by_side_names_of_two_are_not_mixed(read):
     header = f"{T}icm_gx,icm_gy,icm_gz,asm_gx,asm_gy,asm_gz"
     with pytest.raises(InputError, match="columns of the options.*'icm_gx', 'icm_gy', 'icm_gz'"):
         read(header, S, X, X + 1, columns=("icm_gx", "icm_gy", "asm_gz"), **DEG)
+
+
+@pytest.mark.parametrize("name", ["tilt_#", "jerk_#", "field_#", "#"])
+def test_rates_by_units_alone_are_said_and_never_a_quaternion(name, read, details):
+    assert "nothing but units" in details(read(axes(name), S, X, **DEG), "rates")[0]
+    assert not read(axes(name), S, X, **BY_NUMBER).findings
+    header = axes(name, "xyzw")
+    with pytest.raises(InputError, match="are by name of a quaternion; give columns"):
+        read(header, S, X, S, **DEG)
+    with pytest.raises(InputError, match="by name of a quaternion; give columns.*trust: options"):
+        read(header, S, X, S, **BY_NUMBER)
+    assert not read(f"{axes(f'{name} (dps)')},{name.replace('#', 'w')}", S, X, S).findings
 
 
 @pytest.mark.parametrize("name", ["calibrated_gyro_# (dps)", "uncalibrated_gyro_# (dps)"])

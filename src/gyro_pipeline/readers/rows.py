@@ -151,7 +151,7 @@ def _takes_turns(
         evidence = "which say what a row is"
     else:
         evidence = _change(rates, codes)
-    return evidence and f"{_counted(codes, texts)}, {evidence}", _value(texts, rows * filled)
+    return evidence and f"{_counted(codes, texts)}, {evidence}", _value(texts, rows)
 
 
 def _value(texts: NDArray[Any], rows: NDArray[np.intp]) -> str:
