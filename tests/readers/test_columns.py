@@ -89,7 +89,7 @@ def test_what_is_not_said_is_asked_for(header, options, words, read):
         (axes("g# (deg/s)"), {"units": "raw", "scale_dps": 0.1}, "raw, of 0.1 deg/s, but the head"),
         *[
             (axes(f"g# ({unit})"), DEG, "but that is no angular rate")
-            for unit in ("deg/√h", "0.1*(deg/s)", "LSB/(deg/s)")
+            for unit in ("grad/s", "Grad/s", "deg/√h", "0.1*(deg/s)", "LSB/(deg/s)")
         ],
         (axes("g# (deg/s)*100"), BY_NUMBER, "no angular rate"),
         (f"{T}gx (deg/s),gy (rad/s),gz (deg/s)", BY_NUMBER, "are deg/s, but the header says rad/s"),

@@ -90,6 +90,21 @@ def test_a_rate_above_the_header_is_compared_with_the_measured_one(preamble, out
     assert {finding.outcome for finding in trusted.findings} <= {"kept"}
 
 
+@pytest.mark.parametrize(
+    ("header", "column", "words"),
+    [
+        ("t (ms)", S, "makes 100000 Hz,.*give time_units: s, which makes 100 Hz, and trust"),
+        ("t (s)", S * 1e6, "makes 0.0001 Hz.*time_units: us, which makes 100 Hz"),
+    ],
+)
+def test_a_rate_at_which_no_gyroscope_is_read_says_what_to_type(header, column, words, read):
+    (finding,) = read(f"{header},{RATES}", column, X).findings
+    assert finding.outcome == "rejected" and re.search(words, finding.detail)
+    unit = re.search("time_units: (.?s),", finding.detail)[1]
+    log = read(f"{header},{RATES}", column, X, time_units=unit, trust="options")
+    assert log.rate_hz == pytest.approx(100)
+
+
 def test_rows_that_are_left_out_take_time_but_have_no_number(read, details):
     header, options = f"dt (ms),sensor,k,{RATES}", {"counter_column": "k", "time_is": "steps"}
     sensor, lost = np.arange(N) % 2, np.where(np.arange(N) < 300, 0, 5) + np.arange(N)

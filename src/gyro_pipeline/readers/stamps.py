@@ -32,6 +32,7 @@ _STATED_RATE = re.compile(
     r"(?i)\b(?:(?:sampl\w*|output|update|data)[ _-]?(?:rate|freq\w*)|odr|fs)\b"
     r"[^\w\n]{0,20}(?:hz)?[^\w\n.]{0,20}(\d+(?:\.\d+)?)[ ]{0,3}(k?)(?:hz|\s|$|[,;\"])"
 )
+_UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _TIME_SCALE = re.compile(r"(?im)^\W*t(?:ime)?[ _]?scale\W+([\d.]+(?:e[-+]?\d+)?)\s*$")
 
 
@@ -131,7 +132,25 @@ def _measured(file: File, number: int, unit_s: float | None, times: Floats) -> T
             f"a line above the header says {scale and scale[0].strip()!r}, but a unit of {name} is "
             f"{used_s:g} s; give time_units: {stated_s:g}"
         )
-    return timing
+    return replace(timing, findings=(*timing.findings, *_implausible(file, name, timing, used_s)))
+
+
+def _implausible(
+    file: File, name: str, timing: Timing, unit_s: float, slow: float = 0.1, fast: float = 2e4
+) -> tuple[Finding, ...]:
+    """A rate in Hz at which no gyroscope is read, and the units that make a usual one."""
+    hz = timing.rate_hz
+    if hz is None or slow <= hz <= fast:
+        return ()
+    rates = {f"time_units: {u}": hz * unit_s / s for u, s in _UNITS_S.items()}
+    usual = [
+        f"{text}, which makes {rate:.6g} Hz" for text, rate in rates.items() if 1 <= rate < fast
+    ]
+    text = (
+        f"{name}, in units of {unit_s:g} s, makes {hz:.6g} Hz, at which no gyroscope is read; give "
+        f"{', or '.join(usual) or 'time_units'}, and trust: options {IN_READER}"
+    )
+    return (Finding("sample rate", KEPT if file.options.trust else REJECTED, text),)
 
 
 def counted(file: File, keep: Mask) -> Timing:
