@@ -118,6 +118,16 @@ def test_rows_without_rates_at_a_regular_share_are_no_samples(blank, details, re
     assert f"{blank.sum()} of {N} rows are blank, at a regular" in details(log, "blank rows")[0]
 
 
+def test_of_increments_the_step_between_rows_that_are_left_is_said(details, read):
+    blank = (ROWS % 2 == 1)[:, None]
+    header = "time (s),dx (deg),dy (deg),dz (deg)"
+    log = read(header, ROWS / 200, np.where(blank, np.nan, WHITE / 100), increments=True)
+    np.testing.assert_allclose(log.samples, WHITE[::2])
+    assert "divided by 0.01 s, the step between the rows that are left, 3000 of 6000" in str(
+        details(log, "increments")
+    )
+
+
 @pytest.mark.parametrize("lost", [RNG.random(N) < 0.2, ROWS // 100 == 20, np.isin(ROWS, [5, 90])])
 def test_rows_that_are_lost_are_not_taken_for_no_samples(lost, read_beside):
     log = read_beside("k", ROWS, np.where(lost[:, None], np.nan, WHITE))
