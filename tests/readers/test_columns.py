@@ -138,6 +138,7 @@ def test_a_scale_that_the_file_states_is_named_for_typing(line, read):
     [
         "Gyro full scale: 250 dps", "acc sensitivity: 0.061", "ascale,0.0004", "gyro scale: 1.0",
         "Resolution: 16 bit", "magnetometer gain 0.15", "fs_sel: 2", "again 5",
+        "Factory: 7", "sensitivity of 2021-05-04", "gain set 10:30:00",
     ],
 )  # fmt: skip
 def test_ranges_and_scales_of_other_sensors_are_none_of_the_rates(line, read):

@@ -15,9 +15,11 @@ from gyro_pipeline.units import Unit, read_unit
 
 RATE_UNITS = "deg/s, rad/s, mdps, deg/h, … or raw (with scale_dps)"
 
-_NUMBER = r"(?<![\w.])([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(?![\w.]*\d|\s*-?bit)"
+_NUMBER = (
+    r"(?<![\w.])(?<!\d[-:])([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(?![\w.]*\d|[-:/]\d|\s*-?bit)"
+)
 _SCALE = re.compile(
-    r"(?i)(?:scal(?:e|ing)|sensitivity|resolution|gain|factor|multiplier|lsb|(?<![a-z])g?res(?![a-z]))"
+    r"(?i)(?:scal(?:e|ing)|sensitivity|resolution|gain|factor(?!y)|multiplier|lsb|(?<![a-z])g?res(?![a-z]))"
     rf"[^\n]*?{_NUMBER}|{_NUMBER}(?=\s*(?:lsb|counts?|digits?)\W*(?:/|per))"
 )
 _OF_OTHERS = re.compile(
