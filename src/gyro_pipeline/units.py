@@ -75,6 +75,8 @@ def read_unit(text: str) -> Unit | None:
         What it measures; ``other`` for known units of anything else; None where it is no unit.
     """
     text = text.strip()
+    if re.match("(?i)grad", text):  # to pint a gon or 10^9 radians; in German a degree
+        return None
     for spelling, of_pint in _SPELLINGS.items():
         text = text.replace(spelling, of_pint)
     text = re.sub(r"\.(?=\s|$)", "", text)  # Deg. per s

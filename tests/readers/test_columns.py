@@ -36,6 +36,9 @@ def axes(name, order="xyz"):
         (f"{T}roll (deg/s),pitch (deg/s),yaw (deg/s)", X, {"columns": (1, 2, 3)}),
         (f"{T}yaw_rate (deg/s),pitch_rate (deg/s),roll_rate (deg/s)", X[:, ::-1], {}),
         (f"{T}p,q,r", X, DEG | {"columns": ("p", "q", "r")}),
+        (f"{T}r (dps),q (dps),p (dps)", X[:, ::-1], {}),
+        (f"{T}gyro3,gyro2,gyro1", X[:, ::-1], DEG),
+        (f"{T}adc1,adc2,adc3", X, BY_NUMBER),
         (f"{T}delta_angle[0],delta_angle[1],delta_angle[2]", X * RAD / 100,
          {"units": "rad", "columns": (1, 2, 3), "increments": True}),
         (axes("g#"), X * RAD, {"preamble": "# gyroscope in rad/s, range 250 dps"}),
@@ -77,17 +80,27 @@ def test_what_is_not_said_is_asked_for(header, options, words, read):
     ("header", "options", "words"),
     [
         (f"{T}yaw (dps),pitch (dps),roll (dps)", BY_NUMBER, "but by their names 'roll .dps.', 'pi"),
+        *[
+            (f"{T}{names}", BY_NUMBER, "belong in this order")
+            for names in ("r,q,p", "gyro3,gyro2,gyro1", "w2,w1,w0", "gyro 3,gyro 2,gyro 1")
+        ],
         (axes("a#"), BY_NUMBER | {"increments": True, "units": "deg"}, "by name no angular rate"),
         (axes("g# (LSB)"), DEG, "but the header says LSB"),
         (axes("g# (deg/s)"), {"units": "raw", "scale_dps": 0.1}, "raw, of 0.1 deg/s, but the head"),
         *[
             (axes(f"g# ({unit})"), DEG, "but that is no angular rate")
-            for unit in ("deg/√h", "0.1*(deg/s)", "LSB/(deg/s)")
+            for unit in ("grad/s", "Grad/s", "deg/√h", "0.1*(deg/s)", "LSB/(deg/s)")
         ],
         (axes("g# (deg/s)*100"), BY_NUMBER, "no angular rate"),
         (f"{T}gx (deg/s),gy (rad/s),gz (deg/s)", BY_NUMBER, "are deg/s, but the header says rad/s"),
         (axes("g#_dps (rad/s)"), BY_NUMBER, "are deg/s, but the header says rad/s"),
-        (axes("g#"), DEG | {"preamble": "Gyro sensitivity: 131"}, "says Gyro sensitivity 131, but"),
+        (
+            axes("g#"),
+            DEG | {"preamble": "Gyro sensitivity: 131"},
+            "says 'Gyro sensitivity: 131', but",
+        ),
+        (axes("10*g# (deg/s)"), {}, "name a factor"),
+        (axes("g#_x10 (deg/s)"), {}, "name a factor"),
     ],
 )
 def test_contradictions_are_refused_unless_the_options_are_trusted(
@@ -101,10 +114,64 @@ def test_contradictions_are_refused_unless_the_options_are_trusted(
     np.testing.assert_allclose(log.samples, X / 100 * factor)
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "LSB/dps = 14.2857", "gyro_lsb_per_dps,14.2857", "Gyroscope scale (deg/s per LSB): 0.07",
+        "gyr_scale 0.07", "Sensitivity: 0.07", "resolution: 0.07 deg/s", "gain: 0.07", "gres,0.07",
+        "factor: 0.07", "multiplier,0.07", "gyro sensitivity 70 mdps/LSB", "14.2857 LSB/dps",
+    ],
+)  # fmt: skip
+def test_a_scale_that_the_file_states_is_named_for_typing(line, read):
+    raw = {"units": "raw", "scale_dps": 0.07}
+    with pytest.raises(InputError, match=r"give units: raw, scale_dps: 0\.07\d* if it is"):
+        read(axes("g#"), S, X, preamble=line, **DEG)
+    assert not read(axes("g#"), S, X, preamble=line, **raw).findings
+    name, _, number = line.rpartition(",")
+    if name and number == "0.07":
+        with pytest.raises(InputError, match=f"column '{name}' is 0.07, but.*scale_dps: 0.07"):
+            read(f"{axes('g#')},{name}", S, X, 0 * S + 0.07, **DEG)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "Gyro full scale: 250 dps", "acc sensitivity: 0.061", "ascale,0.0004", "gyro scale: 1.0",
+        "Resolution: 16 bit", "magnetometer gain 0.15", "fs_sel: 2", "again 5",
+        "Factory: 7", "sensitivity of 2021-05-04", "gain set 10:30:00",
+    ],
+)  # fmt: skip
+def test_ranges_and_scales_of_other_sensors_are_none_of_the_rates(line, read):
+    assert not read(axes("g#"), S, X, preamble=line, **DEG).findings
+
+
+@pytest.mark.parametrize(
+    ("dps", "taken"), [(0.00106423, "deg/s a count"), (0.0609759, "rad/s a count")]
+)
+def test_of_a_scale_with_two_readings_the_one_taken_is_said(dps, taken, read, details):
+    above = {"preamble": "tscale,0.001\ngscale,0.00106423", "time_units": 1e-3}
+    with pytest.raises(InputError, match="0.00106423 if it is deg/s.*0.0609759 if it is rad/s a"):
+        read("t,gx,gy,gz", S * 1e3, X, **above, **DEG)
+    log = read("t,gx,gy,gz", S * 1e3, X, units="raw", scale_dps=dps, **above)
+    assert taken in details(log, "scale")[0]
+
+
 def test_of_sensors_side_by_side_names_of_two_are_not_mixed(read):
     header = f"{T}icm_gx,icm_gy,icm_gz,asm_gx,asm_gy,asm_gz"
     with pytest.raises(InputError, match="columns of the options.*'icm_gx', 'icm_gy', 'icm_gz'"):
         read(header, S, X, X + 1, columns=("icm_gx", "icm_gy", "asm_gz"), **DEG)
+
+
+@pytest.mark.parametrize("name", ["tilt_#", "jerk_#", "field_#", "#"])
+def test_rates_by_units_alone_are_said_and_never_a_quaternion(name, read, details):
+    assert "nothing but units" in details(read(axes(name), S, X, **DEG), "rates")[0]
+    assert not read(axes(name), S, X, **BY_NUMBER).findings
+    header = axes(name, "xyzw")
+    with pytest.raises(InputError, match="are by name of a quaternion; give columns"):
+        read(header, S, X, S, **DEG)
+    with pytest.raises(InputError, match="by name of a quaternion; give columns.*trust: options"):
+        read(header, S, X, S, **BY_NUMBER)
+    assert not read(f"{axes(f'{name} (dps)')},{name.replace('#', 'w')}", S, X, S).findings
 
 
 @pytest.mark.parametrize("name", ["calibrated_gyro_# (dps)", "uncalibrated_gyro_# (dps)"])

@@ -60,6 +60,22 @@ def test_devices_tell_by_their_name_by_small_biases_by_their_noise_and_by_texts(
 
 
 @pytest.mark.parametrize(
+    ("kinds", "value"),
+    [
+        (("acc", "gyr"), "gyr"), (("LINEAR_ACCELERATION", "GYROSCOPE"), "GYROSCOPE"),
+        (("acc", "ω"), "ω"), (("acc", "mag"), "…"), (("acc", "B"), "B"), (("B", "A", "A"), "A"),
+    ],
+)  # fmt: skip
+def test_the_rows_to_pick_are_never_of_another_quantity(kinds, value, read_beside):
+    column = [kinds[row % len(kinds)] for row in ROWS]
+    with pytest.raises(InputError, match=f"such as rows: {{k: {value}}}"):
+        read_beside("k", column, WHITE)
+    if "acc" in kinds:
+        with pytest.raises(InputError, match="pick acc in 'k', by its name no angular rate"):
+            read_beside("k", column, WHITE, rows={"k": "acc"})
+
+
+@pytest.mark.parametrize(
     "rates",
     [
         WHITE,
@@ -100,6 +116,16 @@ def test_rows_without_rates_at_a_regular_share_are_no_samples(blank, details, re
     np.testing.assert_array_equal(log.samples, WHITE[~blank])
     np.testing.assert_array_equal(log.rows, np.flatnonzero(~blank))
     assert f"{blank.sum()} of {N} rows are blank, at a regular" in details(log, "blank rows")[0]
+
+
+def test_of_increments_the_step_between_rows_that_are_left_is_said(details, read):
+    blank = (ROWS % 2 == 1)[:, None]
+    header = "time (s),dx (deg),dy (deg),dz (deg)"
+    log = read(header, ROWS / 200, np.where(blank, np.nan, WHITE / 100), increments=True)
+    np.testing.assert_allclose(log.samples, WHITE[::2])
+    assert "divided by 0.01 s, the step between the rows that are left, 3000 of 6000" in str(
+        details(log, "increments")
+    )
 
 
 @pytest.mark.parametrize("lost", [RNG.random(N) < 0.2, ROWS // 100 == 20, np.isin(ROWS, [5, 90])])

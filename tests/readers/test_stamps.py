@@ -61,6 +61,7 @@ def test_what_is_not_known_of_the_time_is_one_short_finding(header, column, word
     ("header", "column", "options", "words"),
     [
         ("t (ms)", S, {"time_units": "s"}, "0.001 s, which makes 100000 Hz, but.* 1 s.* 100 Hz"),
+        ("t", S, {"time_units": "s", "preamble": "tscale,0.001"}, "1 s; give time_units: 0.001"),
         ("k", S, {"time_column": "k"}, "'k' has no unit"),
         ("k", S * 0, {"time_column": "k", "time_units": "s"}, "'k' holds"),
         ("k", STEPS, {"time_column": "k", "time_units": "ms"}, "give time_is: steps"),
@@ -87,6 +88,21 @@ def test_a_rate_above_the_header_is_compared_with_the_measured_one(preamble, out
     assert tuple(f.outcome for f in log.findings if f.check == "stated rate") == outcome
     trusted = read(f"time (s),{RATES}", S, X, preamble=preamble, trust="options")
     assert {finding.outcome for finding in trusted.findings} <= {"kept"}
+
+
+@pytest.mark.parametrize(
+    ("header", "column", "words"),
+    [
+        ("t (ms)", S, "makes 100000 Hz,.*give time_units: s, which makes 100 Hz, and trust"),
+        ("t (s)", S * 1e6, "makes 0.0001 Hz.*time_units: us, which makes 100 Hz"),
+    ],
+)
+def test_a_rate_at_which_no_gyroscope_is_read_says_what_to_type(header, column, words, read):
+    (finding,) = read(f"{header},{RATES}", column, X).findings
+    assert finding.outcome == "rejected" and re.search(words, finding.detail)
+    unit = re.search("time_units: (.?s),", finding.detail)[1]
+    log = read(f"{header},{RATES}", column, X, time_units=unit, trust="options")
+    assert log.rate_hz == pytest.approx(100)
 
 
 def test_rows_that_are_left_out_take_time_but_have_no_number(read, details):

@@ -73,6 +73,9 @@ DAMAGED = {  # rows that are NaN, and what is said
         lambda t: cell(9, 8, "1,2")(cell(30, 2, "1,2")(t)), [9, 30], ROWS),
     "a field too many in the first row": (cell(0, 2, "1,2"), [0], ROWS),
     "a message between rows": (inserted(31, "SD card slow"), [30], ROWS),
+    "a boot message with commas": (
+        inserted(31, "rst:0x1 (POWERON),boot:0x13", "I (123) wifi: connected, ip x, gw y"),
+        [30, 31], ROWS),
     "comments between rows": (inserted(31, "# a, b", "// c"), [30, 31], ROWS),
 }  # fmt: skip
 
@@ -118,6 +121,8 @@ REFUSED = {
     "a header of fewer columns": ("angles", replaced("phi,theta,", ""), "the rows, 10, got 8"),
     "two recordings": ("angles", lambda t: t + t, "a second header in row 60 .line 62."),
     "two loggers": ("angles", lambda t: t + t.replace("f_", ""), "a second header in row 60"),
+    "two recordings, their rows wider than the header": (
+        "angles", lambda t: (t := t.replace("z,\n", "z\n")) + t, "a second header in row 60"),
     "two recordings with lines above": ("dot", lambda t: t + t, "a second header"),
     "a column of thousands": (
         "general", replaced(";0.", ";1,000."), "numbers in 'z', without thousands"),
@@ -191,6 +196,12 @@ def test_names_that_are_not_utf_8_come_with_the_option(table):
 
 def test_a_delimiter_may_be_told(table):
     assert table("a|b|c\n" + "1|2|3\n" * 9, delimiter="|").names == ("a", "b", "c")
+
+
+def test_many_boot_messages_ask_for_a_row(table):
+    text = "t,x,y,z\n" + ("1,2,3,4\n" * 9 + "rst:0x1 (POWERON),boot:0x13\n") * 9
+    with pytest.raises(InputError, match="got 9 of 90 that are not.*row: '"):
+        table(text)
 
 
 @pytest.mark.parametrize(("rows", "most"), [(100, 3), (1000, 10)])

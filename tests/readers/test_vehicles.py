@@ -186,5 +186,5 @@ def test_logs_without_a_gyroscope_or_the_library_say_so(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="expected messages with angular rates, got none"):
         read(ulog(tmp_path / "log.ulg", ("sensor_accel", 0, 0)))
     monkeypatch.setitem(sys.modules, "pyulog", None)
-    with pytest.raises(InputError, match=r"pip install 'gyro-pipeline\[logs\]'"):
+    with pytest.raises(InputError, match=r"pip install -e '\.\[logs\]'"):
         read(tmp_path / "log.ulg")

@@ -68,6 +68,9 @@ def log_of(
     timing = timing_of(file, keep)
     raw = raw if keep.all() else raw[keep]
     rates = _in_dps(file, raw, scale, timing.rate_hz or expected_rate_hz)
+    if options.increments and timing.rate_hz and not keep.all():
+        text = f"divided by {1 / timing.rate_hz:.6g} s, the step between the rows that are left"
+        file.note("increments", f"angles are {text}, {keep.sum()} of {len(keep)}")
     temperature, acceleration = temperature_of(file), acceleration_of(file, columns)
     contradict_values(file, raw, rates, are_counts)
     contradict_turns(file, {*columns, *temperature[0], *acceleration[0]}, keep, rates)

@@ -13,7 +13,15 @@ from gyro_pipeline.conventions import AXES, InputError
 from gyro_pipeline.parameters import Column
 from gyro_pipeline.readers.file import File
 from gyro_pipeline.readers.formats import find_all
-from gyro_pipeline.readers.names import ATTITUDE, INDEX, RATE, Header, triples
+from gyro_pipeline.readers.names import (
+    ATTITUDE,
+    INDEX,
+    RATE,
+    Header,
+    is_quaternion,
+    numbered,
+    triples,
+)
 from gyro_pipeline.readers.scales import RATE_UNITS
 
 Columns = Sequence[int]
@@ -58,7 +66,8 @@ def _by_options(file: File, columns: Sequence[Column]) -> Columns:
     rates = [file.find(column) for column in columns]
     if len(set(rates)) < len(AXES):
         raise file.refusal(f"expected three columns of rates, got {list(columns)}; correct columns")
-    others = [triple for triple in triples(file.headers) if {*triple} & {*rates}]
+    known = triples(file.headers) + numbered(file.headers)
+    others = [triple for triple in known if {*triple} & {*rates}]
     same = [triple for triple in others if {*triple} == {*rates}]
     if others and tuple(rates) not in same:
         together = "in this order" if same else "together"
@@ -74,10 +83,10 @@ def _by_options(file: File, columns: Sequence[Column]) -> Columns:
             "name one; write a row for each sample"
         )
     strange = [n for n in rates if not _may_be_rate(file, file.headers[n])]
-    if strange:
+    if strange or is_quaternion(file.headers, rates):
         file.contradictions.append(
-            f"columns of the options name {file.listed(strange)}, by name no angular rate; give "
-            "columns of angular rates"
+            f"columns of the options name {file.listed(strange or rates)}, by name "
+            f"{'no angular rate' if strange else 'of a quaternion'}; give columns of angular rates"
         )
     return rates
 
@@ -94,18 +103,25 @@ def _by_name(file: File) -> Columns:
         return find_all(file.table, *file.form.rates.split())
     measured = "angle" if file.options.increments else "rate"
     groups: dict[bool, list[Columns]] = {True: [], False: []}
-    for triple in triples(file.headers):
+    with_axes = triples(file.headers)
+    for triple in with_axes + numbered(file.headers):
         header = file.headers[triple[0]]
-        if header.quantity in ("", RATE):
-            groups[header.quantity == RATE or header.measures(measured)].append(triple)
+        certain = header.quantity == RATE or header.measures(measured)
+        if header.quantity in ("", RATE) and (certain or triple in with_axes):
+            groups[certain].append(triple)
     if not any(file.table.names) and len(file.table.names) == len(AXES):
         groups[False].append((0, 1, 2))
-    certain, silent = groups[True], groups[False]
-    if not certain and file.options.units:  # the user's word
-        certain = silent
-    if len(certain) == 1:
-        return certain[0]
-    raise _refusal_of(file, certain, silent)
+    rates, silent = groups[True], groups[False]
+    if not rates and len(silent) == 1 and is_quaternion(file.headers, silent[0]):
+        raise file.refusal(f"{file.listed(silent[0])} are by name of a quaternion; give columns")
+    if not rates and file.options.units:  # the user's word
+        rates = silent
+        if len(rates) == 1:
+            text = f"nothing but units of the options says that {file.listed(rates[0])} are rates"
+            file.note("rates", text)
+    if len(rates) == 1:
+        return rates[0]
+    raise _refusal_of(file, rates, silent)
 
 
 def _refusal_of(file: File, certain: Sequence[Columns], silent: Sequence[Columns]) -> InputError:
@@ -113,9 +129,9 @@ def _refusal_of(file: File, certain: Sequence[Columns], silent: Sequence[Columns
         first, second = map(list, certain[:2])
         return file.refusal(
             f"expected one sensor and one sample a row, got {len(certain)}, such as "
-            f"{file.listed(first)} and {file.listed(second)}; give columns of the one to read, "
-            f"such as {first}, or of both as IMUs, {{1: {first}, 2: {second}}}, or write a row for "
-            "each sample;"
+            f"{file.listed(first)} and {file.listed(second)}; if they are samples, write a row for "
+            f"each; if they are sensors, give columns of the one to read, such as {first}, or of "
+            f"both as IMUs, {{1: {first}, 2: {second}}},"
         )
     if len(silent) == 1:
         return file.refusal(

@@ -1,7 +1,7 @@
 """What the name of a column says: a unit, a quantity, an axis."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -24,6 +24,7 @@ _AXIS_WORDS = [
     {axis: axis for axis in AXES},
     {"alpha": "z", "beta": "x", "gamma": "y"},  # W3C DeviceOrientation Event Specification, 2016
     {"roll": "x", "pitch": "y", "yaw": "z"},
+    {"p": "x", "q": "y", "r": "z"},
 ]
 _BRACKETS = re.compile(r"\s*[(\[]((?:[^()\[\]]|[(\[][^()\[\]]*[)\]])*)[)\]]")
 _BEHIND_UNIT = re.compile(r"(?i)[\W_]*([xyz]|[xyz][\W_]?axis|cal|raw|since .*)?[\W_]*")
@@ -56,7 +57,7 @@ class Header(NamedTuple):
 
 @lru_cache(1 << 10)
 def _quantity_of(name: str) -> str:
-    text = " ".join(re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)).lower()
+    text = " ".join(re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name.replace("ω", "omega"))).lower()
     matches = (name for name, word in _QUANTITIES if re.search(rf"\b({word})\b", text))
     return next(matches, "")
 
@@ -114,7 +115,7 @@ def _stands_without_brackets(unit: Unit, text: str, alone: bool) -> bool:
 def triples(headers: tuple[Header, ...]) -> list[tuple[int, ...]]:
     """Numbers of columns (x, y, z) whose names differ in nothing but the axis.
 
-    Axes are x, y, z, a browser's alpha, beta, gamma, roll, pitch, yaw, or [0], [1], [2].
+    Axes are x, y, z, a browser's alpha, beta, gamma, roll, pitch, yaw, p, q, r, or [0], [1], [2].
     """
     groups: dict[str, dict[str, list[int]]] = {}
     for number, header in enumerate(headers):
@@ -126,6 +127,27 @@ def triples(headers: tuple[Header, ...]) -> list[tuple[int, ...]]:
         if set(axes) == set(AXES)  # an array of more than three has others
         for triple in zip(*(axes[axis] for axis in AXES), strict=False)
     ]
+
+
+@lru_cache(64)
+def numbered(headers: tuple[Header, ...]) -> list[tuple[int, ...]]:
+    """The same of columns without axes that end in 1, 2, 3 or 0, 1, 2: ``w0``, ``gyro 3``."""
+    with_axes = {number for triple in triples(headers) for number in triple}
+    groups: dict[str, dict[int, int]] = {}
+    for number, header in enumerate(headers):
+        match = re.fullmatch(r"(.*\D)(\d)", header.name[:_LONGEST])
+        if match and number not in with_axes:
+            groups.setdefault(match[1], {})[int(match[2])] = number
+    wanted = ([0, 1, 2], [1, 2, 3])
+    return [tuple(g[k] for k in sorted(g)) for g in groups.values() if sorted(g) in wanted]
+
+
+def is_quaternion(headers: tuple[Header, ...], triple: Sequence[int]) -> bool:
+    """Whether beside x, y, z, which have no unit of a rate, there is a w of the same name."""
+    first, names = headers[triple[0]], {header.name.lower() for header in headers}
+    name = first.name.lower()
+    beside = {f"{name[: x.start()]}w{name[x.end() :]}" for x in re.finditer("x", name)}
+    return bool(beside & names) and not first.measures("rate")
 
 
 def _axes_in(name: str) -> Iterator[tuple[str, str]]:

@@ -17,7 +17,7 @@ from scipy.ndimage import uniform_filter1d
 
 from gyro_pipeline.conventions import AXES
 from gyro_pipeline.readers.file import File
-from gyro_pipeline.readers.names import triples
+from gyro_pipeline.readers.names import OTHER, RATE, Header, triples
 from gyro_pipeline.readers.stamps import names_time
 
 Codes = NDArray[np.intp]
@@ -61,6 +61,11 @@ def _with_value(file: File, number: int, value: str | float, count: int) -> Mask
         raise file.refusal(
             f"expected {count} rows, some with {_as_text(value)} in {file.table.names[number]!r}, "
             f"got {_counted(codes, texts)}; correct rows"
+        )
+    if Header(_as_text(value)).quantity == OTHER:
+        file.contradictions.append(
+            f"rows of the options pick {_as_text(value)} in {file.listed([number])}, by its name "
+            f"no angular rate, of {_counted(codes, texts)}; correct rows"
         )
     return same
 
@@ -146,7 +151,14 @@ def _takes_turns(
         evidence = "which say what a row is"
     else:
         evidence = _change(rates, codes)
-    return evidence and f"{_counted(codes, texts)}, {evidence}", texts[filled][0]
+    return evidence and f"{_counted(codes, texts)}, {evidence}", _value(texts, rows)
+
+
+def _value(texts: NDArray[Any], rows: NDArray[np.intp]) -> str:
+    """The value to suggest: of a rate by its word, else of most rows; of no other quantity."""
+    ranks = [{RATE: 2, "": 1}.get(Header(text).quantity, 0) * bool(text) for text in texts]
+    rank, _, best = max(zip(ranks, rows.tolist(), range(len(texts)), strict=True))
+    return str(texts[best]) if rank else "…"
 
 
 def _change(rates: Floats, codes: Codes, least: float = 0.3, chance: float = 1e-12) -> str:

@@ -15,10 +15,19 @@ from gyro_pipeline.units import Unit, read_unit
 
 RATE_UNITS = "deg/s, rad/s, mdps, deg/h, … or raw (with scale_dps)"
 
-_SCALE = re.compile(
-    r"(?im)^\W*((?:g|gyro\w*)[ _]?(?:scale|sensitivity)(?:[ _]?factor)?|scale[ _]?factor|scale)"
-    r"\W+([-+]?[\d.]+(?:e[-+]?\d+)?)"
+_NUMBER = (
+    r"(?<![\w.])(?<!\d[-:])([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(?![\w.]*\d|[-:/]\d|\s*-?bit)"
 )
+_SCALE = re.compile(
+    r"(?i)(?:scal(?:e|ing)|sensitivity|resolution|gain|factor(?!y)|multiplier|lsb|(?<![a-z])g?res(?![a-z]))"
+    rf"[^\n]*?{_NUMBER}|{_NUMBER}(?=\s*(?:lsb|counts?|digits?)\W*(?:/|per))"
+)
+_OF_OTHERS = re.compile(
+    r"(?i)acc|mag|temp|time|baro|press|humid|image|video|lens|camera|screen|range|full|"
+    r"(?<![a-z])[atm][ _]?(?:scal|res|sens|gain|lsb)"
+)
+_FACTOR = re.compile(r"(?i)[*×]\s*\d|\d\s*[*×]|(?<![a-z])x\d+(?![a-z\d])")
+_DPS_PER_RAD = 57.29577951308232
 
 
 class Statement(NamedTuple):
@@ -44,8 +53,10 @@ def scale_of(file: File, rates: Sequence[int]) -> tuple[float, bool]:
     options, names = file.options, file.listed(rates)
     by_options, by_format = _of_options(file), _of_format(file, rates)
     by_file = [*_of_headers(file, rates), *_above(file)]
+    scales = _stated_scales(file, rates)
+    stated = "".join(f"; {where}: give {_typed(readings)}" for where, readings in scales)
     if not (by_options or by_file or by_format):
-        text = f"expected a unit of the rates, got {names}; give units: {RATE_UNITS}"
+        text = f"expected a unit of the rates, got {names}; give units: {RATE_UNITS}{stated}"
         raise file.refusal(file.contradictions[0] if file.contradictions else text)
     if not (by_options or by_file):
         file.note("unit", f"{by_format[0].text}; the file does not say")
@@ -59,9 +70,12 @@ def scale_of(file: File, rates: Sequence[int]) -> tuple[float, bool]:
             file.contradictions.append(f"{text}; correct units")
     counts = first.unit.quantity == "count"
     if counts and first.unit.factor == 1 and options.scale_dps is None:
-        text = f"{names} are raw counts: give units: raw and scale_dps, deg/s a count,"
+        text = f"{names} are raw counts: give units: raw and scale_dps, deg/s a count{stated},"
         raise file.refusal(text)
-    _contradict_scale_above(file, first.unit.factor)
+    _contradict_scales(file, first.unit.factor, scales)
+    if options.scale_dps is None and all(_FACTOR.search(file.table.names[n]) for n in rates):
+        text = f"{names} name a factor, and the scale is {first.unit.factor:g} deg/s"
+        file.contradictions.append(f"{text}; give units: raw and scale_dps, deg/s a count")
     return first.unit.factor, counts
 
 
@@ -118,14 +132,57 @@ def _above(file: File) -> list[Statement]:
     return statements if len(statements) == 1 else []
 
 
-def _contradict_scale_above(file: File, scale: float) -> None:
-    """A factor on the rates in the lines above the header that is not the scale."""
-    match = _SCALE.search(file.table.preamble)
-    factor = float(match[2]) if match else 0.0
-    in_rad_per_s = scale * 0.017453292519943295
-    readings = (1.0, scale, 1 / scale, in_rad_per_s)
-    if match and factor and not any(isclose(factor, other, rel_tol=1e-3) for other in readings):
-        file.contradictions.append(
-            f"a line above the header says {match[1]} {match[2]}, but the scale is {scale:g} "
-            "deg/s; give units: raw and scale_dps"
-        )
+def _stated_scales(file: File, rates: Sequence[int]) -> list[tuple[str, dict[str, float]]]:
+    """Factors on the rates that lines above the header or constant columns name.
+
+    Returns:
+        Where each stands, and deg/s a count by what it may be.
+    """
+    lines = [
+        (f"a line above the header says {line[:200].strip()!r}", line[:200])
+        for line in file.table.preamble.splitlines()
+    ]
+    for number, (name, column) in enumerate(zip(file.table.names, file.table.columns, strict=True)):
+        if number not in rates and len(column) and (column == column[0]).all():
+            lines.append((f"column {name!r} is {column[0]}", f"{name}: {column[0]}"))
+    matches = [(where, line, _SCALE.search(line)) for where, line in lines]
+    return [
+        (where, _readings(line, abs(float(match[1] or match[2]))))
+        for where, line, match in matches
+        if match and not _OF_OTHERS.search(line) and float(match[1] or match[2])
+    ]
+
+
+def _readings(line: str, factor: float) -> dict[str, float]:
+    """deg/s a count, by what a factor may be; the unit in its line leaves fewer readings."""
+    factor *= 1e-3 if re.search(r"(?i)mdps|m(?:illi)?(?:deg|°)", line) else 1
+    in_rad = {"rad/s a count": factor * _DPS_PER_RAD}
+    in_deg = {"deg/s a count": factor, "counts per deg/s": 1 / factor}
+    if re.search(r"(?i)dps|deg|°", line):
+        return in_deg
+    if re.search(r"(?i)rad", line):
+        return in_rad | {"counts per rad/s": _DPS_PER_RAD / factor}
+    return in_deg | in_rad
+
+
+def _typed(readings: dict[str, float]) -> str:
+    """What to type for a factor; a count of a gyroscope is less than a degree per second."""
+    likely = {what: dps for what, dps in readings.items() if dps < 1} or readings
+    return "units: raw, scale_dps: " + ", or ".join(
+        f"{dps:.6g} if it is {what}" for what, dps in likely.items()
+    )
+
+
+def _contradict_scales(
+    file: File, scale: float, scales: Sequence[tuple[str, dict[str, float]]]
+) -> None:
+    """Factors that are named and are not the scale; which reading of one is taken is said."""
+    for where, readings in scales:
+        if isclose(readings.get("deg/s a count", 0), 1, rel_tol=1e-3):
+            continue
+        same = [what for what, dps in readings.items() if isclose(dps, scale, rel_tol=1e-3)]
+        if not same:
+            text = f"{where}, but the scale is {scale:g} deg/s; give {_typed(readings)}"
+            file.contradictions.append(text)
+        elif sum(dps < 1 for dps in readings.values()) > 1:
+            file.note("scale", f"{where}, which is taken for {same[0]}")

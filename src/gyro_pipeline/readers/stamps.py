@@ -32,6 +32,8 @@ _STATED_RATE = re.compile(
     r"(?i)\b(?:(?:sampl\w*|output|update|data)[ _-]?(?:rate|freq\w*)|odr|fs)\b"
     r"[^\w\n]{0,20}(?:hz)?[^\w\n.]{0,20}(\d+(?:\.\d+)?)[ ]{0,3}(k?)(?:hz|\s|$|[,;\"])"
 )
+_UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_TIME_SCALE = re.compile(r"(?im)^\W*t(?:ime)?[ _]?scale\W+([\d.]+(?:e[-+]?\d+)?)\s*$")
 
 
 def names_time(header: Header) -> bool:
@@ -109,9 +111,12 @@ def _measured(file: File, number: int, unit_s: float | None, times: Floats) -> T
     if file.table.columns[number].dtype.kind != "f":
         return from_stamps(times, 1.0)
     name, options_s = file.listed([number]), _options_s(file)
+    scale = _TIME_SCALE.search(file.table.preamble)
+    stated_s = float(scale[1]) if scale else 0.0
     timing = from_stamps(times, options_s or unit_s)
     if not (options_s or unit_s):
         text = f"{name} has no unit: the rate is not measured; give time_units"
+        text += f": {stated_s:g}, as a line above the header says" if stated_s else ""
         if file.options.time_column is not None:
             raise file.refusal(text)
         return replace(timing, findings=(*timing.findings, Finding("timestamps", KEPT, text)))
@@ -121,7 +126,31 @@ def _measured(file: File, number: int, unit_s: float | None, times: Floats) -> T
             f"{timing.rate_hz * options_s / unit_s:.6g} Hz, but time_units of the options "
             f"{options_s:g} s, which makes {timing.rate_hz:.6g} Hz"
         )
-    return timing
+    used_s = options_s or unit_s or stated_s
+    if stated_s not in (0.0, 1.0) and not isclose(stated_s, used_s):
+        file.contradictions.append(
+            f"a line above the header says {scale and scale[0].strip()!r}, but a unit of {name} is "
+            f"{used_s:g} s; give time_units: {stated_s:g}"
+        )
+    return replace(timing, findings=(*timing.findings, *_implausible(file, name, timing, used_s)))
+
+
+def _implausible(
+    file: File, name: str, timing: Timing, unit_s: float, slow: float = 0.1, fast: float = 2e4
+) -> tuple[Finding, ...]:
+    """A rate in Hz at which no gyroscope is read, and the units that make a usual one."""
+    hz = timing.rate_hz
+    if hz is None or slow <= hz <= fast:
+        return ()
+    rates = {f"time_units: {u}": hz * unit_s / s for u, s in _UNITS_S.items()}
+    usual = [
+        f"{text}, which makes {rate:.6g} Hz" for text, rate in rates.items() if 1 <= rate < fast
+    ]
+    text = (
+        f"{name}, in units of {unit_s:g} s, makes {hz:.6g} Hz, at which no gyroscope is read; give "
+        f"{', or '.join(usual) or 'time_units'}, and trust: options {IN_READER}"
+    )
+    return (Finding("sample rate", KEPT if file.options.trust else REJECTED, text),)
 
 
 def counted(file: File, keep: Mask) -> Timing:

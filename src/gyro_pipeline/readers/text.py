@@ -101,7 +101,7 @@ def _read_rows(where: str, text: bytes, delimiter: str | None) -> Table:
     arrays, odd = _parse(body, layout)
     columns, findings, damaged = columns_of(layout.names, arrays, place, layout.decimal_point)
     for row in sorted(damaged | {*odd})[:100]:
-        if _are_names(_split(lines()[row][1], layout.delimiter)):
+        if _is_header(_split(lines()[row][1], layout.delimiter), layout.names):
             raise InputError(
                 f"{where}: expected numbers, got a second header in {place(row)}, "
                 f"{lines()[row][1][:80]!r}: two recordings in one file? Split it"
@@ -238,6 +238,12 @@ def _are_names(fields: Sequence[str]) -> bool:
     filled = [field.lstrip("[(") for field in fields if field]
     words = [field for field in filled if field[:1].isalpha() and not _is_number(field)]
     return len(words) > max(1, len(filled) // 2)
+
+
+def _is_header(fields: list[str], names: Sequence[str]) -> bool:
+    """Whether a line below the header is another one, not a message that has delimiters in it."""
+    same = len(fields) == len(names) or _filled(fields) == _filled([*names])
+    return same and _are_names(fields)
 
 
 def _first_row(lines: list[str], delimiter: str) -> tuple[int, int, int] | None:

@@ -56,7 +56,7 @@ def read(path: Path, options: ReaderOptions) -> Table:
     except ImportError as error:
         raise InputError(
             f"{path}: expected the library {error.name}, which is not installed; type "
-            "pip install 'gyro-pipeline[logs]'"
+            "pip install -e '.[logs]'"
         ) from error
     except InputError:
         raise
