@@ -98,7 +98,7 @@ def windows_at(samples: np.ndarray, size: int, starts: np.ndarray) -> np.ndarray
 class UsableWindows:
     """How many non-overlapping windows the recordings of a sensor, all of one length, give.
 
-    A recording without one neither trains nor tests.
+    A recording without one trains no network and tests none.
 
     Args:
         recordings: Each is read once, here.
@@ -132,7 +132,7 @@ class UsableWindows:
             first = starts[late[0]][0] // size + 1
             parts.append(f"the first one used of {_named(late)} is window {first}")
         if lost:
-            parts.append(f"none is left of {_named(lost)}, so it neither trains nor tests")
+            parts.append(f"none is left of {_named(lost)}, so it trains no network and tests none")
         return "; ".join(parts)
 
     def _starts(self, imus: Sequence[int], number: int, size: int) -> np.ndarray:

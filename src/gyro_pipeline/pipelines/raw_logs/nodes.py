@@ -80,9 +80,10 @@ def quality_table(files: Logs, inspected: Sequence[Recording]) -> pd.DataFrame:
         inspected: All recordings, by IMU and number.
 
     Returns:
-        A row per IMU and recording: ``sensor, imu, recording, file, outcome``; ``rows`` of the
-        file; the rows that are used, from ``start`` to before ``stop``, and of these ``masked``;
-        ``rate_hz``, measured; ``findings``.
+        A row per IMU and recording: ``sensor, imu, recording, file, outcome``; ``rows`` that the
+        reading did not leave out; of these, counted from 0, those that are used, from ``start`` to
+        before ``stop``, and how many of them are ``masked``; ``rate_hz``, measured; ``findings``,
+        which count the rows of the file.
     """
     rows = []
     for recording in _without_copies(inspected):
