@@ -183,7 +183,7 @@ def test_more_gyroscopes_than_a_file_holds(mine):
 
 
 def test_a_fold_that_there_is_not(mine):
-    assert "only.fold=7: memsense has folds 0 to 6" in refused(mine(good(), fold=7))
+    assert "only.fold=7: memsense has folds 0, 1, 2, 3, 4, 5, 6" in refused(mine(good(), fold=7))
 
 
 # places

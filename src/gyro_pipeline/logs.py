@@ -25,8 +25,8 @@ class Finding:
     Attributes:
         check: What looked, in two or three words, such as ``zero rows`` or ``sample rate``.
         outcome: KEPT, REPAIRED or REJECTED.
-        detail: What was found, where (0-based data rows), and what was cut or why it cannot be
-            used; a sentence without a full stop.
+        detail: What was found, where (data rows of the file, from 0), and what was cut or why it
+            cannot be used; a sentence without a full stop.
     """
 
     check: str
@@ -126,10 +126,10 @@ class Recording:
         key: As in :class:`Listing`; empty where reading it again may end otherwise.
         outcome: KEPT, REPAIRED or REJECTED.
         findings: Why.
-        rows: Rows of the file.
-        start: First row that is kept.
-        stop: The row after the last one that is kept.
-        masked: Rows between them that hold no measurement.
+        rows: Samples of its log: rows of the file, but for those that the reading left out.
+        start: First of them that is kept, counted from 0.
+        stop: The one after the last that is kept.
+        masked: How many between them hold no measurement.
         rate_hz: Measured from timestamps; None where there are none, or it cannot be read.
         content: Hash of the samples that are kept (:func:`~gyro_pipeline.fingerprints.data_hash`);
             two recordings of one hash are one.

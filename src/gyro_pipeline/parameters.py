@@ -270,8 +270,8 @@ class Quality(Parameter):
     length_s: float | None = Field(
         None,
         gt=0,
-        description="to which recordings are cut, at the expected rate, and without which they are "
-        "rejected, seconds; null: to the shortest one that is kept",
+        description="to which recordings are cut, and shorter ones rejected, seconds; null: they "
+        "keep their own, and studies use as many of their first samples as the shortest has",
     )
     needed_pct: float = Field(
         90.0,

@@ -235,7 +235,7 @@ def over_folds(cells: Sequence[Cell], folds: Sequence[int], only: Only) -> list[
     """
     if only.fold is not None and only.fold not in folds:
         raise InputError(
-            f"only.fold={only.fold}: {cells[0].sensor} has folds {min(folds)} to {max(folds)}"
+            f"only.fold={only.fold}: {cells[0].sensor} has folds {', '.join(map(str, folds))}"
         )
     wanted = [fold for fold in folds if only.fold in (None, fold)]
     return [
@@ -278,6 +278,7 @@ def run_params(
         params["turn_on_jitter_mdps"] = virtual_gyros.turn_on_jitter_mdps
     if cell.estimator not in NETWORKS:
         return params
-    validation = splits.validation_recordings if folds == 1 else splits.fold_validation_recordings
+    hold_out = cell.fold == HOLD_OUT
+    validation = splits.validation_recordings if hold_out else splits.fold_validation_recordings
     params |= training.model_dump()
     return params | {"validation_recordings": validation, "split_seed": splits.split_seed}

@@ -17,6 +17,7 @@ from gyro_pipeline.conventions import (
     TEST,
     TRAIN,
     TRUE,
+    VALIDATION,
     InputError,
 )
 from gyro_pipeline.estimators import ESTIMATORS, ORIENTATION_NOTE, RunningMean
@@ -689,6 +690,66 @@ def test_masked_samples_and_lacking_recordings_stop_nothing(damaged, as_stored):
         ]
         assert windows.groupby("recording").window.count().to_dict() == {11: 5, 12: 4, 14: 5}
         assert run.metrics["test_rmse_dps_all"] < 0.01
+
+
+def without_windows(world, *numbers):
+    """The same world, with every fifth sample of these recordings masked."""
+    recordings = world.recordings.copy(deep=True)
+    recordings.angular_rate[:, [number - 1 for number in numbers], :, ::5] = np.nan
+    return replace(world, recordings=recordings)
+
+
+def one_by_one(world, names=("cnn",), method=2, real_gyros=(3, 6)):
+    """The same world, where each of the first six recordings tests in a fold of its own."""
+    grid = Grid(method=method, real_gyros=list(real_gyros))
+    study = Study(experiment="some", estimators=list(names), sensors={"sparkfun": grid})
+    roles = [
+        (fold, n, TEST if n == fold + 1 else VALIDATION if n == (fold + 1) % 6 + 1 else TRAIN)
+        for fold in range(6)
+        for n in range(1, 7)
+    ]
+    roles = pd.DataFrame(roles, columns=["fold", "recording", "role"])
+    return replace(world, study=study, roles=roles, virtual=None)
+
+
+def train_and_judge(world, as_stored):
+    runs = [as_stored(run, f"id{i}") for i, run in enumerate(world.train())]
+    given = world.recordings, world.bias, world.allan, world.roles, world.evaluation
+    return list(evaluate(world.plan(), runs, *given))
+
+
+def test_a_recording_that_lost_its_windows_trains_and_tests_no_network(world, as_stored, caplog):
+    small = without_windows(one_by_one(world, ["cnn", *ESTIMATORS]), 3)
+    networks = small.plan()[lambda cells: cells.estimator == CNN]
+    assert set(networks.fold) == {0, 1, 3, 4, 5}
+    assert set(networks.folds) == {5}
+    assert (
+        "some sparkfun, 10 s windows: 10 of 140 lost more than 10% of their samples and are left "
+        "out; none is left of IMU 1 recording 3 (and of 1 more), so it trains no network and tests none"
+    ) in caplog.text
+    for run in train_and_judge(small, as_stored):
+        assert np.isfinite(run.artifacts[ERRORS].error_dps).all()
+        assert 3 not in set(run.artifacts[ERRORS].recording)
+
+
+@pytest.mark.parametrize(
+    ("lost", "words"),
+    [
+        (range(1, 7), "10 s windows: no test recording has one that can be used; lower windows_s"),
+        (range(2, 7), "fold 0, 10 s windows: no training recording has one .* lower windows_s"),
+    ],
+)
+def test_without_a_window_to_test_or_to_train_on_a_study_says_so(world, lost, words):
+    with pytest.raises(InputError, match=f"some sparkfun.* {words}"):
+        without_windows(one_by_one(world), *lost).train()
+
+
+def test_what_an_imu_beside_lost_changes_no_window_of_the_tested_one(world, as_stored):
+    small = one_by_one(world, method=1, real_gyros=[6])
+    recordings = small.recordings.copy(deep=True)
+    recordings.angular_rate[1, :, :, 200:230] = np.nan
+    runs = train_and_judge(replace(small, recordings=recordings), as_stored)
+    assert all(np.isfinite(run.metrics["test_rmse_dps_all"]) for run in runs)
 
 
 def test_errors_in_masked_windows_are_about_what_was_measured(damaged):

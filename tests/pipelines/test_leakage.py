@@ -171,6 +171,23 @@ def test_an_only_that_leaves_nothing_is_refused(small, only, message):
         replace(small, only=Only(**only)).plan()
 
 
+def test_a_recording_without_a_window_is_not_used(small, as_stored, caplog):
+    recordings = small.recordings.copy(deep=True)
+    recordings.angular_rate.loc[{"recording": 3}][..., ::5] = np.nan
+    p = small.parameters
+    leakage = p.leakage.model_copy(update={"strides_s": [LONG_S], "steps": 1})
+    lossy = replace(small, recordings=recordings)
+    lossy = replace(lossy, parameters=p.model_copy(update={"leakage": leakage}))
+    cells = lossy.plan()
+    assert "leakage memsense, 10 s windows: 5 of 60 lost more than 10%" in caplog.text
+    runs = [as_stored(run, f"run{number}") for number, run in enumerate(lossy.train(cells))]
+    tested = {n for run in lossy.evaluate(cells, runs) for n in run.artifacts[ERRORS].recording}
+    assert tested == {1, 2, *range(4, 13)}  # the twelfth one in its place
+    lossy.recordings.angular_rate[..., ::5] = np.nan
+    with pytest.raises(InputError, match="recordings with a window of 10 s .*, got 0; lower"):
+        lossy.plan()
+
+
 def test_runs_are_marked_and_apart(cells, trained):
     assert {run.tags[FINGERPRINT] for run in trained} == set(cells[FINGERPRINT])
     for run in trained:

@@ -221,8 +221,9 @@ def test_imus_recorded_together_cannot_get_a_role_each(world, monkeypatch):
     """IMU 2 is made to train on what IMU 1 is tested on."""
     honest = Devices._real
 
-    def leaky(self, imus, fold, role):
-        return honest(self, imus, fold, "test" if imus == (2,) and role == "train" else role)
+    def leaky(self, imus, fold, role, window):
+        role = "test" if imus == (2,) and role == "train" else role
+        return honest(self, imus, fold, role, window)
 
     monkeypatch.setattr(Devices, "_real", leaky)
     message = r"recording 11 .*: train \(IMU 2\), test \(IMU 1\); .* for all IMUs recorded together"

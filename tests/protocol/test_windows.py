@@ -3,6 +3,7 @@ import pytest
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.protocol.windows import (
+    UsableWindows,
     cut_windows,
     usable_starts,
     window_size,
@@ -81,6 +82,20 @@ def test_masked_samples_are_the_mean_of_their_window_which_is_dropped_if_it_lost
     np.testing.assert_allclose(windows[:, 0].mean(axis=1), means, rtol=1e-6)
     named = cut_windows(samples, 10, np.array([12, 6, 25]))  # the first lost two
     np.testing.assert_array_equal(named, np.stack([samples[:, 6:16], samples[:, 25:35]], axis=1))
+
+
+def test_windows_that_are_left_out_are_said(make_recordings):
+    recordings = make_recordings(np.zeros((2, 3, 3)), 40, 10.0, 1.0)
+    assert not UsableWindows(recordings).losses(10)
+    recordings.angular_rate[0, 1, :, [5, 6, 25, 26]] = np.nan
+    recordings.angular_rate[1, 1, :, 30:] = np.nan
+    windows = UsableWindows(recordings)
+    assert windows.losses(10) == (
+        "3 of 24 lost more than 10% of their samples and are left out; the first one used of IMU 1 "
+        "recording 2 is window 2"
+    )
+    counts = [windows.count(imus, 2, 10) for imus in ([1], [2], [1, 2], [3])]
+    assert counts == [2, 3, 1, 0]
 
 
 def test_a_window_may_be_the_whole_recording():

@@ -151,6 +151,9 @@ def test_rows_are_named_as_the_file_has_them(still, quality):
     inspected = inspect(Log(still, rows=2 * np.arange(ROWS) + 1), RATE_HZ, quality)
     assert "row 21, masked" in detail(inspected, "spikes")
     assert np.flatnonzero(inspected.masked).tolist() == [10]
+    log = Log(still, rows=2 * np.arange(ROWS) + 1, gap_rows=np.array([500]))
+    words = "the longest stretch, of 6000 rows, is rows 1001 to 11999 (5 to 59.99 s)"
+    assert detail(inspect(log, RATE_HZ, quality), "gaps") == words
 
 
 def test_what_is_masked_at_the_ends_is_cut(still, quality):

@@ -41,6 +41,14 @@ def test_devices_that_take_turns_are_refused_and_picked(name, numbers, details, 
     assert details(read_beside(name, numbers, rates, trust="options"), "trust: options")
 
 
+def test_findings_of_the_clock_count_the_rows_of_the_file(read, details):
+    header, seconds = "time (s),sensor,gx (dps),gy (dps),gz (dps)", ROWS / 300 + (ROWS >= 3000)
+    log = read(header, seconds, ROWS % 2, WHITE, rows={"sensor": 1})
+    assert log.gap_rows.tolist() == [1500]
+    (detail,) = details(log, "gaps")
+    assert detail == "samples are missing, about 150: once, before row 3001"
+
+
 @pytest.mark.parametrize(
     ("name", "column", "rates", "words"),
     [

@@ -24,7 +24,7 @@ from gyro_pipeline.parameters import Leakage
 from gyro_pipeline.protocol.recordings import recordings_of_test_imu
 from gyro_pipeline.protocol.scores import Estimate, SquaredErrors, curve_errors, score
 from gyro_pipeline.protocol.splits import deal, refuse_two_roles
-from gyro_pipeline.protocol.windows import window_size, window_starts
+from gyro_pipeline.protocol.windows import UsableWindows, window_size, window_starts
 
 
 @dataclass(frozen=True)
@@ -65,11 +65,20 @@ def divide_windows(  # noqa: PLR0917 - what a division depends on
     numbers = used_recordings(recordings, leakage)
     if len(numbers) < leakage.folds:
         raise InputError(
-            f"{sensor}: expected at least {leakage.folds} recordings, one for each of "
-            f"leakage.folds, got {len(numbers)}; lower leakage.folds"
+            f"{sensor}: expected at least {leakage.folds} recordings with a window of "
+            f"{leakage.window_s:g} s that can be used, one for each of leakage.folds, got "
+            f"{len(numbers)}; lower leakage.window_s or leakage.folds, or bring recordings"
         )
     starts = window_starts(samples, size, stride)
     return divide(leak, numbers, starts, leakage.folds, fold, seed)
+
+
+def with_windows(recordings: xr.Dataset, leakage: Leakage) -> xr.Dataset:
+    """The recordings of which the tested IMU has a window that can be used."""
+    windows, size = UsableWindows(recordings), round(leakage.window_s * recordings.attrs["rate_hz"])
+    numbers = recordings.recording.to_numpy().tolist()
+    chosen = [number for number in numbers if windows.count([TEST_IMU], number, size)]
+    return recordings if len(chosen) == len(numbers) else recordings.sel(recording=chosen)
 
 
 def used_recordings(recordings: xr.Dataset, leakage: Leakage) -> list[int]:

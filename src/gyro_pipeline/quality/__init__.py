@@ -42,8 +42,8 @@ class Inspected:
 
     Attributes:
         outcome: KEPT, REPAIRED or REJECTED, the worst that a finding ends in.
-        start: First row of the log that makes the recording, 0-based.
-        stop: The row after its last; equal to ``start`` if there is none.
+        start: First sample of the log that makes the recording, 0-based.
+        stop: The sample after its last; equal to ``start`` if there is none.
         masked: (stop - start,), rows in it that hold no measurement.
         findings: Of the reading, then of the checks.
     """

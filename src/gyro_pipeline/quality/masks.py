@@ -54,9 +54,11 @@ def keep_longest_stretch(recording: Recording) -> None:
     edges = np.unique([0, *recording.log.gap_rows, recording.masked.size]).astype(np.intp)
     used = np.add.reduceat(~recording.masked, edges[:-1], dtype=np.intp)
     start, stop = edges[used.argmax() :][:2] if used.size else (0, 0)
-    recording.masked[:start] = recording.masked[stop:] = True
+    stretch = np.zeros_like(recording.masked)
+    stretch[start:stop] = True
+    recording.masked |= ~stretch
     if used.size > 1:
-        detail = f"rows {start} to {stop - 1}, of {edges[-1]}, are the longest stretch"
+        detail = f"the longest stretch, of {edges[-1]} rows, is {recording.where(stretch)}"
         recording.add("gaps", REPAIRED, detail)
     recording.trim()
 

@@ -33,24 +33,26 @@ class Timing:
     findings: tuple[Finding, ...] = ()
 
 
-def from_stamps(stamps: Floats, unit_s: float | None) -> Timing:
+def from_stamps(stamps: Floats, unit_s: float | None, numbers: Rows | None = None) -> Timing:
     """Sample rate and gaps from timestamps.
 
     Args:
         stamps: (n,), one a row, in any unit; NaN where a row has none.
         unit_s: Seconds in one unit of them; None: not known, and no rate.
+        numbers: (n,), of the rows in the file, for findings; None: from 0.
 
     Returns:
         Rows behind missing samples, and those at which time goes back, are gaps. The rate is that
         between them; a finding is REJECTED where it changes along the recording.
     """
+    numbers = np.arange(len(stamps)) if numbers is None else numbers
     stamps, strays = _without_strays(stamps)
     rows = np.flatnonzero(np.isfinite(stamps))
     times, wraps, back = _increasing(stamps[rows], unit_s)
     findings = [
-        *_at("timestamps", strays, "a timestamp is far from those beside it, and ignored"),
-        *_at("wrap-around", rows[wraps], "the counter of the timestamps starts anew"),
-        *_at("time order", rows[back], "time goes back", REPAIRED),
+        *_at("timestamps", numbers[strays], "a timestamp is far from those beside it, and ignored"),
+        *_at("wrap-around", numbers[rows[wraps]], "the counter of the timestamps starts anew"),
+        *_at("time order", numbers[rows[back]], "time goes back", REPAIRED),
     ]
     usual = _slope(times, rows, len(rows) // 20)
     if not usual > 0:
@@ -62,9 +64,10 @@ def from_stamps(stamps: Floats, unit_s: float | None) -> Timing:
     step, losses, even = _fit(times[last], rows[last], stamps[rows])
     gaps = rows[first][losses > 0]
     text = "the timestamp of the row before, as a coarse clock, bursts and doubled rows have it"
+    missing = f"samples are missing, about {losses.sum():.0f}"
     findings += [
-        *_at("gaps", gaps, f"samples are missing, about {losses.sum():.0f}", REPAIRED),
-        *_at("timestamps", rows[~first], text),
+        *_at("gaps", numbers[gaps], missing, REPAIRED, "before"),
+        *_at("timestamps", numbers[rows[~first]], text),
         *_regularity(even, rows[last], losses == 0),
     ]
     rate_hz = None if unit_s is None else 1 / (step * unit_s)
@@ -270,11 +273,10 @@ def check_rate(rate_hz: float, expected_hz: float, tolerance_pct: float) -> tupl
     return (Finding("sample rate", REJECTED, text),)
 
 
-def _at(check: str, rows: Rows, text: str, outcome: str = KEPT) -> list[Finding]:
+def _at(check: str, rows: Rows, text: str, outcome: str = KEPT, place: str = "at") -> list[Finding]:
     """How often something is so, and where first; no finding if it never is."""
     if not len(rows):
         return []
     listed = ", ".join(map(str, rows[:3])) + (", …" if len(rows[3:]) else "")
-    count = "once, at row" if len(rows) == 1 else f"{len(rows)} times, at rows"
-    cut = ", cut there" if outcome == REPAIRED else ""
-    return [Finding(check, outcome, f"{text}: {count} {listed}{cut}")]
+    count = f"once, {place} row" if len(rows) == 1 else f"{len(rows)} times, {place} rows"
+    return [Finding(check, outcome, f"{text}: {count} {listed}")]

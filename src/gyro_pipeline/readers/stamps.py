@@ -63,7 +63,7 @@ def timing_of(file: File, keep: Mask) -> Timing:
         if stepwise:
             times = np.cumsum(np.nan_to_num(times))  # of all rows, also of those left out
         if _increase(times[keep], 0.0 if named else 0.95):
-            return _measured(file, number, unit_s, times[keep])
+            return _measured(file, number, unit_s, times, keep)
     if file.options.time_column is not None:
         problem = problem or f"{file.options.time_column!r} holds no times that can be read"
         raise file.refusal(f"{problem}, or correct time_column")
@@ -106,14 +106,17 @@ def _options_s(file: File) -> float | None:
     return (read_unit(units) or Unit("time")).factor if isinstance(units, str) else units
 
 
-def _measured(file: File, number: int, unit_s: float | None, times: Floats) -> Timing:
-    """Rate and gaps; the unit of the options contradicts another one of the file."""
+def _measured(file: File, number: int, unit_s: float | None, times: Floats, keep: Mask) -> Timing:
+    """Rate and gaps by times (n,), where rows are kept.
+
+    A unit of the options contradicts another one of the file.
+    """
     if file.table.columns[number].dtype.kind != "f":
-        return from_stamps(times, 1.0)
+        return from_stamps(times[keep], 1.0, np.flatnonzero(keep))
     name, options_s = file.listed([number]), _options_s(file)
     scale = _TIME_SCALE.search(file.table.preamble)
     stated_s = float(scale[1]) if scale else 0.0
-    timing = from_stamps(times, options_s or unit_s)
+    timing = from_stamps(times[keep], options_s or unit_s, np.flatnonzero(keep))
     if not (options_s or unit_s):
         text = f"{name} has no unit: the rate is not measured; give time_units"
         text += f": {stated_s:g}, as a line above the header says" if stated_s else ""

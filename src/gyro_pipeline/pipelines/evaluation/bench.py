@@ -66,7 +66,7 @@ from gyro_pipeline.protocol.truths import (
     running_mean_curve,
     stacked,
 )
-from gyro_pipeline.protocol.windows import cut_windows, window_size
+from gyro_pipeline.protocol.windows import cut_windows, window_size, windows_at
 from gyro_pipeline.tracking import metric_name
 
 _CURVE_POINTS = 30  # of the expected running mean, to interpolate between
@@ -159,7 +159,8 @@ class Bench:
                 else np.concatenate(seen.sel(recording=recording.number).to_numpy())
             )
             starts = recording.starts(self.size)
-            windows = cut_windows(samples, self.size, starts).transpose(1, 0, 2)
+            # those of the tested IMU, whatever IMUs beside it lost
+            windows = windows_at(samples, self.size, starts).transpose(1, 0, 2)
             start_s = starts / self.recordings.attrs["rate_hz"]
             judged = {
                 target: [

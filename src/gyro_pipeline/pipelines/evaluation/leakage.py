@@ -36,6 +36,7 @@ from gyro_pipeline.protocol.leaks import (
     divide_windows,
     strided_scores,
     used_recordings,
+    with_windows,
 )
 from gyro_pipeline.protocol.scores import resampled_weights
 from gyro_pipeline.protocol.windows import cut_windows
@@ -88,6 +89,7 @@ def evaluate_leakage(  # noqa: PLR0917 - a node's arguments are its datasets
         The check against the oracle is not among them: a leak is meant to beat it.
     """
     judged_with = fingerprint([code_hash(_CODE), evaluation.model_dump()])
+    recordings = with_windows(recordings, leakage)
     numbers = tuple(used_recordings(recordings, leakage))
     device = describe_device(recordings, bias, allan, numbers, evaluation.bootstrap_seed)
     bench = Bench(recordings, device, numbers, leakage.window_s, evaluation)

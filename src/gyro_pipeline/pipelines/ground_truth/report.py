@@ -8,6 +8,7 @@ import xarray as xr
 
 from gyro_pipeline.conventions import AXES
 from gyro_pipeline.logs import REJECTED
+from gyro_pipeline.protocol.rejections import reasons
 
 logger = logging.getLogger(__name__)
 
@@ -23,8 +24,8 @@ def report_biases(
         recordings: For the sensor and its sample rate.
         bias: The ground truth of all recordings.
         quality: A row per recording: its outcome, which rows are used and how many masked.
-        most: Number of recordings that are printed, of the used and of the rejected; more are
-            counted.
+        most: Number of biases that are printed; more are counted. Of the rejected recordings each
+            reason is printed once.
     """
     sensor, rate_hz = recordings.attrs["sensor"], recordings.attrs["rate_hz"]
     texts = list(map(_with_error, bias.bias_dps, bias.standard_error_dps))
@@ -36,13 +37,9 @@ def report_biases(
     lines = [whole.to_string(index=False)]
     if bias.standard_error_dps.isna().any():
         lines.append("± –: no standard error, the recordings are too short to fit their noise")
-    rejected = quality[quality.outcome == REJECTED]
-    for row in rejected.head(most).itertuples():
-        where = f"IMU {row.imu} recording {row.recording}, {row.file}"
-        lines.append(f"rejected: {where}: {row.findings}")
-    for rows, name in ((table, "biases"), (rejected, "their quality")):
-        if len(rows) > most:
-            lines.append(f"{len(rows) - most} more are in the table of {name}")
+    if len(table) > most:
+        lines.append(f"{len(table) - most} more are in the table of biases")
+    lines += [f"rejected: {reason}" for reason in reasons(quality[quality.outcome == REJECTED])]
     logger.info("%s: biases ± standard errors, deg/s\n%s", sensor, "\n".join(lines))
 
 

@@ -1,7 +1,6 @@
 """Nodes of the raw-logs stage."""
 
 import logging
-import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -19,6 +18,7 @@ from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding, Listing, Logs,
 from gyro_pipeline.parameters import Execution, Quality
 from gyro_pipeline.protocol import inspection
 from gyro_pipeline.protocol.inspection import Inspection, judge
+from gyro_pipeline.protocol.rejections import NAMED, reasons
 
 logger = logging.getLogger(__name__)
 
@@ -28,8 +28,6 @@ _AT_ONCE, _BYTES_AT_ONCE = 16, 16 * 10**6
 """Recordings, and bytes of them, that go to a process together, and come back so."""
 _OF_USED = ("start", "stop", "masked")
 """Columns of recordings that are used."""
-_NAMED = 10
-"""So many are named in a message; all are in the table."""
 
 
 def inspect_logs(
@@ -82,9 +80,10 @@ def quality_table(files: Logs, inspected: Sequence[Recording]) -> pd.DataFrame:
         inspected: All recordings, by IMU and number.
 
     Returns:
-        A row per IMU and recording: ``sensor, imu, recording, file, outcome``; ``rows`` of the
-        file; the rows that are used, from ``start`` to before ``stop``, and of these ``masked``;
-        ``rate_hz``, measured; ``findings``.
+        A row per IMU and recording: ``sensor, imu, recording, file, outcome``; ``rows`` that the
+        reading did not leave out; of these, counted from 0, those that are used, from ``start`` to
+        before ``stop``, and how many of them are ``masked``; ``rate_hz``, measured; ``findings``,
+        which count the rows of the file.
     """
     rows = []
     for recording in _without_copies(inspected):
@@ -174,11 +173,11 @@ def require_enough(table: pd.DataFrame, quality: Quality) -> None:
             raise InputError(
                 f"{label}: {remain} of {len(listed)} recordings can be used, quality.needed_pct "
                 f"asks for {quality.needed_pct:g} %. Repair or remove the others, or lower it:\n  "
-                + "\n  ".join(_reasons(bad))
+                + "\n  ".join(reasons(bad))
             )
     lost = sorted(set(table.imu) - set(table.imu[~rejected]))
     if lost:
-        shown = ", ".join(map(str, lost[:_NAMED])) + (", …" if len(lost) > _NAMED else "")
+        shown = ", ".join(map(str, lost[:NAMED])) + (", …" if len(lost) > NAMED else "")
         logger.warning("%s: no recording is left of IMU %s", sensor, shown)
 
 
@@ -198,18 +197,3 @@ def _without_copies(inspected: Sequence[Recording]) -> Iterator[Recording]:
 def _rounded(rate_hz: float | None) -> float | None:
     """To a millionth, which is better than any logger's clock."""
     return None if rate_hz is None else float(f"{rate_hz:.6g}")
-
-
-def _reasons(rejected: pd.DataFrame) -> list[str]:
-    """Why recordings were rejected, each reason once, with the recordings that it is of."""
-    reasons = [
-        re.sub(rf"\S*{re.escape(file)}", "the file", str(findings))
-        for file, findings in zip(rejected.file, rejected.findings, strict=True)
-    ]
-    lines = []
-    for reason, alike in rejected.groupby(reasons, sort=False):
-        row, more = alike.iloc[0], f", and {len(alike) - 1} more" if len(alike) > 1 else ""
-        lines.append(f"IMU {row.imu} recording {row.recording}, {row.file}{more}: {reason}")
-    further = len(lines) - _NAMED
-    rest = [f"and {further} other reasons, in the table of their quality"] if further > 0 else []
-    return lines[:_NAMED] + rest

@@ -17,13 +17,14 @@ from gyro_pipeline.pipelines.training.nodes import (
     check_cell,
     check_present,
     labelled_bias,
+    log_losses,
     train_missing,
     training_code,
 )
 from gyro_pipeline.protocol import leaks
-from gyro_pipeline.protocol.leaks import Division, divide_windows
-from gyro_pipeline.protocol.windows import window_size
-from gyro_pipeline.studies import CNN_SHUFFLED, LeakCell, leak_cells, leak_params
+from gyro_pipeline.protocol.leaks import Division, divide_windows, with_windows
+from gyro_pipeline.protocol.windows import UsableWindows, window_size
+from gyro_pipeline.studies import CNN_SHUFFLED, LEAKAGE, LeakCell, leak_cells, leak_params
 from gyro_pipeline.tracking import FINGERPRINT, StoredRun, TrainedRun
 
 
@@ -53,6 +54,10 @@ def plan_leakage(
         InputError: If the recordings cannot give what is asked for, or ``only`` leaves nothing.
     """
     sensor, source = recordings.attrs["sensor"], recordings.attrs["source"]
+    size = round(leakage.window_s * recordings.attrs["rate_hz"])
+    label = f"{LEAKAGE} {sensor}, {leakage.window_s:g} s windows"
+    log_losses(label, UsableWindows(recordings), size)
+    recordings = with_windows(recordings, leakage)
     sizes = leakage.training(training, windows=1)
     code = [*training_code(), code_hash([leaks])]
     wanted = only.model_dump(exclude_none=True)
@@ -108,7 +113,7 @@ def train_leakage(  # noqa: PLR0917 - a node's arguments are its datasets
         row[FINGERPRINT]: LeakCell(**{name: row[name] for name in LeakCell.names()})
         for row in cells.to_dict("records")
     }
-    biases = labelled_bias(bias)
+    biases, recordings = labelled_bias(bias), with_windows(recordings, leakage)
 
     def job(name: str, cell: LeakCell) -> TrainingJob:
         divided = divide_windows(*_division(cell), recordings, leakage, splits.split_seed)

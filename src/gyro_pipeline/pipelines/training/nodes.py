@@ -30,7 +30,7 @@ from gyro_pipeline.parameters import Execution, Only, Splits, Study, Training, V
 from gyro_pipeline.protocol import windows
 from gyro_pipeline.protocol.recordings import present
 from gyro_pipeline.protocol.splits import check_devices, check_roles, refuse_two_roles, with_role
-from gyro_pipeline.protocol.windows import window_size
+from gyro_pipeline.protocol.windows import UsableWindows, window_size
 from gyro_pipeline.studies import (
     CNN,
     CNN_SHUFFLED,
@@ -43,6 +43,8 @@ from gyro_pipeline.studies import (
 from gyro_pipeline.tracking import FINGERPRINT, HISTORY, TRAINED_IN, WEIGHTS, StoredRun, TrainedRun
 
 logger = logging.getLogger(__name__)
+
+_ADVICE = "lower windows_s of the study, or bring recordings that lost fewer samples"
 
 
 def plan(
@@ -79,11 +81,12 @@ def plan(
     sensor, source = recordings.attrs["sensor"], recordings.attrs["source"]
     folds = sorted(roles.fold.unique().tolist())
     cells = study_cells(study, sensor, source, windows_s, seeds, only)
-    cells = over_folds(cells, folds, only)
     for cell in cells:
         check_cell(cell, recordings, training)
         if not study.unseen_devices:
             check_present(cell, recordings)
+    tested = tested_folds(study.experiment, cells, recordings, roles)
+    cells = [one for cell in cells for one in over_folds([cell], tested[cell.window_s], only)]
     code = training_code()
     rows = []
     for cell in cells:
@@ -96,8 +99,32 @@ def plan(
         if cell.virtual_gyros and virtual is not None:
             content |= {"virtual": virtual.attrs["data_hash"]}
         hashed = fingerprint(content)
-        rows.append({name: getattr(cell, name) for name in Cell.names()} | {FINGERPRINT: hashed})
-    return pd.DataFrame(rows).assign(folds=len(folds))
+        made_of = {FINGERPRINT: hashed, "folds": len(tested[cell.window_s])}
+        rows.append({name: getattr(cell, name) for name in Cell.names()} | made_of)
+    return pd.DataFrame(rows)
+
+
+def tested_folds(
+    study: str, cells: Sequence[Cell], recordings: xr.Dataset, roles: pd.DataFrame
+) -> dict[float, list[int]]:
+    """Folds with a window to test, for each window length; the log says which windows are lost.
+
+    Raises:
+        InputError: No fold has one.
+    """
+    sensor, rate_hz = recordings.attrs["sensor"], recordings.attrs["rate_hz"]
+    windows, tests = UsableWindows(recordings), roles[roles.role == TEST]
+    tests = tests if "imu" in tests else tests.assign(imu=TEST_IMU)
+    folds: dict[float, list[int]] = {}
+    for window_s in dict.fromkeys(cell.window_s for cell in cells):
+        size, label = round(window_s * rate_hz), f"{study} {sensor}, {window_s:g} s windows"
+        log_losses(label, windows, size)
+        places = zip(tests.imu.tolist(), tests.recording.tolist(), strict=True)
+        counts = [windows.count([imu], number, size) for imu, number in places]
+        folds[window_s] = sorted(tests.fold[np.array(counts) > 0].unique().tolist())
+        if not folds[window_s]:
+            raise InputError(f"{label}: no test recording has one that can be used; {_ADVICE}")
+    return folds
 
 
 def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
@@ -130,14 +157,14 @@ def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
         Runs that wait for their evaluation.
     """
     planned = {row[FINGERPRINT]: _cell(row) for row in cells.to_dict("records")}
-    folds = int(cells.folds.iloc[0])
+    folds = dict(zip(planned.values(), cells.folds.tolist(), strict=True))
     devices = Devices(recordings, labelled_bias(bias), roles, virtual, virtual_gyros)
     yield from train_missing(
         planned,
         tracked,
         recordings.attrs,
         execution,
-        params=lambda cell: run_params(cell, folds, training, splits, virtual_gyros),
+        params=lambda cell: run_params(cell, folds[cell], training, splits, virtual_gyros),
         job=lambda name, cell: devices.job(name, cell, training),
     )
 
@@ -146,6 +173,12 @@ def training_code() -> list[str]:
     """What the results of a training depend on beside its settings and data."""
     modules = [batched, examples, fused, jobs, network, packing, trainer, trainings, windows]
     return [code_hash(modules), *(path.read_text() for path in fused.SOURCES)]
+
+
+def log_losses(label: str, windows: UsableWindows, size: int) -> None:
+    """Say which windows of a study are left out, if any is."""
+    if losses := windows.losses(size):
+        logger.warning("%s: %s", label, losses)
 
 
 C = TypeVar("C", bound=Cell)
@@ -223,18 +256,27 @@ class Devices:
     ) -> None:
         self._recordings, self._bias, self._roles = recordings, bias, roles
         self._virtual, self._virtual_gyros = virtual, virtual_gyros
+        self._windows = UsableWindows(recordings)
 
     def job(self, name: str, cell: Cell, training: Training) -> TrainingJob:
         """The training of a cell, under a name of the caller's choice.
 
         Raises:
-            InputError: If a recording would be used in two roles, be it by different IMUs.
+            InputError: If a recording would be used in two roles, be it by different IMUs, or no
+                window is left to train on.
         """
         samples, rate_hz = self._recordings.sizes["sample"], self._recordings.attrs["rate_hz"]
         imus = tuple(self._recordings.imu.to_numpy()[: cell.real_imus].tolist())
         inputs = [imus] if cell.method == 1 else [(imu,) for imu in imus]
-        devices = [self._real(side_by_side, cell.fold, TRAIN) for side_by_side in inputs]
-        validation = self._real(inputs[0], cell.fold, VALIDATION)
+        window = window_size(cell.window_s, rate_hz, samples, cell.sensor)
+        devices = [self._real(side_by_side, cell.fold, TRAIN, window) for side_by_side in inputs]
+        if not devices[0].numbers:  # whose centre the estimates are about
+            raise InputError(
+                f"{cell.study} {cell.sensor} fold {cell.fold}, {cell.window_s:g} s windows: no "
+                f"training recording has one that can be used; {_ADVICE}"
+            )
+        devices = [device for device in devices if device.numbers]
+        validation = self._real(inputs[0], cell.fold, VALIDATION, window)
         tested = [(TEST_IMU, number) for number in with_role(self._roles, cell.fold, TEST)]
         used = {TRAIN: _used(devices), VALIDATION: _used([validation]), TEST: tested}
         refuse_two_roles(used, f"{cell.sensor} fold {cell.fold}")
@@ -247,16 +289,18 @@ class Devices:
             name=name,
             devices=devices,
             validation=validation if validation.numbers else None,
-            window=window_size(cell.window_s, rate_hz, samples, cell.sensor),
+            window=window,
             settings=training,
             seed=cell.seed,
             cell=cell if shuffled else replace(cell, seed=0),  # a seed has labels of its own
         )
 
-    def _real(self, imus: tuple[int, ...], fold: int, role: str) -> Device:
-        numbers = with_role(self._roles, fold, role)
-        there = present(self._recordings).sel(imu=list(imus), recording=numbers).all("imu")
-        numbers = np.array(numbers)[there.to_numpy()].tolist()
+    def _real(self, imus: tuple[int, ...], fold: int, role: str, window: int) -> Device:
+        numbers = [
+            number
+            for number in with_role(self._roles, fold, role)
+            if self._windows.count(imus, number, window)
+        ]
         return Device(self._recordings.angular_rate, self._bias, imus, tuple(numbers))
 
     def _virtual_imu(self, imu: int) -> Device:
