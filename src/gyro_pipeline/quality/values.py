@@ -1,6 +1,9 @@
 """Values that no gyroscope at rest gives, each told by a function of its own."""
 
+from statistics import NormalDist
+
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from gyro_pipeline.conventions import AXES, MDPS
 from gyro_pipeline.logs import KEPT, REJECTED
@@ -46,29 +49,75 @@ def check_steps(recording: Recording) -> None:
         recording.add("coarse quantisation", outcome, detail)
 
 
-def check_levels(recording: Recording, least: int = 8) -> None:
-    """A value that comes ``least`` times and twice as often as the next: a flat top, a dead band.
+def check_dead_band(recording: Recording) -> None:
+    """Zeros amid the noise that come too often: small values, or parts of a count, were cut."""
+    for name, rates in zip(AXES, recording.used, strict=True):
+        often = zero_excess(recording, rates)
+        if often and rates.min() < 0 < rates.max():
+            band, step = np.abs(rates[rates != 0]).min(), np.diff(np.unique(rates))
+            cut = f"± {band:.2g} deg/s" if band > 1.5 * np.median(step) else "counts cut to zero?"  # noqa: PLR2004
+            detail = f"axis {name}, {cut}: 0 comes {often:.2g} times as often as its neighbours; "
+            detail += "the mean is pulled to zero; log the raw rates"
+            recording.add("dead band", REJECTED, detail)
 
-    The tail of noise thins out, and behind a low-pass filter a peak lasts, but comes once. A step
-    above 0.2 sigma hides a top at 2 sigma, which shifts the mean by 0.008 sigma. A dead band is a
-    gap on both sides of zero, five times as wide as others.
+
+def zero_excess(recording: Recording, rates: Array, least: int = 8) -> float:
+    """How many times as often as its neighbours zero comes; 0: no more than by chance."""
+    if np.count_nonzero(rates == 0) < least:
+        return 0.0
+    values, often = frequent_values(recording, rates)
+    return float(often[values == 0].sum())
+
+
+def check_levels(recording: Recording, least: float = 3) -> None:
+    """The value that comes most beyond its neighbours: a flat top at an end, elsewhere a code.
+
+    Elsewhere it comes ``least`` times as often: where numbers are rounded twice, two share a value.
     """
     for name, rates in zip(AXES, recording.used, strict=True):
-        if max(np.count_nonzero(rates == value) for value in (rates.min(), rates.max(), 0)) < least:
-            continue
-        values, counts = np.unique(rates[1:][np.diff(rates) != 0], return_counts=True)
-        gaps, zero = np.diff(values), np.searchsorted(values, 0)
-        if gaps.size < 2:  # noqa: PLR2004 - of two values alone, nothing is a tail
-            continue
-        for end, following in ((0, 1), (-1, -2)):
-            if counts[end] >= max(least, 2 * counts[following]):
-                detail = f"axis {name} is cut off at {values[end]:.4g} deg/s, {counts[end]} times"
-                recording.add("saturation", REJECTED, f"{detail}; the mean is pulled from there")
-        if 0 < zero < gaps.size and values[zero] == 0 and counts[zero] >= least:
-            band = gaps[zero - 1 : zero + 1].min()
-            if band > 5 * np.median(gaps):
-                detail = f"± {band:.2g} deg/s on axis {name}; the mean is pulled to zero"
-                recording.add("dead band", REJECTED, detail)
+        values, often = frequent_values(recording, rates)
+        often[1:-1][often[1:-1] < least] = 0
+        if often.any():
+            most = often.argmax()
+            end = most in {0, values.size - 1}
+            detail = f"axis {name} {'is cut off' if end else 'is held'} at {values[most]:.4g} deg/s"
+            detail += f", {np.count_nonzero(rates == values[most])} times; the mean is pulled there"
+            recording.add("saturation" if end else "frequent value", REJECTED, detail)
+
+
+def frequent_values(
+    recording: Recording, rates: Array, least: float = 1.5, most: int = 3
+) -> tuple[Array, Array]:
+    """Values, and how many times as often as their neighbours they come; 0: no more than by chance.
+
+    The neighbours' counts give the one between by a cubic through their logarithms, which is exact
+    for normal noise on a fine grid and too large on a coarse one, or by a line where that is more.
+    Chance is that of runs, as of independent samples. More than ``most`` such values are a pattern,
+    as of numbers rounded twice, which moves no mean.
+    """
+    ordered = np.sort(rates)
+    nowhere = np.zeros(0), np.zeros(0)
+    if not np.any(ordered[7:] == ordered[:-7]):  # fewer never are beyond chance
+        return nowhere
+    values, counts = np.unique(ordered, return_counts=True)
+    if values.size < 3:  # noqa: PLR2004 - of two values alone, nothing is a tail
+        return nowhere
+    # beyond the ends a tail goes on to less than one count
+    below, above = (min(0.5, a**2 / b) for a, b in (counts[:2], counts[:-3:-1]))
+    padded = np.array([below, below, *counts, above, above])
+    second, first, _, third, fourth = sliding_window_view(padded, values.size)
+    near, far = np.log(first) + np.log(third), np.log(second) + np.log(fourth)
+    expected = np.exp(np.maximum(near / 2, (4 * near - far) / 6)) / counts
+    runs = counts - np.bincount(
+        np.searchsorted(values, rates[1:][np.diff(rates) == 0]), minlength=values.size
+    )
+    # twice the root of a count scatters by 1
+    variance = (16 / first + 16 / third + 1 / second + 1 / fourth) / 36 * counts
+    beyond = 2 * np.sqrt(runs) * (1 - np.sqrt(expected)) / np.sqrt(1 + expected * variance)
+    limit = -NormalDist().inv_cdf(recording.quality.false_alarm / (len(AXES) * values.size))
+    often = np.where(beyond > limit, 1 / expected, 0)
+    often[often < least] = 0
+    return (values, often) if np.count_nonzero(often) <= most else nowhere
 
 
 def check_turns(recording: Recording, least: float = 0.5, period: int = 60) -> None:
