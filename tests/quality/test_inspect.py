@@ -75,6 +75,15 @@ def rounded(step):
     return lambda x: step * np.round(x / step)
 
 
+def held_in_turn(x):
+    return np.stack([x[np.maximum((ROW - 3 * i) // 10 * 10 + 3 * i, 0), i] for i in range(3)], 1)
+
+
+def held_thrice(x):
+    x[:, 1] = x[ROW // 3 * 3, 1]
+    return x
+
+
 def blanked(x):
     """A twentieth of the rows as zeros, about biases of two sigma."""
     x = (x - BIAS) + [0.1, -0.1, 0.1]
@@ -144,6 +153,10 @@ FEW, SOME = RANDOM.random(ROWS) < 0.02, RANDOM.random(ROWS) < 0.1
         (rounded(1.3 * SIGMA), {"coarse quantisation": KEPT}, []),
         (rounded(3 * SIGMA), {"coarse quantisation": REJECTED}, ["quality.largest_step"]),
         (thrice, {"repeated rows": KEPT}, ["6.7%"]),
+        (held_in_turn, {"repeated values": REJECTED}, ["axis x repeats 90%", "axis z repeats 90%"]),
+        (held_thrice, {"repeated values": REJECTED}, ["axis y repeats 67%"]),
+        (lambda x: x[:, [1, 1, 2]], {"equal axes": REJECTED}, ["axes x and y", "`columns`"]),
+        (lambda x: rounded(SIGMA)(x[:, [0, 0, 0]]), {"equal axes": REJECTED}, ["axes y and z"]),
         (lambda x: x * 20, {"noise level": REJECTED}, ["quality.largest_noise_dps"]),
     ],
 )  # fmt: skip
@@ -160,18 +173,21 @@ def test_each_oddity_has_its_finding(still, quality, change, expected, words):
 @pytest.mark.parametrize(
     ("rows", "sigmas"),
     [(ROW % 2 == 0, 1), (ROW % 3 == 0, 1), (ROW % 4 < 2, 1), (ROW % 5 == 0, 1),
+     (ROW % 7 == 0, 1.2), (ROW % 11 < 4, 1), (ROW % 13 == 0, 1.3),
      ((ROW + ROW // 611) % 2 == 0, 6), (RANDOM.random(ROWS) < 0.5, 12), (SOME, 12)],
-    ids=["2 in turn", "3 in turn", "4 in turn", "5 in turn", "slips", "random", "few at random"],
+    ids=["2 in turn", "3 in turn", "4 in turn", "5 in turn", "7 in turn", "11 in turn",
+         "13 in turn", "slips", "random", "few at random"],
 )  # fmt: skip
 def test_rows_of_two_devices_are_rejected_in_any_order(still, quality, rows, sigmas):
     still[rows] += [0, sigmas * SIGMA, 0]
     inspected = inspect(Log(still), RATE_HZ, quality)
     assert checks(inspected) == {"mixed rows": REJECTED}
     assert "axis y jumps by" in detail(inspected, "mixed rows")
+    assert "Split it by device" in detail(inspected, "mixed rows")
 
 
 @pytest.mark.parametrize("step", [0, 0.4, 1, 1.9])
-@pytest.mark.parametrize("hz", [11, 24, 50])
+@pytest.mark.parametrize("hz", [11, 15, 24, 50])
 def test_neither_a_vibration_nor_a_coarse_step_is_of_several_devices(still, quality, hz, step):
     wave = 5 * SIGMA * np.sin(2 * np.pi * hz * SECONDS + 1)[:, None] * (hz < RATE_HZ / 2)
     rates = rounded(step * SIGMA)(still + wave) if step else still + wave

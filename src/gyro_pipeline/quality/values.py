@@ -1,5 +1,7 @@
 """Values that no gyroscope at rest gives, each told by a function of its own."""
 
+from collections.abc import Sequence
+from itertools import combinations
 from statistics import NormalDist
 
 import numpy as np
@@ -11,6 +13,14 @@ from gyro_pipeline.quality.recording import Recording
 from gyro_pipeline.quality.rest import Array
 
 READER = "in `reader:` of the catalog entry in catalog.yml"
+
+
+def check_equal_axes(recording: Recording) -> None:
+    """Two axes of the same values: one column of the file was read twice."""
+    for first, second in combinations(range(len(AXES)), 2):
+        if np.array_equal(recording.used[first], recording.used[second]):
+            detail = f"axes {AXES[first]} and {AXES[second]} have the same values"
+            recording.add("equal axes", REJECTED, f"{detail}; correct `columns` {READER}")
 
 
 def check_repeats(recording: Recording, reported: float = 0.01, most: float = 0.2) -> None:
@@ -30,6 +40,21 @@ def check_repeats(recording: Recording, reported: float = 0.01, most: float = 0.
         recording.add("repeated rows", REJECTED, detail)
     elif share > reported + 4 * np.sqrt(chance / same.shape[1]):
         recording.add("repeated rows", KEPT, detail)
+
+
+def check_held_axes(recording: Recording, most: float = 0.2) -> None:
+    """An axis that repeats its own values beyond chance, though the others change.
+
+    Noise makes counts of changes by 0, 1, 2 steps that are log-concave: n0 n2 <= n1^2.
+    """
+    for axis in np.flatnonzero(recording.steps):
+        sizes = np.minimum(np.abs(recording.changes[axis]) / recording.steps[axis] + 0.5, 3)
+        repeats, ones, twos, _ = np.bincount(sizes.astype(np.intp), minlength=4)
+        share = (repeats - ones**2 / (2 * max(twos, 1))) / sizes.size
+        if share > most:
+            detail = f"axis {AXES[axis]} repeats {share:.0%} of its values beyond chance; log each "
+            detail += "sample once, at the sensor's own rate"
+            recording.add("repeated values", REJECTED, detail)
 
 
 def check_steps(recording: Recording) -> None:
@@ -120,26 +145,43 @@ def frequent_values(
     return (values, often) if np.count_nonzero(often) <= most else nowhere
 
 
-def check_turns(recording: Recording, least: float = 0.5, period: int = 60) -> None:
-    """Rows of several levels, as of several devices: in turn, or in any order if far apart.
-
-    In turn, changes of rows that are a ``period`` or a divisor of it apart have means of their own,
-    beyond ``least`` times the noise and beyond chance.
-    """
+def check_turns(recording: Recording, least: float = 0.5) -> None:
+    """Rows of several levels, as of several devices: in turn, or in any order if far apart."""
     changes = np.diff(recording.filled, axis=1)
-    period = period if changes.shape[1] > 10 * period else period // 5
-    count = changes.shape[1] // period
-    means = changes[:, : count * period].reshape(len(changes), count, period).mean(axis=1)
     squares = np.einsum("as,as->a", changes, changes) / changes.shape[1]
-    within = np.maximum(squares - means.var(axis=1), 0.01 * squares) / (1 - 1 / count)
-    jumps = np.ptp(means, axis=1) / 2
-    jumps *= jumps > max(least, 6 / np.sqrt(count)) * np.sqrt(within / 2)
+    jumps = turns(changes, squares, least)
     widths = np.maximum(0.4 * np.sqrt(squares), recording.steps)
     jumps = np.maximum(jumps, list(map(jump_apart, changes, widths)))
     if jumps.any():
-        detail = f"axis {AXES[jumps.argmax()]} jumps by {jumps.max():.2g} deg/s from row to row"
-        device = f"several sensors in one file? Pick one by `rows: {{COLUMN: VALUE}}` {READER}"
-        recording.add("mixed rows", REJECTED, f"{detail}: {device}")
+        detail = f"axis {AXES[jumps.argmax()]} jumps by {jumps.max():.2g} deg/s from row to row; "
+        detail += "several sensors in one file? Split it by device, or log a column that names the "
+        detail += f"device and pick one by `rows: {{NAME: VALUE}}` {READER}"
+        recording.add("mixed rows", REJECTED, detail)
+
+
+def turns(
+    changes: Array, squares: Array, least: float, periods: Sequence[int] = (60, 56, 54, 44, 52, 48)
+) -> Array:
+    """(axis,), how far rows jump that are a period, or a divisor of it, apart; 0: nowhere.
+
+    The periods have 2 to 16 devices in turn as divisors. Changes that are a period apart have means
+    of their own, beyond ``least`` times the noise and beyond chance. Nearly all of one frequency is
+    a vibration, unless 2 to 4 rows make its period.
+    """
+    jumps = np.zeros(len(changes))
+    for longest in periods:
+        period = longest if changes.shape[1] > 10 * longest else 12
+        count = changes.shape[1] // period
+        means = changes[:, : count * period].reshape(len(changes), count, period).mean(axis=1)
+        within = np.maximum(squares - means.var(axis=1), 0.01 * squares) / (1 - 1 / count)
+        sizes = np.ptp(means, axis=1) / 2
+        beyond = sizes > max(least, 6 / np.sqrt(count)) * np.sqrt(within / 2)
+        for axis in np.flatnonzero(beyond & (sizes > jumps)):
+            powers = np.abs(np.fft.rfft(means[axis])) ** 2
+            main = powers.argmax()
+            if main in {period / 2, period / 3, period / 4} or powers[main] < 0.9 * powers.sum():  # noqa: PLR2004
+                jumps[axis] = sizes[axis]
+    return jumps
 
 
 def jump_apart(changes: Array, width: float, hollow: float = 0.1, share: float = 0.02) -> float:
