@@ -8,15 +8,18 @@ and does not end the recording; a gap in time does. Limits know how many samples
 | zero rows | the first or last rows are zero on all axes | cut, kept |
 | non-finite values | not a number, infinite, or absurdly large | masked, repaired |
 | stuck values | an axis holds a value for longer than chance allows | masked, repaired |
+| dropouts | rows elsewhere are zero on all axes, beyond chance | masked, repaired |
 | gaps | the clock misses samples: the longest stretch without is kept | repaired |
 | too short | too few seconds, or too small a share of the stretch, can be used | rejected |
+| equal axes | two axes have the same values | rejected |
+| dead band | zero, amid others, comes far more often than its neighbours | rejected |
 | repeated rows | rows repeat the one before, beyond chance | above 20 % rejected, else kept |
+| repeated values | an axis repeats its values beyond chance | rejected |
 | coarse quantisation | the step is above the noise | above `largest_step` rejected, else kept |
 | bias taken off | a level goes to zero on all axes | rejected |
 | start | a shock of the first rows, as of what settles faster than a bias | cut, repaired |
 | shocks, spikes | a burst beyond the noise with a block about; one or two rows | masked, repaired |
-| dead band | exact zeros, and nothing near them | rejected |
-| saturation | the largest or the least value comes too often | rejected |
+| saturation, frequent value | a value comes far more often than its neighbours | rejected |
 | mixed rows | rows jump between levels, as those of several devices do | rejected |
 | noise level, little noise | more noise, or less, than a MEMS gyroscope has | rejected, kept |
 | motion | the mean or the noise changes; a burst is too long, a drift too large | rejected |
@@ -24,6 +27,12 @@ and does not end the recording; a gap in time does. Limits know how many samples
 
 Motion rejects all of a recording: rates alone do not tell which part was at rest, and after a turn
 the Earth's rate falls differently on the axes. A rotation as steady as a bias cannot be seen.
+
+Not told are steps of 0.1 deg/s up and down every few seconds, and sways of 0.05 deg/s or of a
+period near a block's length. Neither are several devices in random order that are less than about
+8 sigma apart, nor those in turn where rows slip and they are less than about 4 sigma apart. More
+than 16 devices in turn may be missed; a steady vibration at a half, a third or a quarter of the
+sample rate is taken for devices.
 """
 
 from dataclasses import dataclass
@@ -69,9 +78,13 @@ def inspect(log: Log, rate_hz: float, quality: Quality) -> Inspected:
         masks.cut_zero_rows,
         masks.mask_non_finite,
         masks.mask_stuck,
+        masks.mask_dropouts,
         masks.keep_longest_stretch,
         masks.require_length,
+        values.check_dead_band,
+        values.check_equal_axes,
         values.check_repeats,
+        values.check_held_axes,
         values.check_steps,
         motion.check_bias,
         masks.mask_bursts,

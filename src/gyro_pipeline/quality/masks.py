@@ -9,6 +9,7 @@ from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED
 from gyro_pipeline.parameters import LEAST_BLOCKS
 from gyro_pipeline.quality.recording import Recording, runs
 from gyro_pipeline.quality.rest import Array, Mask
+from gyro_pipeline.quality.values import zero_excess
 
 
 def cut_zero_rows(recording: Recording) -> None:
@@ -40,6 +41,24 @@ def mask_stuck(recording: Recording, least_s: float = 0.1) -> None:
         chance = np.ceil(np.log(recording.quality.false_alarm / rates.shape[1]) / np.log(p))
         held[axis] = np.repeat(lengths > max(least - 1, chance), lengths)
     _mask_samples(recording, "stuck values", held)
+
+
+def mask_dropouts(recording: Recording) -> None:
+    """Rows of zeros anywhere, ten times those of chance, where zero comes too often on all axes.
+
+    By chance axes are zero independently, as often as in rows that are not zero on all of them. At
+    least c rows where m are expected have a probability of at most (e m / c)^c.
+    """
+    zeros = recording.used == 0
+    rows = np.count_nonzero(zeros.all(axis=0))
+    if rows:
+        others = zeros.shape[1] - rows + 1
+        shares = (np.count_nonzero(zeros, axis=1) - rows + 1) / others
+        chance = rows * np.log(10 * zeros.shape[1] * np.prod(shares) / rows)
+        too_often = (zero_excess(recording, rates) > 0 for rates in recording.used)
+        if chance < np.log(recording.quality.false_alarm) and all(too_often):
+            dropouts = ~recording.rates.any(axis=0) & ~recording.masked
+            recording.mask("dropouts", dropouts, "zero on all axes, ")
 
 
 def _mask_samples(recording: Recording, check: str, samples: Mask) -> None:

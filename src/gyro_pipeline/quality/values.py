@@ -1,6 +1,11 @@
 """Values that no gyroscope at rest gives, each told by a function of its own."""
 
+from collections.abc import Sequence
+from itertools import combinations
+from statistics import NormalDist
+
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from gyro_pipeline.conventions import AXES, MDPS
 from gyro_pipeline.logs import KEPT, REJECTED
@@ -8,6 +13,14 @@ from gyro_pipeline.quality.recording import Recording
 from gyro_pipeline.quality.rest import Array
 
 READER = "in `reader:` of the catalog entry in catalog.yml"
+
+
+def check_equal_axes(recording: Recording) -> None:
+    """Two axes of the same values: one column of the file was read twice."""
+    for first, second in combinations(range(len(AXES)), 2):
+        if np.array_equal(recording.used[first], recording.used[second]):
+            detail = f"axes {AXES[first]} and {AXES[second]} have the same values"
+            recording.add("equal axes", REJECTED, f"{detail}; correct `columns` {READER}")
 
 
 def check_repeats(recording: Recording, reported: float = 0.01, most: float = 0.2) -> None:
@@ -29,6 +42,21 @@ def check_repeats(recording: Recording, reported: float = 0.01, most: float = 0.
         recording.add("repeated rows", KEPT, detail)
 
 
+def check_held_axes(recording: Recording, most: float = 0.2) -> None:
+    """An axis that repeats its own values beyond chance, though the others change.
+
+    Noise makes counts of changes by 0, 1, 2 steps that are log-concave: n0 n2 <= n1^2.
+    """
+    for axis in np.flatnonzero(recording.steps):
+        sizes = np.minimum(np.abs(recording.changes[axis]) / recording.steps[axis] + 0.5, 3)
+        repeats, ones, twos, _ = np.bincount(sizes.astype(np.intp), minlength=4)
+        share = (repeats - ones**2 / (2 * max(twos, 1))) / sizes.size
+        if share > most:
+            detail = f"axis {AXES[axis]} repeats {share:.0%} of its values beyond chance; log each "
+            detail += "sample once, at the sensor's own rate"
+            recording.add("repeated values", REJECTED, detail)
+
+
 def check_steps(recording: Recording) -> None:
     """A quantisation step above the noise, on the coarsest axis."""
     steps, largest = recording.steps / MDPS, recording.quality.largest_step
@@ -46,51 +74,114 @@ def check_steps(recording: Recording) -> None:
         recording.add("coarse quantisation", outcome, detail)
 
 
-def check_levels(recording: Recording, least: int = 8) -> None:
-    """A value that comes ``least`` times and twice as often as the next: a flat top, a dead band.
+def check_dead_band(recording: Recording) -> None:
+    """Zeros amid the noise that come too often: small values, or parts of a count, were cut."""
+    for name, rates in zip(AXES, recording.used, strict=True):
+        often = zero_excess(recording, rates)
+        if often and rates.min() < 0 < rates.max():
+            band, step = np.abs(rates[rates != 0]).min(), np.diff(np.unique(rates))
+            cut = f"± {band:.2g} deg/s" if band > 1.5 * np.median(step) else "counts cut to zero?"  # noqa: PLR2004
+            detail = f"axis {name}, {cut}: 0 comes {often:.2g} times as often as its neighbours; "
+            detail += "the mean is pulled to zero; log the raw rates"
+            recording.add("dead band", REJECTED, detail)
 
-    The tail of noise thins out, and behind a low-pass filter a peak lasts, but comes once. A step
-    above 0.2 sigma hides a top at 2 sigma, which shifts the mean by 0.008 sigma. A dead band is a
-    gap on both sides of zero, five times as wide as others.
+
+def zero_excess(recording: Recording, rates: Array, least: int = 8) -> float:
+    """How many times as often as its neighbours zero comes; 0: no more than by chance."""
+    if np.count_nonzero(rates == 0) < least:
+        return 0.0
+    values, often = frequent_values(recording, rates)
+    return float(often[values == 0].sum())
+
+
+def check_levels(recording: Recording, least: float = 3) -> None:
+    """The value that comes most beyond its neighbours: a flat top at an end, elsewhere a code.
+
+    Elsewhere it comes ``least`` times as often: where numbers are rounded twice, two share a value.
     """
     for name, rates in zip(AXES, recording.used, strict=True):
-        if max(np.count_nonzero(rates == value) for value in (rates.min(), rates.max(), 0)) < least:
-            continue
-        values, counts = np.unique(rates[1:][np.diff(rates) != 0], return_counts=True)
-        gaps, zero = np.diff(values), np.searchsorted(values, 0)
-        if gaps.size < 2:  # noqa: PLR2004 - of two values alone, nothing is a tail
-            continue
-        for end, following in ((0, 1), (-1, -2)):
-            if counts[end] >= max(least, 2 * counts[following]):
-                detail = f"axis {name} is cut off at {values[end]:.4g} deg/s, {counts[end]} times"
-                recording.add("saturation", REJECTED, f"{detail}; the mean is pulled from there")
-        if 0 < zero < gaps.size and values[zero] == 0 and counts[zero] >= least:
-            band = gaps[zero - 1 : zero + 1].min()
-            if band > 5 * np.median(gaps):
-                detail = f"± {band:.2g} deg/s on axis {name}; the mean is pulled to zero"
-                recording.add("dead band", REJECTED, detail)
+        values, often = frequent_values(recording, rates)
+        often[1:-1][often[1:-1] < least] = 0
+        if often.any():
+            most = often.argmax()
+            end = most in {0, values.size - 1}
+            detail = f"axis {name} {'is cut off' if end else 'is held'} at {values[most]:.4g} deg/s"
+            detail += f", {np.count_nonzero(rates == values[most])} times; the mean is pulled there"
+            recording.add("saturation" if end else "frequent value", REJECTED, detail)
 
 
-def check_turns(recording: Recording, least: float = 0.5, period: int = 60) -> None:
-    """Rows of several levels, as of several devices: in turn, or in any order if far apart.
+def frequent_values(
+    recording: Recording, rates: Array, least: float = 1.5, most: int = 3
+) -> tuple[Array, Array]:
+    """Values, and how many times as often as their neighbours they come; 0: no more than by chance.
 
-    In turn, changes of rows that are a ``period`` or a divisor of it apart have means of their own,
-    beyond ``least`` times the noise and beyond chance.
+    The neighbours' counts give the one between by a cubic through their logarithms, which is exact
+    for normal noise on a fine grid and too large on a coarse one, or by a line where that is more.
+    Chance is that of runs, as of independent samples. More than ``most`` such values are a pattern,
+    as of numbers rounded twice, which moves no mean.
     """
+    ordered = np.sort(rates)
+    nowhere = np.zeros(0), np.zeros(0)
+    if not np.any(ordered[7:] == ordered[:-7]):  # fewer never are beyond chance
+        return nowhere
+    values, counts = np.unique(ordered, return_counts=True)
+    if values.size < 3:  # noqa: PLR2004 - of two values alone, nothing is a tail
+        return nowhere
+    # beyond the ends a tail goes on to less than one count
+    below, above = (min(0.5, a**2 / b) for a, b in (counts[:2], counts[:-3:-1]))
+    padded = np.array([below, below, *counts, above, above])
+    second, first, _, third, fourth = sliding_window_view(padded, values.size)
+    near, far = np.log(first) + np.log(third), np.log(second) + np.log(fourth)
+    expected = np.exp(np.maximum(near / 2, (4 * near - far) / 6)) / counts
+    runs = counts - np.bincount(
+        np.searchsorted(values, rates[1:][np.diff(rates) == 0]), minlength=values.size
+    )
+    # twice the root of a count scatters by 1
+    variance = (16 / first + 16 / third + 1 / second + 1 / fourth) / 36 * counts
+    beyond = 2 * np.sqrt(runs) * (1 - np.sqrt(expected)) / np.sqrt(1 + expected * variance)
+    limit = -NormalDist().inv_cdf(recording.quality.false_alarm / (len(AXES) * values.size))
+    often = np.where(beyond > limit, 1 / expected, 0)
+    often[often < least] = 0
+    return (values, often) if np.count_nonzero(often) <= most else nowhere
+
+
+def check_turns(recording: Recording, least: float = 0.5) -> None:
+    """Rows of several levels, as of several devices: in turn, or in any order if far apart."""
     changes = np.diff(recording.filled, axis=1)
-    period = period if changes.shape[1] > 10 * period else period // 5
-    count = changes.shape[1] // period
-    means = changes[:, : count * period].reshape(len(changes), count, period).mean(axis=1)
     squares = np.einsum("as,as->a", changes, changes) / changes.shape[1]
-    within = np.maximum(squares - means.var(axis=1), 0.01 * squares) / (1 - 1 / count)
-    jumps = np.ptp(means, axis=1) / 2
-    jumps *= jumps > max(least, 6 / np.sqrt(count)) * np.sqrt(within / 2)
+    jumps = turns(changes, squares, least)
     widths = np.maximum(0.4 * np.sqrt(squares), recording.steps)
     jumps = np.maximum(jumps, list(map(jump_apart, changes, widths)))
     if jumps.any():
-        detail = f"axis {AXES[jumps.argmax()]} jumps by {jumps.max():.2g} deg/s from row to row"
-        device = f"several sensors in one file? Pick one by `rows: {{COLUMN: VALUE}}` {READER}"
-        recording.add("mixed rows", REJECTED, f"{detail}: {device}")
+        detail = f"axis {AXES[jumps.argmax()]} jumps by {jumps.max():.2g} deg/s from row to row; "
+        detail += "several sensors in one file? Split it by device, or log a column that names the "
+        detail += f"device and pick one by `rows: {{NAME: VALUE}}` {READER}"
+        recording.add("mixed rows", REJECTED, detail)
+
+
+def turns(
+    changes: Array, squares: Array, least: float, periods: Sequence[int] = (60, 56, 54, 44, 52, 48)
+) -> Array:
+    """(axis,), how far rows jump that are a period, or a divisor of it, apart; 0: nowhere.
+
+    The periods have 2 to 16 devices in turn as divisors. Changes that are a period apart have means
+    of their own, beyond ``least`` times the noise and beyond chance. Nearly all of one frequency is
+    a vibration, unless 2 to 4 rows make its period.
+    """
+    jumps = np.zeros(len(changes))
+    for longest in periods:
+        period = longest if changes.shape[1] > 10 * longest else 12
+        count = changes.shape[1] // period
+        means = changes[:, : count * period].reshape(len(changes), count, period).mean(axis=1)
+        within = np.maximum(squares - means.var(axis=1), 0.01 * squares) / (1 - 1 / count)
+        sizes = np.ptp(means, axis=1) / 2
+        beyond = sizes > max(least, 6 / np.sqrt(count)) * np.sqrt(within / 2)
+        for axis in np.flatnonzero(beyond & (sizes > jumps)):
+            powers = np.abs(np.fft.rfft(means[axis])) ** 2
+            main = powers.argmax()
+            if main in {period / 2, period / 3, period / 4} or powers[main] < 0.9 * powers.sum():  # noqa: PLR2004
+                jumps[axis] = sizes[axis]
+    return jumps
 
 
 def jump_apart(changes: Array, width: float, hollow: float = 0.1, share: float = 0.02) -> float:
