@@ -725,7 +725,8 @@ def test_a_recording_that_lost_its_windows_trains_and_tests_no_network(world, as
     assert set(networks.folds) == {5}
     assert (
         "some sparkfun, 10 s windows: 10 of 140 lost more than 10% of their samples and are left "
-        "out; none is left of IMU 1 recording 3 (and of 1 more), so it trains no network and tests none"
+        "out; none is left of IMU 1 recording 3 (and of 1 more), so it trains no network and tests "
+        "none"
     ) in caplog.text
     for run in train_and_judge(small, as_stored):
         assert np.isfinite(run.artifacts[ERRORS].error_dps).all()
