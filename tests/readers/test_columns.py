@@ -120,6 +120,7 @@ def test_contradictions_are_refused_unless_the_options_are_trusted(
         "LSB/dps = 14.2857", "gyro_lsb_per_dps,14.2857", "Gyroscope scale (deg/s per LSB): 0.07",
         "gyr_scale 0.07", "Sensitivity: 0.07", "resolution: 0.07 deg/s", "gain: 0.07", "gres,0.07",
         "factor: 0.07", "multiplier,0.07", "gyro sensitivity 70 mdps/LSB", "14.2857 LSB/dps",
+        "range 250 dps, 14.2857 LSB/dps", "acc: 16384 LSB/g, gyro: 14.2857 LSB/dps",
     ],
 )  # fmt: skip
 def test_a_scale_that_the_file_states_is_named_for_typing(line, read):
@@ -137,8 +138,8 @@ def test_a_scale_that_the_file_states_is_named_for_typing(line, read):
     "line",
     [
         "Gyro full scale: 250 dps", "acc sensitivity: 0.061", "ascale,0.0004", "gyro scale: 1.0",
-        "Resolution: 16 bit", "magnetometer gain 0.15", "fs_sel: 2", "again 5",
-        "Factory: 7", "sensitivity of 2021-05-04", "gain set 10:30:00",
+        "acc scale, mg, 0.061", "gyro range: ±250", "Resolution: 16 bit", "fs_sel: 2", "again 5",
+        "magnetometer gain 0.15", "Factory: 7", "sensitivity of 2021-05-04", "gain set 10:30:00",
     ],
 )  # fmt: skip
 def test_ranges_and_scales_of_other_sensors_are_none_of_the_rates(line, read):

@@ -23,9 +23,10 @@ _SCALE = re.compile(
     rf"[^\n]*?{_NUMBER}|{_NUMBER}(?=\s*(?:lsb|counts?|digits?)\W*(?:/|per))"
 )
 _OF_OTHERS = re.compile(
-    r"(?i)acc|mag|temp|time|baro|press|humid|image|video|lens|camera|screen|range|full|"
+    r"(?i)acc|mag|temp|time|baro|press|humid|image|video|lens|camera|screen|"
     r"(?<![a-z])[atm][ _]?(?:scal|res|sens|gain|lsb)"
 )
+_RANGE = re.compile(r"(?i)(?:full[ _-]?scale|range)[^\d\n]*[\d.]+")
 _FACTOR = re.compile(r"(?i)[*×]\s*\d|\d\s*[*×]|(?<![a-z])x\d+(?![a-z\d])")
 _DPS_PER_RAD = 57.29577951308232
 
@@ -145,12 +146,16 @@ def _stated_scales(file: File, rates: Sequence[int]) -> list[tuple[str, dict[str
     for number, (name, column) in enumerate(zip(file.table.names, file.table.columns, strict=True)):
         if number not in rates and len(column) and (column == column[0]).all():
             lines.append((f"column {name!r} is {column[0]}", f"{name}: {column[0]}"))
-    matches = [(where, line, _SCALE.search(line)) for where, line in lines]
-    return [
-        (where, _readings(line, abs(float(match[1] or match[2]))))
-        for where, line, match in matches
-        if match and not _OF_OTHERS.search(line) and float(match[1] or match[2])
-    ]
+    scales = []
+    for where, line in lines:
+        text = _RANGE.sub("", line)
+        # acc: 16384 LSB/g, gyro: 131 LSB/dps
+        of_several = _OF_OTHERS.search(text) and "gyr" in text.lower()
+        for part in re.split(r"[,;]\s*(?=[^\W\d])", text) if of_several else [text]:
+            match = None if _OF_OTHERS.search(part) else _SCALE.search(part)
+            if match and (factor := abs(float(match[1] or match[2]))):
+                scales.append((where, _readings(part, factor)))
+    return scales
 
 
 def _readings(line: str, factor: float) -> dict[str, float]:
