@@ -28,11 +28,11 @@ and does not end the recording; a gap in time does. Limits know how many samples
 Motion rejects all of a recording: rates alone do not tell which part was at rest, and after a turn
 the Earth's rate falls differently on the axes. A rotation as steady as a bias cannot be seen.
 
-Not told are steps of 0.1 deg/s up and down every few seconds, and sways of 0.05 deg/s or of a
-period near a block's length. Neither are several devices in random order that are less than about
-8 sigma apart, nor those in turn where rows slip and they are less than about 4 sigma apart. More
-than 16 devices in turn may be missed; a steady vibration at a half, a third or a quarter of the
-sample rate is taken for devices.
+Not told are steps of 0.1 deg/s up and down every few seconds, and sways of 0.05 deg/s or, of any
+size, of a period of one or two blocks. Neither are several devices in random order that are less
+than about 8 sigma apart, nor those in turn where rows slip and they are less than about 4 sigma
+apart. More than 16 devices in turn may be missed; a steady vibration at a half, a third or a
+quarter of the sample rate is taken for devices.
 """
 
 from dataclasses import dataclass

@@ -128,7 +128,7 @@ def frequent_values(
     if values.size < 3:  # noqa: PLR2004 - of two values alone, nothing is a tail
         return nowhere
     # beyond the ends a tail goes on to less than one count
-    below, above = (min(0.5, a**2 / b) for a, b in (counts[:2], counts[:-3:-1]))
+    below, above = (np.clip(a**2 / b, 0.05, 0.5) for a, b in (counts[:2], counts[:-3:-1]))
     padded = np.array([below, below, *counts, above, above])
     second, first, _, third, fourth = sliding_window_view(padded, values.size)
     near, far = np.log(first) + np.log(third), np.log(second) + np.log(fourth)
