@@ -33,7 +33,7 @@ def contradict_values(file: File, raw: Floats, rates: Floats, are_counts: bool) 
         file.contradictions.append(text)
 
 
-def wrapped(values: Floats, bits: Sequence[int] = (*range(8, 25), 32), compact: float = 8) -> str:
+def wrapped(values: Floats, bits: Sequence[int] = (*range(12, 25), 32), compact: float = 8) -> str:
     """Signed counts that were written as unsigned ones.
 
     Nearly all rows are whole numbers without a sign, of which some lie so high that their signed
