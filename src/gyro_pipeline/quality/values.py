@@ -175,7 +175,7 @@ def turns(
         means = changes[:, : count * period].reshape(len(changes), count, period).mean(axis=1)
         within = np.maximum(squares - means.var(axis=1), 0.01 * squares) / (1 - 1 / count)
         sizes = np.ptp(means, axis=1) / 2
-        beyond = sizes > max(least, 6 / np.sqrt(count)) * np.sqrt(within / 2)
+        beyond = sizes > max(least, 7 / np.sqrt(count)) * np.sqrt(within / 2)
         for axis in np.flatnonzero(beyond & (sizes > jumps)):
             powers = np.abs(np.fft.rfft(means[axis])) ** 2
             main = powers.argmax()
