@@ -27,7 +27,7 @@ from gyro_pipeline.readers.table import IN_READER, Table, columns_of, few
 
 DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab", " ": "blanks"}
 
-_HEAD = 1 << 15  # bytes that tell the layout
+_HEAD = 1 << 14  # bytes that tell the layout
 _LEAST = 3  # numbers in a row
 _COMMENT, _SENTENCE = ("#", "%", "//"), ("$", "!")  # NMEA 0183 begins sentences so
 _MISSING = ["", " ", "NA", "N/A", "null", "NULL", "None"]
