@@ -6,7 +6,6 @@ Means of blocks are (axis, block), noise is the standard deviation of one, (axis
 from statistics import NormalDist
 
 import numpy as np
-from scipy import optimize
 
 from gyro_pipeline.conventions import AXES, MDPS
 from gyro_pipeline.logs import KEPT, REJECTED
@@ -52,6 +51,8 @@ def fit_drift(recording: Recording, shortest: float = 0.5) -> Array:
     before = np.arange(1, times.size)
     steps = np.cumsum(rates, axis=1)[:, :-1] ** 2 * (1 / before + 1 / before[::-1])
     for axis in np.flatnonzero(alone.max(axis=1) > limit):
+        from scipy import optimize  # noqa: PLC0415 - it starts slowly, and most have no drift
+
         fits = [(sign, *optimize.nnls(shapes.T, sign * rates[axis])) for sign in (1, -1)]
         sign, weights, left = min(fits, key=lambda fit: fit[2])
         if rates[axis] @ rates[axis] - left**2 > steps[axis].max():

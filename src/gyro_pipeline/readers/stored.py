@@ -13,7 +13,6 @@ import h5py
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-import scipy.io
 from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import AXES, InputError
@@ -72,6 +71,8 @@ def read_zip(path: Path) -> Table:
 
 def read_mat(path: Path) -> Table:
     """Read arrays and structures of MATLAB 5 to 7."""
+    import scipy.io  # noqa: PLC0415 - it starts slowly, and most files are texts
+
     mat5.check(path.read_bytes())
     variables = scipy.io.loadmat(path, simplify_cells=True)
     return _of_arrays(path, {k: v for k, v in variables.items() if not k.startswith("__")})
