@@ -46,13 +46,14 @@ def from_stamps(stamps: Floats, unit_s: float | None, numbers: Rows | None = Non
         between them; a finding is REJECTED where it changes along the recording.
     """
     numbers = np.arange(len(stamps)) if numbers is None else numbers
-    steps = np.diff(stamps)
-    if len(steps) and np.ptp(steps) < steps.mean() / 5:  # as most are: no sample is missing
-        whole = np.ones(len(stamps), bool)
-        rate_hz = None if unit_s is None else 1 / (steps.mean() * unit_s)
-        return Timing(rate_hz, findings=tuple(_regularity(stamps, numbers, whole)))
     stamps, strays = _without_strays(stamps)
     rows = np.flatnonzero(np.isfinite(stamps))
+    steps = np.diff(stamps[rows])
+    if len(stamps) == len(rows) > 1 and 5 * np.ptp(steps) + 1e-80 < steps.mean():  # as most are
+        findings = _regularity(stamps, numbers, np.ones(len(stamps), bool))
+        return Timing(
+            None if unit_s is None else 1 / (steps.mean() * unit_s), findings=(*findings,)
+        )
     times, wraps, back = _increasing(stamps[rows], unit_s)
     findings = [
         *_at("timestamps", numbers[strays], "a timestamp is far from those beside it, and ignored"),
