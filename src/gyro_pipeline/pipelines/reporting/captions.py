@@ -95,9 +95,9 @@ CAPTIONS = {
     ),
     "tables/recording_quality": Caption(
         "Recordings: kept, repaired, rejected",
-        "Quality control of the raw logs, and the recordings in which it found something. Of "
-        "each the longest stretch without a gap is kept, and brief damage in it is masked. Rows "
-        "count from 0.",
+        "Quality control of the raw logs, and the recordings in which it found "
+        "something. The longest stretch without a gap is kept of a recording, and brief damage in "
+        "it is masked. Rows count from 0.",
         "ground_truth",
     ),
     "tables/dataset_hours": Caption(
