@@ -370,8 +370,8 @@ def test_too_few_recordings_stop_and_the_same_reason_is_given_once(quality):
     assert str(caught.value).splitlines() == [
         "dot: 1 of 14 recordings can be used, quality.needed_pct asks for 90 %. Repair or remove "
         "the others, or lower it:",
-        "  IMU 1 recording 1, 1_1.csv, and 11 more: file: the file: is a zip",
-        "  IMU 2 recording 1, 2_1.csv: file: the file: is empty",
+        "  IMU 1 recording 1, 1_1.csv, and 11 more: file: is a zip",
+        "  IMU 2 recording 1, 2_1.csv: file: is empty",
     ]
 
 

@@ -15,7 +15,7 @@ def reasons(rejected: pd.DataFrame) -> list[str]:
         rejected: Rows of the table of quality: ``imu, recording, file, findings``.
     """
     texts = [
-        re.sub(rf"\S*{re.escape(file)}", "the file", str(findings))
+        re.sub(rf"file: .*?{re.escape(file)}", "file", str(findings))  # its path says no reason
         for file, findings in zip(rejected.file, rejected.findings, strict=True)
     ]
     lines = []
