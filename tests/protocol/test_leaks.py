@@ -98,7 +98,7 @@ def test_the_first_recordings_are_divided_at_the_stride(recordings, parameters):
     ("changes", "stride_s", "message"),
     [
         ({}, 0.01, "sparkfun: a window stride of 0.01 s is less than half a sample at 25 Hz"),
-        ({"recordings": 20, "folds": 15}, 1, "at least 15 recordings, .* got 14; lower"),
+        ({"recordings": 20, "folds": 15}, 1, "at least 15 recordings .* got 14; lower"),
         ({"window_s": 52.1}, 1, "a window of 52.1 s is 1302 samples"),
     ],
 )
