@@ -144,7 +144,7 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("content", "message"), REFUSED)
+@pytest.mark.parametrize(("content", "message"), REFUSED, ids=[text for _, text in REFUSED])
 def test_what_is_not_read_comes_with_advice(content, message, table):
     with pytest.raises(InputError, match=f"log.csv: (expected )?.*{message}"):
         table(content)
