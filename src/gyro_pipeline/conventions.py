@@ -11,10 +11,15 @@ Recordings are :class:`xarray.Dataset` objects with
 * ``temperature_c`` (imu, recording, sample), degrees Celsius, and ``acceleration_g``
   (imu, recording, axis, sample), g, float32, where the files have them;
 * ``true_bias`` (imu, recording, axis), float64, deg/s, on simulated data only;
-* ``given_split`` (recording), ``"train"`` or ``"test"``, where the source came split;
+* the coordinate ``split`` (recording), the role of each recording in a hold-out; none where few
+  recordings make a k-fold;
 * attributes ``sensor``, ``source``, ``simulated`` (0 or 1), ``rate_hz`` and ``data_hash``.
 
-Those of a study (``windowed_splits.recordings``) are all of one length.
+Those of a study (``windowed_splits.recordings``) are all of one length, and have
+``recording_mean`` (imu, recording, axis), deg/s, the truth of the paper, as virtual ones do.
+
+A windows table has a row per window: ``protocol, window_s, window_stride_s``; ``fold``, ``role``;
+``origin``, real or virtual; ``imu``, ``recording`` and ``start``, its first sample.
 """
 
 from dataclasses import dataclass
@@ -25,17 +30,24 @@ DIMENSIONS = ("imu", "recording", "axis", "sample")
 MDPS = 1e-3
 """deg/s in one mdps."""
 
-HOLD_OUT = -1
-"""The ``fold`` of a run on the fixed hold-out split."""
-
-LEAVE_ONE_DEVICE_OUT = "leave_one_device_out"
-"""The ``protocol`` by which every IMU in turn is an unseen device; else recordings are held out."""
-
 TRAIN, VALIDATION, TEST = "train", "validation", "test"
-"""The roles a recording can have. It has exactly one of them in each fold."""
+"""The roles of windows and recordings."""
 
-TEST_IMU = 1
-"""All published results are on the three gyroscopes of IMU 1 (paper, section IV-B)."""
+UNUSED = ""
+"""The role of a window that has none in a fold."""
+
+ORIGIN_REAL, ORIGIN_VIRTUAL = "real", "virtual"
+"""Where the recording of a window comes from."""
+
+HOLD_OUT, ALL_RECORDINGS = "hold-out", "all recordings"
+"""Folds: the only one of a hold-out, and one in which nothing tests, of which the model is."""
+
+BY_RECORDING, LEAVE_ONE_DEVICE_OUT, K_FOLD = "by_recording", "leave_one_device_out", "k_fold"
+WINDOW_SPLIT = "window_split"
+TEST_IN_TRAINING = "test_in_training"
+BEST_EPOCH_ON_TEST = "best_epoch_on_test"
+LEAKS = (WINDOW_SPLIT, TEST_IN_TRAINING, BEST_EPOCH_ON_TEST)
+"""Protocols; the leaks let test information into training on purpose, in the leak study alone."""
 
 PAPER, DISJOINT, TRUE = "paper", "disjoint", "true"
 """The truths an estimate is judged against: (a) mean of the whole recording, (b) mean of the
@@ -53,13 +65,6 @@ FIRST, ALL = "first", "all"
 
 LAST, BEST = "last", "best"
 """Weights at the last epoch (the paper's way), or at the best validation epoch."""
-
-NO_LEAK = "none"
-WINDOW_SPLIT = "window_split"
-TEST_IN_TRAINING = "test_in_training"
-BEST_EPOCH_ON_TEST = "best_epoch_on_test"
-LEAKS = (NO_LEAK, WINDOW_SPLIT, TEST_IN_TRAINING, BEST_EPOCH_ON_TEST)
-"""How test information reaches a training of the leak study on purpose; no other study has any."""
 
 
 class InputError(ValueError):

@@ -6,7 +6,7 @@ such as a study of a sensor, is checked for the studies that are to run
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -314,6 +314,11 @@ class Splits(Parameter):
     test_fraction: float = Field(gt=0, lt=1, description="of recordings, where none is given")
     validation_recordings: int = Field(ge=0, description="of the training ones; 0: the paper's")
     fold_validation_recordings: int = Field(ge=0, description="the same in each fold of a k-fold")
+    training_windows: Literal["all", "first"] | Seconds = Field(
+        "all",
+        description="of a recording: all that do not overlap, the first alone, or, as a number, "
+        "one every so many seconds",
+    )
     k_fold_below: int = Field(ge=0, description="fewer recordings than this: k-fold by recording")
     leave_one_out_up_to: int = Field(ge=0, description="so many recordings: one fold each")
     folds: int = Field(ge=2, description="of a k-fold that is not leave-one-out")
@@ -399,6 +404,16 @@ class Grid(Parameter):
         return self
 
 
+Protocol = Literal[
+    "by_recording",
+    "leave_one_device_out",
+    "k_fold",
+    "window_split",
+    "test_in_training",
+    "best_epoch_on_test",
+]
+
+
 class Study(Parameter):
     """Estimators to compare, tracked in one MLflow experiment; each of the paper's has networks."""
 
@@ -406,27 +421,77 @@ class Study(Parameter):
     estimators: list[str] = Field(
         ["cnn"],
         min_length=1,
-        description="beside the running mean; names of gyro_pipeline.estimators",
+        description="beside the running mean; names of gyro_pipeline.estimators, or "
+        "package.module:Class",
     )
     windows_s: list[Annotated[float, Field(gt=0)]] | None = Field(
         None, min_length=1, description="its own; null: those of all studies"
     )
     default: bool = Field(True, description="part of `kedro run` and `--pipeline=reporting`")
-    protocol: Literal["by_recording", "leave_one_device_out"] = Field(
+    protocol: Protocol = Field(
         "by_recording",
-        description="what tests: recordings of IMU 1, or every IMU in turn, as an unseen device "
-        "(docs/honest_protocol.md); the second has no networks of the paper's",
+        description="what tests: recordings of the first IMU, or every IMU in turn, as an unseen "
+        "device (docs/honest_protocol.md)",
     )
-    sensors: dict[str, Grid]
+    also: dict[Protocol, list[str]] = Field(
+        {}, description="further protocols, and the estimators to compare under them"
+    )
+    strides_s: list[Seconds] | None = Field(
+        None,
+        min_length=1,
+        description="from the start of one window to that of the next, seconds; null: windows do "
+        "not overlap",
+    )
+    recordings: int | None = Field(
+        None, ge=2, description="of the first IMU; the first so many; null: the split decides"
+    )
+    folds: int | None = Field(None, ge=2, description="its own; null: those of splits")
+    training: dict[str, Any] = Field({}, description="settings of training that it changes")
+    sensors: dict[str, Grid] = {}
+    any_sensor: Grid | None = Field(
+        None, description="of every other sensor of globals.yml; null: they are no part of it"
+    )
 
     @property
     def unseen_devices(self) -> bool:
         """Whether the devices that test are unseen ones."""
         return self.protocol == LEAVE_ONE_DEVICE_OUT
 
+    @property
+    def estimators_of(self) -> dict[str, list[str]]:
+        """Estimators of each protocol."""
+        return {self.protocol: self.estimators} | dict(self.also)
+
+    def sensors_among(self, sensors: Iterable[str]) -> list[str]:
+        """Which sensors are part of it: those that it names, and others if it takes any."""
+        others = [name for name in sensors if name not in self.sensors] if self.any_sensor else []
+        return [*self.sensors, *others]
+
+    def grid_of(self, sensor: str) -> Grid:
+        """Networks that it trains on a sensor.
+
+        Raises:
+            InputError: The sensor is no part of it.
+        """
+        grid = self.sensors.get(sensor, self.any_sensor)
+        if grid is None:
+            raise InputError(
+                f"studies.{self.experiment}.sensors: {sensor!r} is none of "
+                f"{', '.join(self.sensors)}; name it there"
+            )
+        return grid
+
+    def training_of(self, base: Training) -> Training:
+        """Settings of training with what the study changes."""
+        return Training.model_validate(base.model_dump() | self.training)
+
+    def splits(self, base: Splits) -> Splits:
+        """Settings of the splits with what the study changes."""
+        return base.model_copy(update={"folds": self.folds or base.folds})
+
     @model_validator(mode="after")
     def _nothing_is_named_twice(self) -> Self:
-        for name in ("estimators", "windows_s"):
+        for name in ("estimators", "windows_s", "strides_s"):
             _refuse_twice(name, getattr(self, name) or [])
         return self
 
@@ -441,33 +506,6 @@ class Study(Parameter):
         return self
 
 
-class Leakage(Parameter):
-    """The leak study: what it trains on, and with which network (docs/honest_protocol.md)."""
-
-    sensors: list[str] = Field(min_length=1)
-    recordings: int = Field(ge=2, description="of IMU 1; the first so many, or all if fewer")
-    window_s: float = Field(gt=0)
-    strides_s: list[Annotated[float, Field(gt=0)]] = Field(
-        min_length=1, description="from the start of one window to that of the next, seconds"
-    )
-    folds: int = Field(ge=2, description="parts to which recordings, or windows, are dealt")
-    steps: int = Field(ge=1, description="of the optimiser, at least, at a constant learning rate")
-    network: NetworkSizes
-
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
-        _refuse_twice("strides_s", self.strides_s)
-        if self.folds > self.recordings:
-            raise ValueError(f"folds: {self.folds} parts of {self.recordings} recordings")
-        return self
-
-    def training(self, base: Training, windows: int) -> Training:
-        """Settings to train on so many windows: the base's, with this network and its steps."""
-        epochs = -(-self.steps // -(-windows // base.batch_size))
-        changes = {"epochs": epochs, "decay": 1.0, "stop_below": 0.0}
-        return base.model_copy(update=self.network.model_dump() | changes)
-
-
 class Only(Parameter):
     """Narrows every study to the cells that match; an absent key matches everything."""
 
@@ -476,7 +514,6 @@ class Only(Parameter):
     virtual_gyros: Gyroscopes | None = None
     window_s: float | None = None
     seed: int | None = None
-    fold: int | None = None
 
 
 class PublishedResult(Parameter):
@@ -559,7 +596,6 @@ class Parameters(Parameter):
     windows_s: list[Annotated[float, Field(gt=0)]] = Field(min_length=1)
     seeds: list[int] = Field(min_length=1)
     studies: dict[str, Study]
-    leakage: Leakage
     only: Only
     published: Published
 

@@ -16,7 +16,7 @@ from gyro_pipeline.pipelines import (
     virtual_gyros,
     windowed_splits,
 )
-from gyro_pipeline.studies import LEAKAGE, leak_sensors, used_sensors
+from gyro_pipeline.studies import LEAKAGE, used_sensors
 
 _selected: Parameters | None = None
 
@@ -34,21 +34,29 @@ def register_pipelines() -> dict[str, Pipeline]:
     """All pipelines; each study ends by writing its own tables and figures."""
     parameters = _selected or base_parameters()
     sensors = used_sensors(parameters)
-    every_sensor = {study: list(asked.sensors) for study, asked in parameters.studies.items()}
+    every_sensor = {
+        study: asked.sensors_among(parameters.sensors)
+        for study, asked in parameters.studies.items()
+    }
     default = [study for study, asked in parameters.studies.items() if asked.default]
     wanted = parameters.only.sensor
     pipelines = {
         study: _runs(parameters, {study: sensors[study]})
         + reporting.create_pipeline({study: every_sensor[study]}, inspected=[*parameters.sensors])
         for study in parameters.studies
+        if study != LEAKAGE
     }
     known = [sensor for sensor in parameters.sensors if wanted in (None, sensor)]
-    drawn = _virtual_sensors(parameters)
     pipelines["ground_truth"] = sum(
         (_measured(sensor) + ground_truth.create_report(sensor) for sensor in known), Pipeline([])
     )
     pipelines["virtual_gyros"] = sum(
-        (_measured(sensor) + _split(sensor, sensor in drawn) for sensor in known), Pipeline([])
+        (
+            _measured(sensor) + virtual_gyros.create_pipeline(sensor)
+            for sensor in known
+            if sensor in _virtual_sensors(parameters)
+        ),
+        Pipeline([]),
     )
     published = parameters.published
     pipelines["reporting"] = reporting.create_pipeline(
@@ -57,7 +65,10 @@ def register_pipelines() -> dict[str, Pipeline]:
         virtual=[row.sensor for row in published.hours if row.virtual],
         inspected=[*parameters.sensors],
     )
-    pipelines[LEAKAGE] = _leakage(parameters)
+    if LEAKAGE in parameters.studies:  # its report is its own, and never without nodes
+        shown = sensors[LEAKAGE] or every_sensor[LEAKAGE]
+        leaks = reporting.create_leakage_pipeline(shown)
+        pipelines[LEAKAGE] = _runs(parameters, {LEAKAGE: sensors[LEAKAGE]}) + leaks
     runs = _runs(parameters, {study: sensors[study] for study in default})
     pipelines["__default__"] = runs + pipelines["reporting"]
     return pipelines
@@ -68,25 +79,13 @@ def _runs(parameters: Parameters, studies: dict[str, list[str]]) -> Pipeline:
     whole = Pipeline([])
     for study, sensors in studies.items():
         for sensor in sensors:
-            asked = parameters.studies[study]
-            virtual = any(asked.sensors[sensor].virtual_gyros)
-            roles = "devices" if asked.unseen_devices else "roles"
-            whole += _measured(sensor) + _split(sensor, virtual, asked.unseen_devices)
-            whole += training.create_pipeline(study, sensor, virtual, roles)
-            whole += evaluation.create_pipeline(study, sensor, virtual, roles)
+            virtual = any(parameters.studies[study].grid_of(sensor).virtual_gyros)
+            whole += _measured(sensor)
+            whole += virtual_gyros.create_pipeline(sensor) if virtual else Pipeline([])
+            whole += windowed_splits.create_pipeline(study, sensor, virtual)
+            whole += training.create_pipeline(study, sensor, virtual)
+            whole += evaluation.create_pipeline(study, sensor)
     return whole
-
-
-def _leakage(parameters: Parameters) -> Pipeline:
-    """From raw logs to the leak study's table and figure; no other pipeline has any of it."""
-    sensors = leak_sensors(parameters.leakage, parameters.only)
-    whole = Pipeline([])
-    for sensor in sensors:
-        whole += _measured(sensor) + windowed_splits.create_cut_pipeline(sensor)
-        whole += training.create_leakage_pipeline(sensor)
-        whole += evaluation.create_leakage_pipeline(sensor)
-    # never without nodes, which Kedro refuses before our check can say why
-    return whole + reporting.create_leakage_pipeline(sensors or parameters.leakage.sensors)
 
 
 def _measured(sensor: str) -> Pipeline:
@@ -94,19 +93,13 @@ def _measured(sensor: str) -> Pipeline:
     return raw_logs.create_pipeline(sensor) + ground_truth.create_pipeline(sensor)
 
 
-def _split(sensor: str, virtual: bool, unseen_devices: bool = False) -> Pipeline:
-    """The roles of the recordings, and the virtual gyroscopes drawn from those that train."""
-    drawn = virtual_gyros.create_pipeline(sensor) if virtual else Pipeline([])
-    return windowed_splits.create_pipeline(sensor, unseen_devices) + drawn
-
-
 def _virtual_sensors(parameters: Parameters) -> set[str]:
     """Sensors of which some study trains on virtual gyroscopes."""
     return {
         sensor
         for study in parameters.studies.values()
-        for sensor, grid in study.sensors.items()
-        if any(grid.virtual_gyros)
+        for sensor in study.sensors_among(parameters.sensors)
+        if any(study.grid_of(sensor).virtual_gyros)
     }
 
 

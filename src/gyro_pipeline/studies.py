@@ -1,61 +1,50 @@
-"""Which trainings the studies of the paper ask for: one :class:`Cell` each."""
+"""Which runs the studies ask for: one :class:`RunSpec` each."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import product
 from typing import Any
 
-from gyro_pipeline.conventions import (
-    AXES,
-    HOLD_OUT,
-    LEAKS,
-    NO_LEAK,
-    TEST_IN_TRAINING,
-    InputError,
-)
-from gyro_pipeline.parameters import (
-    Leakage,
-    Only,
-    Parameters,
-    Splits,
-    Study,
-    Training,
-    VirtualGyros,
-)
+import pandas as pd
 
-CNN, CNN_SHUFFLED, MEAN = "cnn", "cnn_shuffled", "mean"
-NETWORKS = (CNN, CNN_SHUFFLED)
-"""Estimators that are the paper's network: as it is, and with shuffled labels, a leak detector."""
+from gyro_pipeline.conventions import AXES, NOTHING, OWN, REAL, InputError
+from gyro_pipeline.estimators import estimator_class
+from gyro_pipeline.parameters import Only, Parameters, Splits, Study, Training, VirtualGyros
+
+CNN, CNN_SHUFFLED, MEAN, CONSTANT = "cnn", "cnn_shuffled", "mean", "training_mean"
 
 RESIDUAL_NETWORK = "residual_network"
-"""The estimator that is fitted to what a cell of the paper trains on: its real and virtual IMUs."""
+"""The recommended estimator that stands beside the paper's network."""
 
 DEFAULT = "__default__"
 """The pipeline without a name."""
 
 LEAKAGE = "leakage"
-"""The leak study: its pipeline, MLflow experiment and parameters."""
+"""The leak study, which has a report of its own."""
+
+
+LEFT_OUT = "left_out"
+"""Column of a plan: why a run cannot be made; empty where it can."""
 
 
 @dataclass(frozen=True)
-class Cell:
-    """One estimator on one sensor, window and fold: one MLflow run.
+class RunSpec:
+    """One estimator on one sensor and window, and what it learns from: one MLflow run.
 
-    The fields are parameters of the run, by these names. The running mean is trained on nothing:
-    its ``method``, ``real_gyros`` and ``virtual_gyros`` are 0. Other estimators without a network
-    have method 0 and seed 0, and are fitted in each fold when they are judged.
+    The fields are parameters of the run, by these names.
     """
 
     study: str
-    method: int
     sensor: str
     source: str
+    protocol: str
+    estimator: str
+    method: int
     real_gyros: int
     virtual_gyros: int
     window_s: float
+    window_stride_s: float
     seed: int
-    fold: int
-    estimator: str
 
     @property
     def real_imus(self) -> int:
@@ -67,88 +56,92 @@ class Cell:
         """Virtual IMUs in training; the first ones, so that smaller sets are parts of larger."""
         return self.virtual_gyros // len(AXES)
 
-    @property
-    def content(self) -> dict[str, Any]:
-        """What the training depends on: not the study, and one IMU is the same in both methods."""
-        content = asdict(self)
-        del content["study"]
-        if self.estimator in NETWORKS and self.real_imus == 1:
-            content["method"] = 2
-        return content
-
     @classmethod
     def names(cls) -> list[str]:
         """Names of the fields, in order."""
         return [field.name for field in fields(cls)]
 
 
-@dataclass(frozen=True)
-class LeakCell(Cell):
-    """A training of the leak study; no run of another study has these parameters."""
-
-    leak: str
-    window_stride_s: float
-
-
-def leak_cells(leakage: Leakage, sensor: str, source: str, seeds: Sequence[int]) -> list[LeakCell]:
-    """Cells of the leak study on a sensor: for each stride the honest split, then the leaks."""
-    ways = [(NO_LEAK, CNN), (NO_LEAK, CNN_SHUFFLED), *((leak, CNN) for leak in LEAKS[1:])]
-    imu = (2, sensor, source, len(AXES), 0)
-    return [
-        LeakCell(LEAKAGE, *imu, leakage.window_s, seed, fold, estimator, leak, stride_s)
-        for stride_s, (leak, estimator), seed in product(leakage.strides_s, ways, seeds)
-        for fold in ([HOLD_OUT] if leak == TEST_IN_TRAINING else range(leakage.folds))
-    ]
-
-
-def leak_sensors(leakage: Leakage, only: Only) -> list[str]:
-    """Sensors of the leak study that ``only`` leaves."""
-    return [sensor for sensor in leakage.sensors if only.sensor in (None, sensor)]
-
-
-def study_cells(  # noqa: PLR0913 - what a grid is made of
+def study_rows(  # noqa: PLR0917 - what a grid is made of
     study: Study,
     sensor: str,
     source: str,
     windows_s: Sequence[float],
     seeds: Sequence[int],
     only: Only,
-) -> list[Cell]:
-    """Cells of a study on a sensor on the hold-out split; the running mean of each window first.
+) -> list[RunSpec]:
+    """Rows of a study on a sensor, the running mean of each window first.
 
     ``only`` narrows them. A running mean stays wherever another estimator of its window does.
     """
-    name, grid = study.experiment, study.sensors[sensor]
-    networks = [
-        Cell(name, grid.method, sensor, source, real, virtual, float(window_s), seed, HOLD_OUT, CNN)
-        for real, virtual, window_s, seed in product(
-            grid.real_gyros, grid.virtual_gyros, study.windows_s or windows_s, seeds
+    grid, wanted = study.grid_of(sensor), only.model_dump(exclude_none=True)
+    rows = [
+        RunSpec(
+            *(study.experiment, sensor, source, protocol, estimator),
+            *(grid.method, real, virtual, float(window_s), float(stride_s or window_s), seed),
+        )
+        for window_s, stride_s in product(study.windows_s or windows_s, study.strides_s or [None])
+        for protocol, estimators in study.estimators_of.items()
+        for estimator, real, virtual, seed in product(
+            estimators, grid.real_gyros, grid.virtual_gyros, seeds
         )
     ]
-    cells = list(
-        dict.fromkeys(
-            cell if estimator == CNN else replace(cell, method=0, seed=0, estimator=estimator)
-            for estimator in study.estimators
-            for cell in networks
-        )
-    )
-    wanted = only.model_dump(exclude_none=True, exclude={"fold"})  # folds: known only with data
-    cells = [c for c in cells if all(getattr(c, key) == value for key, value in wanted.items())]
+    rows = [row for row in rows if all(getattr(row, key) == v for key, v in wanted.items())]
+    least = {"real_gyros": min(grid.real_gyros), "virtual_gyros": 0, "seed": 0}
     means = [
-        Cell(name, 0, sensor, source, 0, 0, window_s, 0, HOLD_OUT, MEAN)
-        for window_s in dict.fromkeys(cell.window_s for cell in cells)
+        replace(row, protocol=study.protocol, estimator=MEAN, method=grid.method, **least)
+        for row in rows
     ]
-    return means + [cell for cell in cells if cell.estimator != MEAN]
+    return [*dict.fromkeys(means), *(row for row in rows if row.estimator != MEAN)]
+
+
+def run_specs(rows: Iterable[RunSpec], unseen_devices: bool) -> list[RunSpec]:
+    """Runs that make some rows: rows whose estimator uses the same training set are one run."""
+    return list(dict.fromkeys(run_spec(row, unseen_devices) for row in rows))
+
+
+def run_spec(row: RunSpec, unseen_devices: bool) -> RunSpec:
+    """A row reduced to what its estimator uses of the training set that it names.
+
+    Args:
+        row: It.
+        unseen_devices: Whether the tested devices are unseen ones, of which there are no own
+            recordings: all real ones are used in their place.
+
+    Returns:
+        The row without the gyroscopes, the seed and the method that change nothing.
+    """
+    estimator = estimator_class(row.estimator)
+    uses = REAL if estimator.uses == OWN and unseen_devices else estimator.uses
+    counts = {NOTHING: (0, 0), OWN: (len(AXES), 0), REAL: (row.real_gyros, 0)}
+    real, virtual = counts.get(uses, (row.real_gyros, row.virtual_gyros))
+    side_by_side = estimator.side_by_side and real > len(AXES)
+    return replace(
+        row,
+        method=row.method if side_by_side else 2,  # one IMU is the same in both methods
+        real_gyros=real,
+        virtual_gyros=virtual,
+        seed=row.seed if estimator.seeded else 0,
+    )
+
+
+def planned(plan: pd.DataFrame) -> dict[str, RunSpec]:
+    """The runs of a plan that can be made, by fingerprint."""
+    made = plan[plan[LEFT_OUT].isna() | (plan[LEFT_OUT] == "")]
+    return {
+        row["fingerprint"]: RunSpec(**{name: row[name] for name in RunSpec.names()})
+        for row in made.to_dict("records")
+    }
 
 
 def used_sensors(parameters: Parameters) -> dict[str, list[str]]:
-    """For each study the sensors on which ``only`` leaves it at least one cell."""
+    """For each study the sensors on which ``only`` leaves it at least one row."""
     p = parameters
     return {
         name: [
             sensor
-            for sensor in study.sensors
-            if study_cells(study, sensor, p.source, p.windows_s, p.seeds, p.only)
+            for sensor in study.sensors_among(p.sensors)
+            if study_rows(study, sensor, p.source, p.windows_s, p.seeds, p.only)
         ]
         for name, study in p.studies.items()
     }
@@ -156,14 +149,11 @@ def used_sensors(parameters: Parameters) -> dict[str, list[str]]:
 
 def studies_to_run(parameters: Parameters, pipelines: Sequence[str]) -> dict[str, list[str]]:
     """Sensors of each study that some pipelines run, as ``only`` leaves them."""
-    studies = {
+    return {
         study: sensors
         for study, sensors in used_sensors(parameters).items()
         if study in pipelines or (parameters.studies[study].default and DEFAULT in pipelines)
     }
-    if LEAKAGE in pipelines:
-        studies[LEAKAGE] = leak_sensors(parameters.leakage, parameters.only)
-    return studies
 
 
 def check_possible(parameters: Parameters, pipelines: Sequence[str]) -> None:
@@ -178,20 +168,20 @@ def check_possible(parameters: Parameters, pipelines: Sequence[str]) -> None:
         pipelines: Names of those to run.
 
     Raises:
-        InputError: ``only`` leaves nothing of the studies, a sensor is unknown, or it has fewer
-            IMUs or shorter recordings than a study needs.
+        InputError: ``only`` leaves nothing of the studies, a sensor or estimator is unknown, or a
+            sensor has fewer IMUs or shorter recordings than a study needs.
     """
     studies = studies_to_run(parameters, pipelines)
     if studies and not any(studies.values()):
         only = parameters.only.model_dump(exclude_none=True)
         raise InputError(
             f"only={only} matches nothing in {', '.join(studies)}; for what there is, and to "
-            "name a new sensor, see studies.yml and leakage.yml in conf/base/parameters"
+            "name a new sensor, see studies.yml in conf/base/parameters"
         )
     for study, sensors in studies.items():
         for sensor in sensors:
-            parameters.check_sensor(_parameter(study), sensor)
-            _check_cells(parameters, study, sensor)
+            parameters.check_sensor(f"studies.{study}", sensor)
+            _check_rows(parameters, study, sensor)
     if {"reporting", DEFAULT} & set(pipelines):
         published = parameters.published
         named = [row.sensor for row in published.specifications]
@@ -199,17 +189,12 @@ def check_possible(parameters: Parameters, pipelines: Sequence[str]) -> None:
             parameters.check_sensor("published", sensor)
 
 
-def _parameter(study: str) -> str:
-    return LEAKAGE if study == LEAKAGE else f"studies.{study}"
-
-
-def _check_cells(p: Parameters, study: str, name: str) -> None:
-    """Compare the cells of a study on a sensor with what the sensor's entry says."""
-    cells: Sequence[Cell] = (
-        leak_cells(p.leakage, name, p.source, p.seeds)
-        if study == LEAKAGE
-        else study_cells(p.studies[study], name, p.source, p.windows_s, p.seeds, p.only)
-    )
+def _check_rows(p: Parameters, study: str, name: str) -> None:
+    """Compare the rows of a study on a sensor with what the sensor's entry says."""
+    asked_study = p.studies[study]
+    rows = study_rows(asked_study, name, p.source, p.windows_s, p.seeds, p.only)
+    for estimator in dict.fromkeys(row.estimator for row in rows):
+        estimator_class(estimator)  # an unknown one is refused here
     imus, length_s = p.sensors[name].imus, p.sensors[name].recording_s
     has, makes = len(AXES) * (imus or 0), len(AXES) * p.virtual_gyros.imus
     for asked, limit, words in (
@@ -219,66 +204,38 @@ def _check_cells(p: Parameters, study: str, name: str) -> None:
             "window_s",
             length_s,
             f"s windows asked, longer than a recording of {name}, {length_s or 0:g} s "
-            "(windows_s of the studies, window_s of leakage; recording_s of the sensor)",
+            "(windows_s of the studies; recording_s of the sensor)",
         ),
     ):
-        most = max(getattr(cell, asked) for cell in cells)
+        most = max(getattr(row, asked) for row in rows)
         if limit is not None and most > limit:
-            raise InputError(f"{_parameter(study)}.{name}: {most:g} {words}")
-
-
-def over_folds(cells: Sequence[Cell], folds: Sequence[int], only: Only) -> list[Cell]:
-    """One network per fold; any other estimator once, over the recordings of all folds.
-
-    Raises:
-        InputError: If ``only.fold`` is none of the folds.
-    """
-    if only.fold is not None and only.fold not in folds:
-        raise InputError(
-            f"only.fold={only.fold}: {cells[0].sensor} has folds {', '.join(map(str, folds))}"
-        )
-    wanted = [fold for fold in folds if only.fold in (None, fold)]
-    return [
-        replace(cell, fold=fold)
-        for cell in cells
-        for fold in (wanted if cell.estimator in NETWORKS else [HOLD_OUT])
-    ]
-
-
-def leak_params(
-    cell: LeakCell, settings: Training, leakage: Leakage, splits: Splits
-) -> dict[str, Any]:
-    """Parameters that a run of the leak study carries; see :func:`run_params`.
-
-    Args:
-        cell: Which run.
-        settings: What the network was trained with.
-        leakage: How many recordings it uses, and into how many folds they or their windows go.
-        splits: The seed of the deal.
-    """
-    folds = 1 if cell.fold == HOLD_OUT else leakage.folds
-    used = {"folds": folds, "recordings": leakage.recordings, "split_seed": splits.split_seed}
-    return asdict(cell) | used | settings.model_dump()
+            raise InputError(f"studies.{study}.{name}: {most:g} {words}")
 
 
 def run_params(
-    cell: Cell, folds: int, training: Training, splits: Splits, virtual_gyros: VirtualGyros
+    spec: RunSpec, study: Study, training: Training, splits: Splits, virtual_gyros: VirtualGyros
 ) -> dict[str, Any]:
-    """Parameters that a run of this cell carries: its identity, and what a network was made with.
+    """Parameters that a run carries: its identity, and the settings that it depends on.
 
     Args:
-        cell: Which run.
-        folds: How many folds make up the row it belongs to; 1 for a hold-out.
-        training: Hyper-parameters.
-        splits: Their validation counts and seed are recorded.
-        virtual_gyros: Their turn-on jitter is recorded where the cell has some.
+        spec: Which run.
+        study: Its study, which may change some settings.
+        training: Hyper-parameters, of estimators that have some.
+        splits: How recordings are split, and which windows train.
+        virtual_gyros: Their turn-on jitter is recorded where the run has some.
     """
-    params: dict[str, Any] = asdict(cell) | {"folds": folds}
-    if cell.virtual_gyros:
+    params: dict[str, Any] = asdict(spec) | study.splits(splits).model_dump(include=_RECORDED)
+    if spec.virtual_gyros:
         params["turn_on_jitter_mdps"] = virtual_gyros.turn_on_jitter_mdps
-    if cell.estimator not in NETWORKS:
-        return params
-    hold_out = cell.fold == HOLD_OUT
-    validation = splits.validation_recordings if hold_out else splits.fold_validation_recordings
-    params |= training.model_dump()
-    return params | {"validation_recordings": validation, "split_seed": splits.split_seed}
+    if estimator_class(spec.estimator).seeded:
+        params |= study.training_of(training).model_dump(exclude_none=True)
+    return params
+
+
+_RECORDED = {
+    "split_seed",
+    "training_windows",
+    "validation_recordings",
+    "fold_validation_recordings",
+}
+"""Settings of the splits that a run's parameters name."""

@@ -1,4 +1,4 @@
-"""Tables as CSV files."""
+"""Tables as CSV or Parquet files."""
 
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,10 @@ from gyro_pipeline.datasets.atomic import replacing
 
 
 class Table(AbstractDataset[pd.DataFrame, pd.DataFrame | Missing]):
-    """Keeps a table as CSV, without its index; numbers come back exactly as they were.
+    """Keeps a table without its index; numbers come back exactly as they were.
 
     Args:
-        filepath: The CSV file.
+        filepath: The file, ``.csv`` or, for long tables, ``.parquet``.
         made_by: The command that makes it. Where it is given and there is no file, ``load``
             returns it as :class:`Missing`, so that a report can say what it lacks.
         metadata: For other tools, such as Kedro-Viz.
@@ -41,7 +41,8 @@ class Table(AbstractDataset[pd.DataFrame, pd.DataFrame | Missing]):
             data: Its columns are stored, its index is not.
         """
         with replacing(self._filepath) as temporary:
-            data.to_csv(temporary, index=False)
+            write = data.to_parquet if self._filepath.suffix == ".parquet" else data.to_csv
+            write(temporary, index=False)
 
     def preview(self, nrows: int = 40) -> TablePreview:
         """Show the first rows in Kedro-Viz.
@@ -63,4 +64,6 @@ class Table(AbstractDataset[pd.DataFrame, pd.DataFrame | Missing]):
 
 def read_table(path: Path) -> pd.DataFrame:
     """Read a table that :class:`Table` wrote."""
+    if path.suffix == ".parquet":
+        return pd.read_parquet(path)
     return pd.read_csv(path, keep_default_na=False, na_values=[""])

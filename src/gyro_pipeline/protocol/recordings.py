@@ -6,29 +6,23 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyro_pipeline.conventions import TEST_IMU, InputError
 from gyro_pipeline.fingerprints import fingerprint
 
 
-def present(recordings: xr.Dataset) -> xr.DataArray:
-    """Whether an IMU has a recording, (imu, recording)."""
-    return recordings["samples"].transpose("imu", "recording").load() > 0
+def tested_imu(recordings: xr.Dataset) -> int:
+    """The IMU whose recordings test, the first one: IMU 1 of the paper (section IV-B)."""
+    return int(recordings.imu[0])
 
 
-def recordings_of_test_imu(recordings: xr.Dataset) -> NDArray[np.bool_]:
-    """Which recordings the tested IMU has, (recording,).
+def common_length(recordings: xr.Dataset) -> int:
+    """The length to which studies cut all recordings, in samples.
 
-    Raises:
-        InputError: It has none.
+    It is the one that keeps most samples of all recordings together; shorter ones are left out. So
+    a single short recording does not shorten all others.
     """
-    imus = recordings.imu.to_numpy().tolist()
-    if TEST_IMU not in imus:
-        raise InputError(
-            f"{recordings.attrs['sensor']}: expected recordings of IMU {TEST_IMU}, which studies "
-            f"test, got IMUs {', '.join(map(str, imus))}. Write {{imu:name}} for {{imu}} in the "
-            "pattern of the catalog entry in catalog.yml, which numbers them from 1 in their order"
-        )
-    return np.asarray(present(recordings).sel(imu=TEST_IMU).to_numpy())
+    lengths = np.sort(recordings["samples"].to_numpy().ravel())
+    kept = np.arange(len(lengths), 0, -1)  # recordings that are at least as long as each
+    return int(lengths[np.argmax(lengths * kept)])
 
 
 def one_by_one(recordings: xr.Dataset) -> Iterator[tuple[int, int, NDArray[np.floating]]]:
@@ -46,9 +40,21 @@ def one_by_one(recordings: xr.Dataset) -> Iterator[tuple[int, int, NDArray[np.fl
 
 
 def cut(recordings: xr.Dataset, length: int) -> xr.Dataset:
-    """The first so many samples of each recording; none may be shorter. Nothing is read."""
-    if length == recordings.sizes["sample"]:
-        return recordings
-    part = recordings.isel(sample=slice(length))
+    """The first so many samples of each recording that has them. No samples are read."""
+    samples = recordings["samples"].load()
+    if bool(((samples == length) | (samples == 0)).all()):
+        return recordings.isel(sample=slice(length))
+    used = samples >= length
     changed = fingerprint([recordings.attrs["data_hash"], length])
-    return part.assign(samples=part["samples"].clip(max=length)).assign_attrs(data_hash=changed)
+    part = recordings.isel(sample=slice(length)).assign(samples=used * length)
+    return with_recordings(part.assign_attrs(data_hash=changed))
+
+
+def with_recordings(recordings: xr.Dataset) -> xr.Dataset:
+    """Leave out IMUs that have no recording, and recordings that no IMU has."""
+    there = recordings["samples"].load() > 0
+    for dimension, other in (("imu", "recording"), ("recording", "imu")):
+        used = there.any(other).to_numpy()
+        if not used.all():  # an index of single places makes reading slow
+            recordings = recordings.isel({dimension: np.flatnonzero(used)})
+    return recordings

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from gyro_pipeline.conventions import ALL, AXES, DISJOINT, FIRST, PAPER, TEST_IMU, TRUE
+from gyro_pipeline.conventions import ALL, AXES, DISJOINT, FIRST, PAPER, TRUE
 from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.recording_model import outside_noise
 from gyro_pipeline.protocol.windows import usable_starts
@@ -32,6 +32,7 @@ class TestRecording:
         noise: N, B and K of each axis from training recordings, or as drawn if simulated.
         true_bias: Drawn bias, shape (3,), deg/s; None on measured data.
         imu: Whose recording it is.
+        tested: First samples of the windows that test, in order.
     """
 
     number: int
@@ -39,31 +40,29 @@ class TestRecording:
     rate_hz: float
     noise: tuple[NoiseFigures, ...]
     true_bias: np.ndarray | None
-    imu: int = TEST_IMU
+    imu: int
+    tested: np.ndarray
 
     @cached_property
     def running_sums(self) -> np.ndarray:
         """Sum of the measured ones of the first i samples in float64, shape (3, n + 1)."""
-        sums = np.cumsum(np.where(self._masked, 0, self.samples), axis=-1, dtype=np.float64)
+        sums = np.cumsum(np.where(self.masked, 0, self.samples), axis=-1, dtype=np.float64)
         return np.concatenate([np.zeros((len(AXES), 1)), sums], axis=-1)
 
     @cached_property
     def running_counts(self) -> np.ndarray:
         """How many of the first i samples are measured, shape (n + 1,)."""
-        return np.concatenate([[0], np.cumsum(~self._masked)])
+        return np.concatenate([[0], np.cumsum(~self.masked)])
 
     @cached_property
-    def _masked(self) -> np.ndarray:
+    def masked(self) -> np.ndarray:
+        """Whether a sample holds no measurement, shape (n,)."""
         return np.isnan(self.samples).any(axis=0)
 
     @property
     def mean(self) -> np.ndarray:
         """Mean of the whole recording, shape (3,), deg/s."""
         return self.running_sums[:, -1] / self.running_counts[-1]
-
-    def starts(self, size: int, starts: np.ndarray | None = None) -> np.ndarray:
-        """First samples of the windows that are used, of all non-overlapping ones or of others."""
-        return usable_starts(self._masked, size, starts)
 
     def window_sums(self, starts: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
         """Sums of windows, shape (windows, 3), and counts of their samples, shape (windows, 1)."""
@@ -73,12 +72,12 @@ class TestRecording:
         )
         return sums.T, counts[:, None]
 
-    def window_means(self, size: int, starts: np.ndarray | None = None) -> np.ndarray:
-        """Means of the windows that are used, shape (windows, 3), deg/s."""
-        sums, counts = self.window_sums(self.starts(size, starts), size)
+    def window_means(self, starts: np.ndarray, size: int) -> np.ndarray:
+        """Means of windows, shape (windows, 3), deg/s."""
+        sums, counts = self.window_sums(starts, size)
         return sums / counts
 
-    def truths(self, size: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    def truths(self, starts: np.ndarray, size: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """The truth for every window, with that truth's own averaging variance.
 
         ``PAPER``, the mean of the whole recording, counts as exact (the paper's definition).
@@ -88,12 +87,13 @@ class TestRecording:
         data.
 
         Args:
+            starts: First samples of the windows.
             size: Samples per window.
 
         Returns:
             For each truth its value in deg/s and its variance, both of shape (windows, 3).
         """
-        n, starts = self.samples.shape[-1], self.starts(size)
+        n = self.samples.shape[-1]
         sums, counts = self.window_sums(starts, size)
         exact = np.zeros(sums.shape)
         truths = {PAPER: (np.broadcast_to(self.mean, sums.shape), exact)}
@@ -117,31 +117,33 @@ Columns = Mapping[str, NDArray[Any]]
 def error_columns(
     recording: TestRecording,
     truth: str,
-    known: tuple[np.ndarray, np.ndarray],
+    value_and_variance: tuple[np.ndarray, np.ndarray],
     estimates: np.ndarray,
     sigma: np.ndarray,
 ) -> Columns:
     """Errors of the estimates on one recording against one truth, a row per window and axis.
 
     Args:
-        recording: What was estimated.
+        recording: What was estimated, in all windows that test.
         truth: Its name.
-        known: Its values and variances, from :meth:`TestRecording.truths`.
+        value_and_variance: From :meth:`TestRecording.truths`.
         estimates: Shape (windows, 3), deg/s.
         sigma: The standard deviations that the estimator states, same shape; NaN for none.
 
     Returns:
-        Columns ``imu, recording, window, axis, truth, error_dps, truth_variance, sigma_dps``;
-        several such tables are put below one another by :func:`stacked`.
+        Columns ``imu, recording, window, start, axis, truth, error_dps, truth_variance,
+        sigma_dps``; several such tables are put below one another by :func:`stacked`.
     """
-    value, variance = known
+    value, variance = value_and_variance
     n = len(estimates)
+    rows = n * len(AXES)
     return {
-        "imu": np.full(n * len(AXES), recording.imu),
-        "recording": np.full(n * len(AXES), recording.number),
+        "imu": np.full(rows, recording.imu),
+        "recording": np.full(rows, recording.number),
         "window": np.repeat(np.arange(n), len(AXES)),
+        "start": np.repeat(recording.tested, len(AXES)),
         "axis": np.tile(AXES, n),
-        "truth": np.full(n * len(AXES), truth),
+        "truth": np.full(rows, truth),
         "error_dps": (estimates - value).ravel(),
         "truth_variance": variance.ravel(),
         "sigma_dps": np.ravel(sigma),
@@ -168,9 +170,10 @@ def running_mean_curve(recording: TestRecording, size: int) -> pd.DataFrame:
     step = max(1, round(CURVE_STEP_S * recording.rate_hz))
     rows = []
     for length in np.unique([*range(step, n, step), size, n]).tolist():
-        estimates = recording.window_means(length)
+        starts = usable_starts(recording.masked, length)
+        estimates = recording.window_means(starts, length)
         time_s = length / recording.rate_hz
-        for truth, (value, variance) in recording.truths(length).items():
+        for truth, (value, variance) in recording.truths(starts, length).items():
             if truth == DISJOINT and length > LAST_DISJOINT_FRACTION * n:
                 continue
             squares = (estimates - value) ** 2 - variance

@@ -8,12 +8,11 @@ nothing that sees windows meets NaN.
 from collections.abc import Sequence
 
 import numpy as np
-import xarray as xr
+import pandas as pd
 from numpy.lib.stride_tricks import sliding_window_view
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.physics.bias import fill_masked
-from gyro_pipeline.protocol.recordings import one_by_one
 
 LARGEST_MASKED_SHARE = 0.1
 """Of a window's samples: where more are masked, the window is left out."""
@@ -41,11 +40,6 @@ def window_size(window_s: float, rate_hz: float, recording_samples: int, where: 
     return size
 
 
-def window_starts(samples: int, size: int, stride: int) -> np.ndarray:
-    """First samples of all windows that fit into a recording, ``stride`` samples apart."""
-    return np.arange(0, samples - size + 1, stride)
-
-
 def usable_starts(
     masked: np.ndarray,
     size: int,
@@ -61,7 +55,7 @@ def usable_starts(
         largest_masked_share: Of a window's samples that may be masked.
     """
     if starts is None:
-        starts = window_starts(len(masked), size, size)
+        starts = np.arange(0, len(masked) - size + 1, size)
     if not masked.any():
         return starts
     before = np.concatenate([[0], np.cumsum(masked)])
@@ -95,55 +89,61 @@ def windows_at(samples: np.ndarray, size: int, starts: np.ndarray) -> np.ndarray
     return fill_masked(sliding_window_view(samples, size, axis=-1)[..., starts, :])
 
 
-class UsableWindows:
-    """How many non-overlapping windows the recordings of a sensor, all of one length, give.
-
-    A recording without one trains no network and tests none.
+def usable_windows(contents: pd.DataFrame, samples: int, size: int, stride: int) -> pd.DataFrame:
+    """Windows of all recordings that are not dropped.
 
     Args:
-        recordings: Each is read once, here.
+        contents: A row per recording: ``imu, recording``, and ``masked``, the numbers of its
+            masked samples.
+        samples: Of every recording.
+        size: Samples per window.
+        stride: Samples from the start of one window to that of the next.
+
+    Returns:
+        A row per window: ``imu, recording`` and ``start``, its first sample.
     """
+    starts = np.arange(0, samples - size + 1, stride)
+    own = []
+    for masked in contents.masked:
+        lost = np.zeros(samples, bool)
+        lost[masked] = True
+        own.append(usable_starts(lost, size, starts))
+    counts = [len(part) for part in own]
+    places = {name: np.repeat(contents[name].to_numpy(), counts) for name in ("imu", "recording")}
+    return pd.DataFrame(places | {"start": np.concatenate([[], *own]).astype(np.int64)})
 
-    def __init__(self, recordings: xr.Dataset) -> None:
-        self._samples = recordings.sizes["sample"]
-        self._masked: dict[tuple[int, int], np.ndarray | None] = {}
-        for imu, number, samples in one_by_one(recordings):
-            masked = np.isnan(samples).any(axis=0)
-            self._masked[imu, number] = masked if masked.any() else None
 
-    def count(self, imus: Sequence[int], number: int, size: int) -> int:
-        """Windows of ``size`` samples of IMUs side by side; 0 where one lacks the recording."""
-        return len(self._starts(imus, number, size))
+def describe_losses(contents: pd.DataFrame, samples: int, size: int) -> str:
+    """Which non-overlapping windows are dropped, in words; empty where none is.
 
-    def losses(self, size: int) -> str:
-        """Which windows of ``size`` samples are left out, in words; empty where none is."""
-        starts = {place: self._starts(place[:1], place[1], size) for place in self._masked}
-        total = len(starts) * (self._samples // size)
-        dropped = total - sum(map(len, starts.values()))
-        if not dropped:
-            return ""
-        parts = [
-            f"{dropped} of {total} lost more than {LARGEST_MASKED_SHARE:.0%} of their samples and "
-            "are left out"
-        ]
-        late = [place for place, own in starts.items() if len(own) and own[0]]
-        lost = [place for place, own in starts.items() if not len(own)]
-        if late:
-            first = starts[late[0]][0] // size + 1
-            parts.append(f"the first one used of {_named(late)} is window {first}")
-        if lost:
-            parts.append(f"none is left of {_named(lost)}, so it trains no network and tests none")
-        return "; ".join(parts)
-
-    def _starts(self, imus: Sequence[int], number: int, size: int) -> np.ndarray:
-        places = [(imu, number) for imu in imus]
-        if not all(place in self._masked for place in places):
-            return np.empty(0, np.intp)
-        masked = np.zeros(self._samples, bool)
-        for place in places:
-            own = self._masked[place]
-            masked |= False if own is None else own
-        return usable_starts(masked, size)
+    Args:
+        contents: A row per recording, as :func:`usable_windows` takes it.
+        samples: Of every recording.
+        size: Samples per window.
+    """
+    windows = usable_windows(contents, samples, size, size)
+    total = len(contents) * (samples // size)
+    if len(windows) == total:
+        return ""
+    firsts = windows.groupby(["imu", "recording"]).start.min()
+    late, lost = (
+        firsts[firsts > 0],
+        [
+            place
+            for place in zip(contents.imu, contents.recording, strict=True)
+            if place not in firsts.index
+        ],
+    )
+    parts = [
+        f"{total - len(windows)} of {total} lost more than {LARGEST_MASKED_SHARE:.0%} of their "
+        "samples and are left out"
+    ]
+    if len(late):
+        first = late.iloc[0] // size + 1
+        parts.append(f"the first one used of {_named([*late.index])} is window {first}")
+    if lost:
+        parts.append(f"none is left of {_named(lost)}, so it trains no network and tests none")
+    return "; ".join(parts)
 
 
 def _named(places: Sequence[tuple[int, int]]) -> str:

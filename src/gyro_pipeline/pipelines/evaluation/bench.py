@@ -1,4 +1,4 @@
-"""The test bench: one sensor, window and fold, on which every estimator is judged alike."""
+"""The test bench: windows of a sensor that test, on which every estimator is judged alike."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -12,22 +12,17 @@ import xarray as xr
 from gyro_pipeline.conventions import (
     ALL,
     AXES,
-    BEST,
     BIAS,
     DISJOINT,
     FIRST,
-    HOLD_OUT,
     LAST,
     PAPER,
     RECORDING_MEAN,
     TARGET_OF,
-    TEST,
-    TEST_IMU,
-    TRAIN,
-    TRUE,
     InputError,
 )
-from gyro_pipeline.estimators import Estimator, RunningMean
+from gyro_pipeline.estimators.averages import RunningMean
+from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.parameters import Evaluation
 from gyro_pipeline.physics.ceiling import (
     best_gain,
@@ -44,7 +39,6 @@ from gyro_pipeline.physics.recording_model import (
     mean_squares,
 )
 from gyro_pipeline.pipelines.evaluation.device import TestDevice
-from gyro_pipeline.protocol.recordings import present
 from gyro_pipeline.protocol.scores import (
     Estimate,
     ResampledCurve,
@@ -60,37 +54,40 @@ from gyro_pipeline.protocol.scores import (
     with_interval,
 )
 from gyro_pipeline.protocol.truths import (
-    CURVE_STEP_S,
     TestRecording,
     error_columns,
     running_mean_curve,
     stacked,
 )
 from gyro_pipeline.protocol.windows import cut_windows, window_size, windows_at
-from gyro_pipeline.tracking import metric_name
 
+SCORES = ["weights", "truth", "windows", "score", "value", "lo", "hi"]
+"""Columns of a table of scores."""
+
+SIGMAS = {"coverage_1sigma_pct": 1.0, "coverage_2sigma_pct": 2.0, "coverage_95_pct": 1.959964}
+"""Of stated standard deviations, within how many an error is counted."""
+
+TARGETS = (RECORDING_MEAN, BIAS)
 _CURVE_POINTS = 30  # of the expected running mean, to interpolate between
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Test recordings of the test IMU, or of several unseen ones, cut into windows of one length.
+    """The windows of a sensor that test, of one length, on which every estimator is judged alike.
 
     Attributes:
         recordings: All recordings of the sensor, of one length.
-        device: From :func:`describe_device`, or from :func:`describe_unseen` of the same IMUs.
-        numbers: The test recordings; an IMU may lack some.
+        device: What is known of the IMUs that test, from :func:`describe_devices`.
+        tests: The rows of the windows table that test: ``fold, imu, recording, start``.
         window_s: Calibration time T0, seconds.
         evaluation: Resamples and seed of the intervals.
-        imus: Whose recordings test, in order.
     """
 
     recordings: xr.Dataset
     device: TestDevice
-    numbers: tuple[int, ...]
+    tests: pd.DataFrame
     window_s: float
     evaluation: Evaluation
-    imus: tuple[int, ...] = (TEST_IMU,)
 
     @cached_property
     def size(self) -> int:
@@ -105,73 +102,51 @@ class Bench:
 
     @cached_property
     def tested(self) -> list[TestRecording]:
-        """The test recordings with what is needed to judge an estimate."""
-        known = "true_bias" in self.recordings
-        places, there = product(self.imus, self.numbers), present(self.recordings)
-        chosen = [
-            self.recordings.sel(imu=imu, recording=number)
-            for imu, number in places
-            if there.sel(imu=imu, recording=number)
-        ]
-        tested = [
-            TestRecording(
-                number=int(one.recording),
-                samples=one.angular_rate.to_numpy(),
-                rate_hz=self.recordings.attrs["rate_hz"],
-                noise=self.device.figures[self._axes(int(one.imu))],
-                true_bias=one.true_bias.to_numpy() if known else None,
-                imu=int(one.imu),
+        """The recordings that test, with what is needed to judge an estimate."""
+        drawn, tested = "true_bias" in self.recordings, []
+        for (imu, number), rows in self.tests.groupby(["imu", "recording"]):
+            recording = self.recordings.sel(imu=imu, recording=number)
+            tested.append(
+                TestRecording(
+                    number=int(number),
+                    samples=recording.angular_rate.to_numpy(),
+                    rate_hz=self.recordings.attrs["rate_hz"],
+                    noise=self.device.figures[self._axes(int(imu))],
+                    true_bias=recording.true_bias.to_numpy() if drawn else None,
+                    imu=int(imu),
+                    tested=np.unique(rows.start.to_numpy()),
+                )
             )
-            for one in chosen
-        ]
-        return [one for one in tested if len(one.starts(self.size))]
+        return tested
 
     @cached_property
     def _truths(self) -> list[dict[str, tuple[np.ndarray, np.ndarray]]]:
-        """Of each test recording."""
-        return [recording.truths(self.size) for recording in self.tested]
+        """The truths of each recording that tests."""
+        return [recording.truths(recording.tested, self.size) for recording in self.tested]
 
     def _axes(self, imu: int) -> slice:
         """Where the axes of an IMU are among those of ``device``."""
-        first = len(AXES) * self.imus.index(imu)
+        first = len(AXES) * self.device.imus.index(imu)
         return slice(first, first + len(AXES))
 
-    def errors(self, estimator: Estimator | Mapping[int, Estimator], imus: int = 1) -> pd.DataFrame:
-        """Errors of an estimator in all windows against all truths.
+    def errors(self, estimators: Mapping[str, Estimator], imus: int = 1) -> pd.DataFrame:
+        """Errors in all windows that test against all truths, each estimated by its fold's fit.
 
-        It is asked for the target that each truth is about.
+        The estimator is asked for the target that each truth is about.
 
         Args:
-            estimator: Sees ``imus`` IMUs side by side, the test IMU first; or one for each IMU
-                that is tested.
-            imus: How many.
+            estimators: The fit of each fold.
+            imus: IMUs that it sees side by side, the tested one first.
 
         Raises:
-            InputError: If it gives no estimate for some window.
+            InputError: There is no estimate for some window.
         """
-        seen = self.recordings.angular_rate.isel(imu=slice(imus))
         parts = []
         for recording, truths in zip(self.tested, self._truths, strict=True):
-            own = estimator[recording.imu] if isinstance(estimator, Mapping) else estimator
-            samples = (
-                recording.samples
-                if imus == 1
-                else np.concatenate(seen.sel(recording=recording.number).to_numpy())
-            )
-            starts = recording.starts(self.size)
-            # those of the tested IMU, whatever IMUs beside it lost
-            windows = windows_at(samples, self.size, starts).transpose(1, 0, 2)
-            start_s = starts / self.recordings.attrs["rate_hz"]
-            judged = {
-                target: [
-                    values[:, : len(AXES)]
-                    for values in own.estimate(windows, target, start_s, recording.number)
-                ]
-                for target in (RECORDING_MEAN, BIAS)
-            }
+            estimates = self._estimates(estimators, recording, imus)
             parts += [
-                error_columns(recording, truth, known, *judged[TARGET_OF[truth]])
-                for truth, known in truths.items()
+                error_columns(recording, truth, value, *estimates[TARGET_OF[truth]])
+                for truth, value in truths.items()
             ]
         errors = stacked(parts)
         for number in errors.recording[errors.error_dps.isna()].unique():
@@ -182,10 +157,36 @@ class Bench:
             )
         return errors
 
+    def _estimates(
+        self, estimators: Mapping[str, Estimator], recording: TestRecording, imus: int
+    ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Biases and sigma (windows, 3) of a recording's windows, by target."""
+        samples = recording.samples
+        if imus > 1:
+            seen = self.recordings.angular_rate.isel(imu=slice(imus))
+            samples = np.concatenate(seen.sel(recording=recording.number).to_numpy())
+        rows = self.tests[
+            (self.tests.imu == recording.imu) & (self.tests.recording == recording.number)
+        ]
+        shape = (len(recording.tested), len(AXES))
+        estimates = {t: (np.full(shape, np.nan), np.full(shape, np.nan)) for t in TARGETS}
+        for fold, own in rows.groupby("fold", observed=True):
+            starts = np.sort(own.start.to_numpy())
+            places = np.searchsorted(recording.tested, starts)
+            # whatever the IMUs beside the tested one lost
+            windows = windows_at(samples, self.size, starts).transpose(1, 0, 2)
+            when = starts / self.recordings.attrs["rate_hz"], recording.number
+            for target, of_target in estimates.items():
+                found = estimators[str(fold)].estimate(windows, target, *when)
+                for values, estimated in zip(of_target, found, strict=True):
+                    values[places] = estimated[:, : len(AXES)]
+        return estimates
+
     @cached_property
     def mean_errors(self) -> pd.DataFrame:
         """Errors of the running mean."""
-        return self.errors(RunningMean())
+        mean = RunningMean()
+        return self.errors(dict.fromkeys(map(str, self.tests.fold.unique()), mean))
 
     @cached_property
     def _means(self) -> dict[tuple[str, str], SquaredErrors]:
@@ -237,11 +238,11 @@ class Bench:
         device, size = self.device, self.size
         if device.models is None:
             assert device.unit_bias is not None
-            means = recording.window_means(size)
+            means = recording.window_means(recording.tested, size)
             axes = self._axes(recording.imu)
             known = (device.unit_bias[axes], device.spread[0, axes], device.noise[0, axes])
             return oracle(means, *known, self.window_s, self.recording_s, truth)
-        starts = recording.starts(size)
+        starts = recording.tested
         windows = cut_windows(recording.samples, size, starts)
         estimates = [
             [
@@ -361,81 +362,43 @@ class Bench:
         reached = equivalent_time(sizes, np.sqrt(curve).T, limit)
         return np.where(np.isfinite(reached), 1 - self.size / reached, 0.0)
 
-    def metrics(self, errors: pd.DataFrame, weights: str) -> dict[str, float]:
-        """All figures of merit of one set of errors, by metric name; only finite ones.
+    def scores(self, errors: pd.DataFrame, weights: str) -> pd.DataFrame:
+        """All figures of merit of one set of errors; only finite ones.
 
         Args:
             errors: From :meth:`errors`.
-            weights: ``last`` or ``best``; part of the names.
+            weights: ``last`` or ``best``, of a network.
+
+        Returns:
+            Columns ``weights, truth, windows, score, value, lo, hi``; the ends are those of the
+            95 % interval, None where there is none.
         """
-        metrics: dict[str, float] = {}
-        for truth in errors.truth.unique():
-            if truth != DISJOINT and errors.sigma_dps.notna().any():
-                for sigmas in (1, 2):
-                    name = metric_name(f"coverage_{sigmas}sigma", ALL, weights, truth)
-                    metrics[name] = coverage(errors, truth, sigmas)
-            for windows in (FIRST, ALL):
-                own, mean = squared_errors(errors, truth, windows), self._means[truth, windows]
-                curve = self.curves[truth, windows]
-                scores = score(own, mean, curve, self.window_s, self._resampled)
-                if weights == LAST:
-                    scores |= self.ceilings(truth, windows)
-                for base, estimate in scores.items():
-                    named = {"": estimate.value, "lo": estimate.lo, "hi": estimate.hi}
-                    metrics |= {
-                        metric_name(base, windows, weights, truth, bound): value
-                        for bound, value in named.items()
-                        if value is not None and np.isfinite(value)
-                    }
-                if self._oracles and self._clusters > 1:
-                    p = beats_oracle(own, self._oracles[truth, windows])
-                    metrics[metric_name("beats_oracle_p", windows, weights, truth)] = p
-        return metrics
+        rows = []
+        for truth, windows in product(errors.truth.unique(), (FIRST, ALL)):
+            own, mean = squared_errors(errors, truth, windows), self._means[truth, windows]
+            curve = self.curves[truth, windows]
+            scores = score(own, mean, curve, self.window_s, self._resampled)
+            if weights == LAST:
+                scores |= self.ceilings(truth, windows)
+            if windows == ALL and truth != DISJOINT and errors.sigma_dps.notna().any():
+                for name, sigmas in SIGMAS.items():
+                    scores[name] = Estimate(100 * coverage(errors, truth, sigmas))
+            if self._oracles and self._clusters > 1:
+                p = beats_oracle(own, self._oracles[truth, windows])
+                scores["beats_oracle_p"] = Estimate(p)
+            rows += [
+                (weights, truth, windows, name, *_finite(estimate))
+                for name, estimate in scores.items()
+                if np.isfinite(estimate.value)
+            ]
+        return pd.DataFrame(rows, columns=SCORES)
+
+
+def _finite(estimate: Estimate) -> list[float | None]:
+    values = (estimate.value, estimate.lo, estimate.hi)
+    return [value if value is not None and np.isfinite(value) else None for value in values]
 
 
 def _by_view(errors: pd.DataFrame) -> dict[tuple[str, str], SquaredErrors]:
     views = product(errors.truth.unique(), (FIRST, ALL))
     return {view: squared_errors(errors, *view) for view in views}
-
-
-def off_the_curve(metrics: Mapping[str, float]) -> dict[str, str]:
-    """In words, every equivalent time that is no time, by metric name.
-
-    Args:
-        metrics: From :meth:`Bench.metrics`, which holds finite values only.
-    """
-    notes = {}
-    for view in product((FIRST, ALL), (LAST, BEST), (PAPER, DISJOINT, TRUE)):
-        rmse, mean, time = (
-            metric_name(base, *view)
-            for base in ("test_rmse_dps", "mean_rmse_dps", "equivalent_time_s")
-        )
-        if rmse in metrics and time not in metrics:
-            worse = metrics[rmse] > metrics[mean]
-            notes[time] = (
-                f"worse than the running mean of {CURVE_STEP_S:g} s, where the curve starts"
-                if worse
-                else "the running mean never gets there"
-            )
-    return notes
-
-
-def test_recordings(roles: pd.DataFrame, fold: int) -> tuple[int, ...]:
-    """Test recordings of a fold; for ``HOLD_OUT`` on several folds, those of all."""
-    tests = roles[roles.role == TEST]
-    if fold != HOLD_OUT:
-        tests = tests[tests.fold == fold]
-    return tuple(sorted(tests.recording.unique().tolist()))
-
-
-def known_recordings(roles: pd.DataFrame) -> tuple[int, ...]:
-    """Recordings the ceiling is learned from: all but a hold-out's test ones; in a k-fold all."""
-    if (roles.fold == HOLD_OUT).all():
-        roles = roles[roles.role != TEST]
-    return tuple(sorted(roles.recording.unique().tolist()))
-
-
-def known_places(roles: pd.DataFrame) -> list[tuple[int, int]]:
-    """IMU and number of the recordings from which the noise of unseen devices is learned."""
-    train = roles[roles.role == TRAIN]
-    return sorted(set(zip(train.imu.tolist(), train.recording.tolist(), strict=True)))

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from gyro_pipeline.conventions import AXES, TEST_IMU
+from gyro_pipeline.conventions import AXES, ORIGIN_REAL, TEST
 from gyro_pipeline.physics.allan import SHORTEST_FIT_SAMPLES, NoiseFigures, fit_noise, mean_variance
 from gyro_pipeline.physics.bias import fill_masked
 from gyro_pipeline.physics.ceiling import turn_on_spread
@@ -18,6 +18,7 @@ UNIT_SPREAD = 1.0
 """Standard deviation of the bias from unit to unit, deg/s: 0.7 to 1.9 on the public DOT files."""
 
 _CEILING_RESAMPLES = 400
+_PLACE = ["imu", "recording"]
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,7 @@ class TestDevice:
     Of several unseen devices, the axes of one after the other.
 
     Attributes:
+        imus: The IMUs that test, in order.
         noise: N, shape (resamples, axes), deg/s sqrt(s); the first row is the estimate itself.
         spread: Turn-on spread tau, same shape, deg/s; of an unseen device, that of units.
         unit_bias: Drawn prior mean, shape (axes,), deg/s; None on measured data.
@@ -34,6 +36,7 @@ class TestDevice:
             (a time constant is then that of the recording at hand), else fitted.
     """
 
+    imus: tuple[int, ...]
     noise: np.ndarray
     spread: np.ndarray
     unit_bias: np.ndarray | None
@@ -54,7 +57,31 @@ class TestDevice:
         return covariances
 
 
-def describe_unseen(
+def describe_devices(
+    recordings: xr.Dataset, bias: pd.DataFrame, allan: xr.Dataset, table: pd.DataFrame, seed: int
+) -> TestDevice:
+    """What is known of the devices that test, from the recordings that do not test with them.
+
+    Args:
+        recordings: With the drawn values on simulated data.
+        bias: Ground truth.
+        allan: Allan variances.
+        table: A windows table. A device is known if some fold in which it tests trains on it.
+        seed: Of the bootstrap.
+    """
+    imus = sorted(table.imu[table.role == TEST].unique().tolist())
+    places = table[table.origin == ORIGIN_REAL].drop_duplicates(["fold", "role", *_PLACE])
+    learned = places[places.role != TEST]
+    tests = places[places.role == TEST].groupby("imu").fold.unique()
+    own = [learned[(learned.imu == imu) & learned.fold.isin(tests[imu])] for imu in imus]
+    if len(imus) == 1 and len(own[0]):
+        numbers = sorted(own[0].recording.unique().tolist())
+        return _describe_known(recordings, bias, allan, numbers, seed, imus[0])
+    others = learned[learned.fold.isin(tests.explode())][_PLACE].drop_duplicates()
+    return _describe_unseen(recordings, allan, sorted(map(tuple, others.to_numpy().tolist())), imus)
+
+
+def _describe_unseen(
     recordings: xr.Dataset,
     allan: xr.Dataset,
     places: Sequence[tuple[int, int]],
@@ -87,7 +114,7 @@ def describe_unseen(
         models = own * len(imus)
     axes = np.tile(noise, len(imus))[None]
     bias = np.zeros(axes.size) if recordings.attrs["simulated"] else None
-    return TestDevice(axes, np.full(axes.shape, UNIT_SPREAD), bias, models or None)
+    return TestDevice(tuple(imus), axes, np.full(axes.shape, UNIT_SPREAD), bias, models or None)
 
 
 def _with_prior(model: RecordingModel, mean: float, spread: float) -> RecordingModel:
@@ -97,13 +124,13 @@ def _with_prior(model: RecordingModel, mean: float, spread: float) -> RecordingM
     return replace(model, mean=means, covariance=covariance)
 
 
-def describe_device(  # noqa: PLR0913, PLR0917 - what a device is described by
+def _describe_known(  # noqa: PLR0913, PLR0917 - what a device is described by
     recordings: xr.Dataset,
     bias: pd.DataFrame,
     allan: xr.Dataset,
     numbers: Sequence[int],
     seed: int,
-    imu: int = TEST_IMU,
+    imu: int,
 ) -> TestDevice:
     """Noise and turn-on spread of an IMU, with a bootstrap over the recordings used.
 
@@ -117,6 +144,7 @@ def describe_device(  # noqa: PLR0913, PLR0917 - what a device is described by
     """
     if recordings.attrs["simulated"]:
         return TestDevice(
+            imus=(imu,),
             noise=recordings.true_noise.to_numpy()[None],
             spread=recordings.true_turn_on_spread.to_numpy()[None],
             unit_bias=recordings.true_unit_bias.sel(imu=imu).to_numpy(),
@@ -138,7 +166,7 @@ def describe_device(  # noqa: PLR0913, PLR0917 - what a device is described by
         values = means.loc[numbers].to_numpy()[chosen]
         averaging = np.square(noise[-1]) / duration_s + beyond_white
         spread.append(turn_on_spread(values, averaging))
-    return TestDevice(np.array(noise), np.array(spread), None, models)
+    return TestDevice((imu,), np.array(noise), np.array(spread), None, models)
 
 
 def _allan_fits(

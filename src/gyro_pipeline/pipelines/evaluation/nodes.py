@@ -2,145 +2,201 @@
 
 import logging
 from collections.abc import Iterator, Mapping
+from typing import Any
 
+import numpy as np
 import pandas as pd
 import xarray as xr
 
-from gyro_pipeline.conventions import ALL, AXES, BEST, FIRST, LAST, TEST_IMU
-from gyro_pipeline.estimators import (
-    ORIENTATION_NOTE,
-    Estimator,
-    averages,
-    base,
-    linear,
-    networks,
-    shrinkage,
-    training,
+from gyro_pipeline.conventions import (
+    ALL,
+    FIRST,
+    LAST,
+    MDPS,
+    PAPER,
+    TEST,
 )
+from gyro_pipeline.estimators.base import ORIENTATION_NOTE, Estimator
 from gyro_pipeline.fingerprints import code_hash, fingerprint
-from gyro_pipeline.learning import perceptrons
-from gyro_pipeline.learning.jobs import NetworkEstimator
 from gyro_pipeline.parameters import Evaluation
-from gyro_pipeline.physics import allan as allan_module
-from gyro_pipeline.physics import bias as bias_module
-from gyro_pipeline.physics import ceiling, history, recording_model, reml
-from gyro_pipeline.pipelines.evaluation import bench as bench_module
-from gyro_pipeline.pipelines.evaluation import device as device_module
-from gyro_pipeline.pipelines.evaluation import folds
-from gyro_pipeline.pipelines.evaluation.bench import (
-    Bench,
-    known_places,
-    known_recordings,
-    off_the_curve,
-    test_recordings,
-)
-from gyro_pipeline.pipelines.evaluation.device import describe_device, describe_unseen
-from gyro_pipeline.pipelines.evaluation.folds import Fitted, FittedToOthers
-from gyro_pipeline.pipelines.evaluation.waiting import waiting
-from gyro_pipeline.protocol import scores, truths, windows
-from gyro_pipeline.studies import MEAN, NETWORKS
+from gyro_pipeline.pipelines.evaluation.bench import Bench
+from gyro_pipeline.pipelines.evaluation.device import TestDevice, describe_devices
+from gyro_pipeline.protocol.truths import CURVE_STEP_S
+from gyro_pipeline.studies import MEAN, RunSpec, planned
 from gyro_pipeline.tracking import (
     CURVE,
     ERRORS,
     EVALUATED_WITH,
-    WEIGHTS,
+    SCORES,
     EvaluatedRun,
     StoredRun,
-    metric_name,
 )
 
 logger = logging.getLogger(__name__)
 
-_CODE = (
-    *(allan_module, bias_module, ceiling, recording_model, reml, history),
-    *(averages, base, linear, networks, perceptrons, shrinkage, training),
-    *(bench_module, device_module, folds, scores, truths, windows),
-)
+METRICS = {
+    "rmse_mdps": ("test_rmse_dps", "value", ALL),
+    "mean_rmse_mdps": ("mean_rmse_dps", "value", ALL),
+    "ceiling_rmse_mdps": ("ceiling_rmse_dps", "value", ALL),
+    "accuracy_gain_pct": ("accuracy_gain_pct", "value", ALL),
+    "accuracy_gain_pct_lo": ("accuracy_gain_pct", "lo", ALL),
+    "accuracy_gain_pct_hi": ("accuracy_gain_pct", "hi", ALL),
+    "time_saving_pct": ("time_saving_pct", "value", ALL),
+    "equivalent_time_s": ("equivalent_time_s", "value", ALL),
+    "coverage_95_pct": ("coverage_95_pct", "value", ALL),
+    "accuracy_gain_pct_first": ("accuracy_gain_pct", "value", FIRST),
+    "time_saving_pct_first": ("time_saving_pct", "value", FIRST),
+}
+"""Metrics of a run: the score, its column and the windows; last epoch, the paper's truth."""
 
 
 def evaluate(
-    cells: pd.DataFrame,
+    plan: pd.DataFrame,
     runs: list[StoredRun],
     recordings: xr.Dataset,
+    windows: pd.DataFrame,
     bias: pd.DataFrame,
     allan: xr.Dataset,
-    roles: pd.DataFrame,
     evaluation: Evaluation,
-    virtual: xr.Dataset | None = None,
 ) -> Iterator[EvaluatedRun]:
     """Judge every run of the plan that was not judged this way before.
 
     Args:
-        cells: The plan.
-        runs: The study's trained runs on this sensor.
+        plan: The runs that the study needs.
+        runs: The study's runs on this sensor.
         recordings: Real recordings.
-        bias: Their ground truth.
-        allan: Their Allan variances.
-        roles: Which recordings test, in each fold.
+        windows: The windows table.
+        bias: Ground truth.
+        allan: Allan variances.
         evaluation: Resamples and seed of the intervals.
-        virtual: Virtual recordings, where the study uses some.
 
     Yields:
-        Metrics and per-window errors, to be added to each run.
+        Metrics, scores and the errors of each window, to be added to each run.
     """
-    judged_with = fingerprint([code_hash(_CODE), evaluation.model_dump()])
-    fitted: Fitted | FittedToOthers
-    if "imu" in roles:  # every IMU in turn is an unseen device
-        imus = tuple(sorted(roles.fold.unique().tolist()))
-        fitted = FittedToOthers(recordings, roles)
-        device = describe_unseen(recordings, allan, known_places(roles), imus)
-    else:
-        imus, seed = (TEST_IMU,), evaluation.bootstrap_seed
-        fitted = Fitted(recordings, roles, virtual)
-        device = describe_device(recordings, bias, allan, known_recordings(roles), seed)
-    benches: dict[tuple[float, int], Bench] = {}
-    for cell, run in waiting(cells, runs, judged_with, recordings.attrs["sensor"]):
-        key = cell["window_s"], cell["fold"]
-        if key not in benches:
-            numbers = test_recordings(roles, cell["fold"])
-            benches[key] = Bench(recordings, device, numbers, key[0], evaluation, imus)
-        yield _judge(run, benches[key], fitted, judged_with)
+    judged_with = fingerprint([code_hash(__name__), evaluation.model_dump()])
+    specs, stored = planned(plan), {run.fingerprint: run for run in reversed(runs)}
+    benches = Benches(recordings, windows, bias, allan, evaluation)
+    judged = 0
+    for key, spec in specs.items():
+        run = stored[key]
+        if run.finished and run.tags.get(EVALUATED_WITH) == judged_with:
+            continue
+        yield _judge(run, spec, benches.of(spec), judged_with)
+        judged += 1
+    label = recordings.attrs["sensor"]
+    logger.info("%s: %d runs evaluated, %d skipped", label, judged, len(specs) - judged)
 
 
-def _judge(
-    run: StoredRun, bench: Bench, fitted: Fitted | FittedToOthers, judged_with: str
-) -> EvaluatedRun:
-    artifacts = {}
-    name = run.params["estimator"]
-    real_imus, virtual_imus = (
-        int(run.params[gyros]) // len(AXES) for gyros in ("real_gyros", "virtual_gyros")
-    )
-    if name not in NETWORKS:
-        judged: dict[str, Estimator | Mapping[int, Estimator]]
-        judged = {LAST: fitted.estimator(name, real_imus, virtual_imus)}
-    else:
-        stored = run.load(WEIGHTS)
-        judged = {which: NetworkEstimator(stored, which) for which in (LAST, BEST) if stored[which]}
-    if name == MEAN:
+class Benches:
+    """The benches of a study on a sensor, each made once.
+
+    Args:
+        recordings, windows, bias, allan, evaluation: As :func:`evaluate` takes them.
+    """
+
+    def __init__(
+        self,
+        recordings: xr.Dataset,
+        windows: pd.DataFrame,
+        bias: pd.DataFrame,
+        allan: xr.Dataset,
+        evaluation: Evaluation,
+    ) -> None:
+        self._recordings, self._bias, self._allan = recordings, bias, allan
+        self._evaluation = evaluation
+        key = ["protocol", "window_s", "window_stride_s"]
+        self._tables = dict(iter(windows.groupby(key, observed=True)))
+        self._devices: dict[str, TestDevice] = {}
+        self._made: dict[Any, Bench] = {}
+
+    def of(self, spec: RunSpec) -> Bench:
+        """The bench on which a run is judged."""
+        key = spec.protocol, spec.window_s, spec.window_stride_s
+        if key not in self._made:
+            table = self._tables[key]
+            columns = ["fold", "imu", "recording", "start"]
+            tests = table[table.role == TEST][columns].astype({"fold": str})
+            self._made = {
+                key: Bench(
+                    self._recordings, self._device(table), tests, spec.window_s, self._evaluation
+                )
+            }
+        return self._made[key]
+
+    def _device(self, table: pd.DataFrame) -> TestDevice:
+        """What is known of the devices that test; the same for most windows."""
+        places = table[["fold", "role", "origin", "imu", "recording"]].drop_duplicates()
+        key = fingerprint(places.astype(str).to_numpy().tolist())
+        if key not in self._devices:
+            self._devices[key] = describe_devices(
+                self._recordings, self._bias, self._allan, table, self._evaluation.bootstrap_seed
+            )
+        return self._devices[key]
+
+
+def _judge(run: StoredRun, spec: RunSpec, bench: Bench, judged_with: str) -> EvaluatedRun:
+    fits = {fold: run.load_fit(fold) for fold in bench.tests.fold.unique()}
+    first = next(iter(fits.values()))
+    imus = spec.real_imus if spec.method == 1 else 1
+    errors, scores = [], []
+    for weights in first.variants():
+        variants: Mapping[str, Estimator] = {f: fit.variants()[weights] for f, fit in fits.items()}
+        table = bench.errors(variants, imus)
+        errors.append(table.assign(weights=weights))
+        scores.append(bench.scores(table, weights))
+    table = pd.concat(scores, ignore_index=True)
+    metrics = _metrics(table) | _losses(first)
+    artifacts = {ERRORS: pd.concat(errors, ignore_index=True), SCORES: table}
+    if spec.estimator == MEAN:
         artifacts[CURVE] = bench.curve
-    side_by_side = real_imus if run.params["method"] == "1" else 1
-    metrics: dict[str, float] = {}
-    tables = []
-    for which, estimator in judged.items():
-        errors = bench.errors(estimator, side_by_side)
-        metrics |= bench.metrics(errors, which)
-        tables.append(errors.assign(weights=which))
-    artifacts[ERRORS] = pd.concat(tables, ignore_index=True)
     tags = {EVALUATED_WITH: judged_with, "ceiling": bench.ceiling_basis}
-    tags |= off_the_curve(metrics)
-    marked = judged[LAST]
-    if isinstance(marked, Mapping):
-        marked = next(iter(marked.values()))
-    tags["recommended"] = str(marked.recommended)
-    if marked.uses_prior:
+    tags |= {"recommended": str(first.recommended)} | _off_the_curve(metrics)
+    if first.uses_prior:
         tags["uses_prior"] = ORIENTATION_NOTE
     logger.info(
-        "%s %s: RMSE %.7f deg/s in the first window, %.6f in all (last epoch)",
-        *(run.study, _title(run)),
-        *(metrics[metric_name("test_rmse_dps", windows)] for windows in (FIRST, ALL)),
+        "%s %s: RMSE %.4f mdps in all windows, %.4f in the first",
+        *(run.study, run.tags["mlflow.runName"], metrics["rmse_mdps"]),
+        _value(table, "test_rmse_dps", FIRST) / MDPS,
     )
     return EvaluatedRun(run.run_id, metrics, tags, artifacts)
 
 
-def _title(run: StoredRun) -> str:
-    return run.tags["mlflow.runName"]
+def _metrics(scores: pd.DataFrame) -> dict[str, float]:
+    """The metrics of a run, of which each is there if it is finite."""
+    values = {
+        name: _value(scores, score, windows, column) / (MDPS if name.endswith("_mdps") else 1)
+        for name, (score, column, windows) in METRICS.items()
+    }
+    return {name: value for name, value in values.items() if np.isfinite(value)}
+
+
+def _value(scores: pd.DataFrame, score: str, windows: str, column: str = "value") -> float:
+    """A score at the last epoch against the mean of the recording; NaN where it is not there."""
+    chosen = scores[
+        (scores.score == score)
+        & (scores.windows == windows)
+        & (scores.truth == PAPER)
+        & (scores.weights == LAST)
+    ]
+    return float(chosen[column].iloc[0]) if chosen[column].notna().any() else np.nan
+
+
+def _losses(estimator: Estimator) -> dict[str, float]:
+    """Losses of a network at the last epoch."""
+    if estimator.history is None:
+        return {}
+    last = estimator.history.iloc[-1]
+    return {name: float(last[name]) for name in ("train_loss", "val_loss") if name in last}
+
+
+def _off_the_curve(metrics: Mapping[str, float]) -> dict[str, str]:
+    """In words, why an equivalent time is none."""
+    if "rmse_mdps" not in metrics or "equivalent_time_s" in metrics:
+        return {}
+    worse = metrics["rmse_mdps"] > metrics["mean_rmse_mdps"]
+    return {
+        "equivalent_time_s": f"worse than the running mean of {CURVE_STEP_S:g} s, where the curve "
+        "starts"
+        if worse
+        else "the running mean never gets there"
+    }

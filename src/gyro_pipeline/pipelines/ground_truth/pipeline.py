@@ -21,6 +21,7 @@ def create_report(sensor: str) -> Pipeline:
                 None,
                 name=f"report_biases_{sensor}",
                 namespace="ground_truth",
+                tags=[sensor],
             )
         ]
     )
@@ -37,6 +38,7 @@ def create_pipeline(sensor: str) -> Pipeline:
                 f"{stage}.allan",
                 name=f"allan_{sensor}",
                 namespace="ground_truth",
+                tags=[sensor],
             ),
             Node(
                 measure_bias,
@@ -44,6 +46,7 @@ def create_pipeline(sensor: str) -> Pipeline:
                 f"{stage}.bias",
                 name=f"bias_{sensor}",
                 namespace="ground_truth",
+                tags=[sensor],
             ),
             Node(
                 measure_noise,
@@ -51,6 +54,7 @@ def create_pipeline(sensor: str) -> Pipeline:
                 f"{stage}.noise",
                 name=f"noise_{sensor}",
                 namespace="ground_truth",
+                tags=[sensor],
             ),
         ]
     )

@@ -11,14 +11,15 @@ import pandas as pd
 import xarray as xr
 
 from gyro_pipeline import quality as checks
-from gyro_pipeline.conventions import AXES, TEST_IMU, InputError
+from gyro_pipeline.conventions import AXES, InputError
 from gyro_pipeline.executors import run_jobs
 from gyro_pipeline.fingerprints import code_hash, fingerprint, package_hash
 from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding, Listing, Logs, Recording
-from gyro_pipeline.parameters import Execution, Quality
+from gyro_pipeline.parameters import Execution, Quality, Splits
 from gyro_pipeline.protocol import inspection
 from gyro_pipeline.protocol.inspection import Inspection, judge
 from gyro_pipeline.protocol.rejections import NAMED, reasons
+from gyro_pipeline.protocol.splits import split_recordings
 
 logger = logging.getLogger(__name__)
 
@@ -106,7 +107,11 @@ def quality_table(files: Logs, inspected: Sequence[Recording]) -> pd.DataFrame:
 
 
 def label_recordings(
-    files: Logs, inspected: Sequence[Recording], table: pd.DataFrame, quality: Quality
+    files: Logs,
+    inspected: Sequence[Recording],
+    table: pd.DataFrame,
+    quality: Quality,
+    splits: Splits,
 ) -> xr.Dataset:
     """Labels of the recordings that are used, once enough of them remain.
 
@@ -115,6 +120,7 @@ def label_recordings(
         inspected: All recordings, by IMU and number.
         table: From :func:`quality_table`.
         quality: How many of those listed must remain.
+        splits: How recordings are held out.
 
     Returns:
         What :mod:`gyro_pipeline.conventions` describes, but what was measured. The rate is the
@@ -129,9 +135,11 @@ def label_recordings(
     lengths = (used["stop"] - used["start"]).unstack(fill_value=0)
     samples = lengths.reindex(index=imus, columns=numbers, fill_value=0).to_numpy(np.int64)
     coordinates: dict[str, Any] = {"imu": imus, "recording": numbers, "axis": list(AXES)}
-    splits = {entry.recording: entry.split for entry in files.entries}
-    if any(splits.values()):
-        coordinates["given_split"] = ("recording", [splits[number] for number in numbers])
+    given = {entry.recording: entry.split for entry in files.entries}
+    of_tested = used.loc[[used.index[0][0]]].index.get_level_values("recording").tolist()
+    split = split_recordings(numbers, of_tested, splits, given if any(given.values()) else None)
+    if split is not None:
+        coordinates["split"] = ("recording", [split[number] for number in numbers])
     measured = used.rate_hz.dropna()
     attributes = {
         "sensor": files.sensor,
@@ -141,7 +149,7 @@ def label_recordings(
         "rate_hz": _rounded(measured.median()) if len(measured) else files.rate_hz,
     }
     contents = [[*one.place, one.content] for one in inspected if one.place in used.index]
-    attributes["data_hash"] = fingerprint([attributes, sorted(splits.items()), contents])
+    attributes["data_hash"] = fingerprint([attributes, contents])
     labels = xr.Dataset({"samples": (("imu", "recording"), samples)}, coordinates, attributes)
     if files.drawn is not None:
         labels = labels.assign(files.drawn.sel(imu=imus, recording=numbers).data_vars)
@@ -165,8 +173,9 @@ def require_enough(table: pd.DataFrame, quality: Quality) -> None:
         ", ".join(f"{counts[outcome]} {outcome}" for outcome in (KEPT, REPAIRED, REJECTED)),
     )
     rejected = table.outcome == REJECTED
-    tested = table[table.imu == TEST_IMU]
-    for label, listed in ((sensor, table), (f"{sensor}, the tested IMU {TEST_IMU}", tested)):
+    first = table.imu.min()
+    tested = table[table.imu == first]
+    for label, listed in ((sensor, table), (f"{sensor}, the tested IMU {first}", tested)):
         bad = listed[rejected[listed.index]]
         remain = len(listed) - len(bad)
         if 100 * remain < quality.needed_pct * len(listed):

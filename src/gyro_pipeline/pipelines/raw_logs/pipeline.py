@@ -16,6 +16,7 @@ def create_pipeline(sensor: str) -> Pipeline:
                 f"{stage}.inspected",
                 name=f"inspect_{sensor}",
                 namespace="raw_logs",
+                tags=[sensor],
             ),
             Node(
                 quality_table,
@@ -23,13 +24,21 @@ def create_pipeline(sensor: str) -> Pipeline:
                 f"{stage}.quality",
                 name=f"quality_table_{sensor}",
                 namespace="raw_logs",
+                tags=[sensor],
             ),
             Node(
                 label_recordings,
-                [f"{stage}.files", f"{stage}.inspected", f"{stage}.quality", "params:quality"],
+                [
+                    f"{stage}.files",
+                    f"{stage}.inspected",
+                    f"{stage}.quality",
+                    "params:quality",
+                    "params:splits",
+                ],
                 f"{stage}.recordings",
                 name=f"label_{sensor}",
                 namespace="raw_logs",
+                tags=[sensor],
             ),
         ]
     )

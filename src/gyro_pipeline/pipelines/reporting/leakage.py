@@ -10,29 +10,42 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from gyro_pipeline.conventions import (
+    ALL,
+    BEST,
     BEST_EPOCH_ON_TEST,
-    NO_LEAK,
+    K_FOLD,
+    LAST,
+    PAPER,
     TEST_IN_TRAINING,
     WINDOW_SPLIT,
 )
-from gyro_pipeline.parameters import Evaluation, Leakage, Published, PublishedResult, Sensor
+from gyro_pipeline.parameters import (
+    Evaluation,
+    Published,
+    PublishedResult,
+    Sensor,
+    Study,
+    Training,
+)
+from gyro_pipeline.pipelines.reporting.results import scores_of
 from gyro_pipeline.pipelines.reporting.style import CEILING, COLOURS, LOOK, MARKERS, share_legend
 from gyro_pipeline.pipelines.reporting.tables import percent, source_of
-from gyro_pipeline.protocol.leaks import strided_errors, strided_scores
 from gyro_pipeline.protocol.scores import (
-    beats_oracle,
+    curve_errors,
     holm,
     paired_difference,
     resampled_weights,
+    score,
+    squared_errors,
 )
-from gyro_pipeline.studies import CNN, CNN_SHUFFLED
-from gyro_pipeline.tracking import CURVE, ERRORS, FINGERPRINT, StoredRun
+from gyro_pipeline.studies import CNN, CNN_SHUFFLED, CONSTANT, MEAN, RunSpec, planned
+from gyro_pipeline.tracking import CURVE, ERRORS, SCORES, StoredRun
 
 logger = logging.getLogger(__name__)
 
 WAYS = {
-    (NO_LEAK, CNN): "Honest split",
-    (NO_LEAK, CNN_SHUFFLED): "Honest, labels shuffled",
+    (K_FOLD, CNN): "Honest split",
+    (K_FOLD, CNN_SHUFFLED): "Honest, labels shuffled",
     (WINDOW_SPLIT, CNN): "Windows split at random",
     (TEST_IN_TRAINING, CNN): "Test windows in training",
     (BEST_EPOCH_ON_TEST, CNN): "Honest split, epoch chosen on test",
@@ -59,7 +72,7 @@ def pool_leakage(evaluation: Evaluation, **stored: Any) -> pd.DataFrame:
 
     Args:
         evaluation: Resamples and seed of the intervals.
-        **stored: For each sensor its plan, ``<sensor>_cells``, and its runs, ``<sensor>_runs``.
+        **stored: For each sensor its plan, ``<sensor>_plan``, and its runs, ``<sensor>_runs``.
 
     Returns:
         What names a row; its counts; its figures of merit over all test windows of all folds and
@@ -67,49 +80,103 @@ def pool_leakage(evaluation: Evaluation, **stored: Any) -> pd.DataFrame:
         square exceeds the constant's, with the upper end of its 99 % interval; the p value against
         the oracle, corrected over all rows, on simulated white noise; the ceiling; and run ids.
     """
-    keys = ["sensor", "source", "window_s", "window_stride_s", "leak", "estimator"]
     rows = []
-    for sensor in [name.removesuffix("_cells") for name in stored if name.endswith("_cells")]:
-        cells, tracked = stored[f"{sensor}_cells"], stored[f"{sensor}_runs"]
-        runs = {run.fingerprint: run for run in reversed(tracked)}
-        for key, group in cells.groupby(keys, sort=False):
-            row = _pooled([runs[fp] for fp in group[FINGERPRINT]], evaluation)
-            rows.append(dict(zip(keys, key, strict=True)) | row)
+    for sensor in [name.removesuffix("_plan") for name in stored if name.endswith("_plan")]:
+        runs = {run.fingerprint: run for run in reversed(stored[f"{sensor}_runs"])}
+        made = [(spec, runs[key]) for key, spec in planned(stored[f"{sensor}_plan"]).items()]
+        for stride_s in dict.fromkeys(spec.window_stride_s for spec, _ in made):
+            of_stride = [(spec, run) for spec, run in made if spec.window_stride_s == stride_s]
+            rows += _rows_of_stride(of_stride, evaluation)
     results = pd.DataFrame(rows)
     checked = results.beats_oracle_p.notna()
     results.loc[checked, "beats_oracle_p"] = holm(results.beats_oracle_p[checked].tolist())
     return results
 
 
-def _pooled(runs: Sequence[StoredRun], evaluation: Evaluation) -> dict[str, Any]:
-    """All folds and seeds of one way of training at one stride."""
-    errors = pd.concat([run.load(ERRORS) for run in runs], ignore_index=True)
-    curve = pd.concat([run.load(CURVE) for run in runs]).drop_duplicates(["recording", "time_s"])
+def _rows_of_stride(
+    made: Sequence[tuple[RunSpec, StoredRun]], evaluation: Evaluation
+) -> list[dict[str, Any]]:
+    """A row for each way of training: all its seeds pooled."""
+    by_name = {spec.estimator: run for spec, run in made}
+    mean, constant = by_name[MEAN], _errors(by_name[CONSTANT])
+    ways = dict.fromkeys((spec.protocol, spec.estimator) for spec, _ in made)
+    rows = []
+    for protocol, estimator in (way for way in ways if way in WAYS):
+        own = [
+            (spec, run)
+            for spec, run in made
+            if (spec.protocol, spec.estimator) == (protocol, estimator)
+        ]
+        spec, runs = own[0][0], [run for _, run in own]
+        rows.append(
+            {
+                "sensor": spec.sensor,
+                "source": spec.source,
+                "window_s": spec.window_s,
+                "window_stride_s": spec.window_stride_s,
+                "leak": protocol,
+                "estimator": estimator,
+            }
+            | _pooled(
+                runs, BEST if protocol == BEST_EPOCH_ON_TEST else LAST, mean, constant, evaluation
+            )
+        )
+    return rows
+
+
+def _errors(run: StoredRun, weights: str = LAST) -> pd.DataFrame:
+    """Errors in the test windows against the mean of the recording, an order for all runs."""
+    errors = run.load(ERRORS)
+    errors = errors[(errors.weights == weights) & (errors.truth == PAPER)]
+    return errors.sort_values(["recording", "start", "axis"], ignore_index=True)
+
+
+def _pooled(
+    runs: Sequence[StoredRun],
+    weights_of: str,
+    mean: StoredRun,
+    constant: pd.DataFrame,
+    evaluation: Evaluation,
+) -> dict[str, Any]:
+    """All seeds of one way of training at one stride."""
+    errors = pd.concat([_errors(run, weights_of) for run in runs], ignore_index=True)
     recordings, first = errors.recording.nunique(), runs[0]
     weights = resampled_weights(recordings, evaluation.resamples, evaluation.bootstrap_seed)
-    seeds = {run.params["seed"] for run in runs}
     row: dict[str, Any] = {
         "simulated": first.tags["simulated"] == "1",
         "windows": len(errors.groupby(["recording", "start"])),
         "recordings": recordings,
-        "seeds": len(seeds),
-        "epochs": max(int(run.params["epochs"]) for run in runs),
+        "seeds": len(runs),
     }
-    for base, estimate in strided_scores(
-        errors, curve, float(first.params["window_s"]), weights
-    ).items():
-        row |= {base: estimate.value, f"{base}_lo": estimate.lo, f"{base}_hi": estimate.hi}
-    ours, mean, constant = (strided_errors(errors, of) for of in ("", "mean", "constant"))
+    ours, of_mean, of_constant = (
+        squared_errors(table, PAPER, ALL) for table in (errors, _errors(mean), constant)
+    )
+    curve = curve_errors(mean.load(CURVE), PAPER, ALL).of(weights)
+    window_s = float(first.params["window_s"])
+    for name, estimate in score(ours, of_mean, curve, window_s, weights).items():
+        row |= {name: estimate.value, f"{name}_lo": estimate.lo, f"{name}_hi": estimate.hi}
     plain = weights[:1]
-    ratio = np.sqrt(constant.mean(plain) / mean.mean(plain))[0]
+    ratio = np.sqrt(of_constant.mean(plain) / of_mean.mean(plain))[0]
     row["constant_accuracy_gain_pct"] = 100 * (1 - ratio)
-    difference = paired_difference(ours, constant, weights, DETECTOR_PCT)
+    difference = paired_difference(ours, of_constant, weights, DETECTOR_PCT)
     row |= {"over_constant_dps2": difference.value, "over_constant_dps2_hi": difference.hi}
-    known = "oracle_error_dps" in errors
-    row["beats_oracle_p"] = beats_oracle(ours, strided_errors(errors, "oracle")) if known else None
-    for base in _CEILINGS:
-        row |= {base + end: first.metrics.get(base + end) for end in ("", "_lo", "_hi")}
+    row["beats_oracle_p"] = _oracle_p(first, weights_of)
+    scores = scores_of(first)
+    for name in _CEILINGS:
+        for end, bound in (("value", ""), ("lo", "_lo"), ("hi", "_hi")):
+            row[name + bound] = scores.get((name, ALL, end))
     return row | {"run_ids": " ".join(run.run_id for run in runs)}
+
+
+def _oracle_p(run: StoredRun, weights: str) -> float | None:
+    scores = run.load(SCORES)
+    chosen = scores[
+        (scores.score == "beats_oracle_p")
+        & (scores.windows == ALL)
+        & (scores.truth == PAPER)
+        & (scores.weights == weights)
+    ]
+    return float(chosen.value.iloc[0]) if len(chosen) else None
 
 
 def results_table(results: pd.DataFrame, published: Published) -> pd.DataFrame:
@@ -153,14 +220,19 @@ def _table_row(ways: pd.DataFrame, published: Published) -> dict[str, Any]:
 
 
 def accuracy_against_stride(
-    results: pd.DataFrame, published: Published, leakage: Leakage, sensors: dict[str, Any]
+    results: pd.DataFrame,
+    published: Published,
+    study: Study,
+    training: Training,
+    sensors: dict[str, Any],
 ) -> Figure:
     """A against the window stride, for the honest split and for each leak.
 
     Args:
         results: From :func:`pool_leakage`.
         published: The paper's gain.
-        leakage: Its network's hop.
+        study: Its network's hop.
+        training: What the study does not change.
         sensors: Their rates, by which the hop is a time, where they are known.
     """
     names = list(dict.fromkeys(results.sensor))
@@ -169,7 +241,7 @@ def accuracy_against_stride(
         axes = figure.subplots(len(names), 1, squeeze=False)[:, 0]
         for ax, sensor in zip(axes, names, strict=True):
             rate_hz = Sensor(**sensors[sensor]).rate_hz
-            hop_s = np.nan if rate_hz is None else leakage.network.hop / rate_hz
+            hop_s = np.nan if rate_hz is None else study.training_of(training).hop / rate_hz
             _draw(ax, results[results.sensor == sensor], published, hop_s)
         share_legend(figure, axes, columns=3)
     return figure

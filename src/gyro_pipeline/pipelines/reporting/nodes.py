@@ -1,7 +1,7 @@
 """Nodes of the reporting stage: tracked runs to results, and what a report lacks."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import wraps
 from typing import Any
 
@@ -11,13 +11,14 @@ from gyro_pipeline.conventions import InputError, Missing
 from gyro_pipeline.parameters import Evaluation, Only, Splits, Study, Training, VirtualGyros
 from gyro_pipeline.pipelines.reporting.results import (
     ROW,
-    find_runs,
+    Finder,
+    Settings,
     pool,
     pooled_curve,
     rows_of,
     why_unused,
 )
-from gyro_pipeline.studies import Cell, study_cells
+from gyro_pipeline.studies import LEFT_OUT, RunSpec, run_spec, study_rows
 from gyro_pipeline.tracking import StoredRun
 
 logger = logging.getLogger(__name__)
@@ -25,7 +26,7 @@ logger = logging.getLogger(__name__)
 Reasons = tuple[str, ...]
 
 _CURVES = ["sensor", "windows", "time_s", "rmse_dps"]
-_UNUSED = ["run_id", *Cell.names(), "why"]
+_UNUSED = ["run_id", *RunSpec.names(), "why"]
 
 
 def pool_results(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
@@ -37,7 +38,7 @@ def pool_results(  # noqa: PLR0913, PLR0917 - a node's arguments are its dataset
     splits: Splits,
     virtual_gyros: VirtualGyros,
     evaluation: Evaluation,
-    *tracked: list[StoredRun],
+    **stored: Any,
 ) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
     """Pool the study's tracked runs into one row per result.
 
@@ -51,7 +52,8 @@ def pool_results(  # noqa: PLR0913, PLR0917 - a node's arguments are its dataset
         splits: Likewise.
         virtual_gyros: Likewise.
         evaluation: Resamples and seed of the intervals.
-        *tracked: Runs by sensor.
+        **stored: For each sensor its runs, ``<sensor>_runs``, and the last plan of them,
+            ``<sensor>_plan``, which says what cannot be made.
 
     Returns:
         Results, a row per estimator, sensor, window and training set, ``missing`` holding the
@@ -59,13 +61,19 @@ def pool_results(  # noqa: PLR0913, PLR0917 - a node's arguments are its dataset
         ``sensor, windows, time_s, rmse_dps``; and the finished runs that no result uses, with
         columns ``run_id``, the fields of a cell, and ``why``.
     """
-    runs = [run for sensor_runs in tracked for run in sensor_runs]
-    settings = (training, splits, virtual_gyros)
-    cells = _cells(study, source, windows_s, seeds)
-    results, means = pool(rows_of(cells), runs, settings, evaluation)
+    runs = [run for name, own in stored.items() if name.endswith("_runs") for run in own]
+    settings = Settings(study, training, splits, virtual_gyros, evaluation)
+    sensors = [name.removesuffix("_runs") for name in stored if name.endswith("_runs")]
+    left_out = _left_out(part for name, part in stored.items() if name.endswith("_plan"))
+    specs = [
+        spec
+        for spec in _specs(study, sensors, source, windows_s, seeds)
+        if run_spec(spec, study.unseen_devices) not in left_out
+    ]
+    results, means = pool(rows_of(specs), runs, settings)
     used = {run_id for row in results for run_id in (row["run_ids"] or "").split()}
     unused = [
-        {"run_id": run.run_id, "why": why_unused(run, cells, settings)} | dict(run.params)
+        {"run_id": run.run_id, "why": why_unused(run, specs, settings)} | dict(run.params)
         for run in runs
         if run.finished and run.run_id not in used
     ]
@@ -110,14 +118,15 @@ def pool_measured_elsewhere(  # noqa: PLR0913, PLR0917 - a node's arguments are 
         Rows like those of :func:`pool_results`, none of them missing; often no row at all.
     """
     runs = [run for run in all_runs if run.tags["simulated"] == "0"]
-    settings = (training, splits, virtual_gyros)
-    results = []
+    settings = Settings(study, training, splits, virtual_gyros, evaluation)
+    results, run_of = [], Finder(runs, settings)
     for other in sorted({run.params["source"] for run in runs} - {source}):
+        sensors = study.sensors_among({run.params["sensor"] for run in runs})
         rows = []
-        for row in rows_of(_cells(study, other, windows_s, seeds)):
-            trained = [cell for cell in row if find_runs([cell], runs, settings)]
-            rows += [trained] if find_runs(trained, runs, settings) else []
-        results += [row for row in pool(rows, runs, settings, evaluation)[0] if row["run_ids"]]
+        for row in rows_of(_specs(study, sensors, other, windows_s, seeds)):
+            made = [spec for spec in row if run_of([spec])]
+            rows += [made] if made and run_of(made) else []
+        results += [row for row in pool(rows, runs, settings)[0] if row["run_ids"]]
     columns = None if results else [*ROW, "missing", "run_ids"]
     return pd.DataFrame(results, columns=columns).assign(protocol=study.protocol)
 
@@ -172,9 +181,21 @@ def refuse_gaps(only: Only, *reasons: Reasons) -> None:
     )
 
 
-def _cells(study: Study, source: str, windows_s: list[float], seeds: list[int]) -> list[Cell]:
+def _specs(
+    study: Study, sensors: Iterable[str], source: str, windows_s: list[float], seeds: list[int]
+) -> list[RunSpec]:
     return [
-        cell
-        for sensor in study.sensors
-        for cell in study_cells(study, sensor, source, windows_s, seeds, Only())
+        spec
+        for sensor in sensors
+        for spec in study_rows(study, sensor, source, windows_s, seeds, Only())
     ]
+
+
+def _left_out(plans: Iterable[pd.DataFrame | Missing]) -> set[RunSpec]:
+    """Runs that cannot be made, by the last plans."""
+    return {
+        RunSpec(**{name: row[name] for name in RunSpec.names()})
+        for plan in plans
+        if isinstance(plan, pd.DataFrame)
+        for row in plan[plan[LEFT_OUT].fillna("") != ""].to_dict("records")
+    }

@@ -103,9 +103,10 @@ def create_pipeline(
 def create_leakage_pipeline(sensors: Sequence[str]) -> Pipeline:
     """Table and figure of the leak study, which no other report shows."""
     stage, pooled = f"{LEAKAGE}.reporting", f"{LEAKAGE}.reporting.results"
-    stored = {f"{sensor}_cells": f"{LEAKAGE}.{sensor}.training.cells" for sensor in sensors}
+    stored = {f"{sensor}_plan": f"{LEAKAGE}.{sensor}.training.plan" for sensor in sensors}
     stored |= {f"{sensor}_runs": f"{LEAKAGE}.{sensor}.evaluation.runs" for sensor in sensors}
-    given = {name: f"params:{name}" for name in ("published", "leakage", "sensors")}
+    given = {name: f"params:{name}" for name in ("published", "training", "sensors")}
+    given |= {"study": f"params:studies.{LEAKAGE}"}
     makers: dict[_Function, tuple[dict[str, str], str]] = {
         leakage.pool_leakage: (stored | {"evaluation": "params:evaluation"}, pooled),
         leakage.results_table: (
@@ -128,21 +129,22 @@ def create_leakage_pipeline(sensors: Sequence[str]) -> Pipeline:
 def _study_nodes(study: str, sensors: Sequence[str]) -> list[Node]:
     stage = f"{study}.reporting"
     parts = "source windows_s seeds training splits virtual_gyros evaluation".split()
-    settings = [f"params:studies.{study}", *(f"params:{name}" for name in parts)]
-    runs = [f"{study}.{sensor}.evaluation.runs" for sensor in sensors]
+    settings = {"study": f"params:studies.{study}"} | {name: f"params:{name}" for name in parts}
+    stored = {f"{sensor}_runs": f"{study}.{sensor}.evaluation.runs" for sensor in sensors}
+    stored |= {f"{sensor}_plan": f"{study}.{sensor}.training.plan" for sensor in sensors}
     pooled = [f"{stage}.{name}" for name in ("results", "curves", "unused")]
     elsewhere = f"{stage}.measured_elsewhere"
     nodes = [
         Node(
             pool_results,
-            [*settings, *runs],
+            settings | stored,
             pooled,
             name=f"pool_{study}",
             namespace="reporting",
         ),
         Node(
             pool_measured_elsewhere,
-            [*settings, f"{stage}.all_runs"],
+            settings | {"all_runs": f"{stage}.all_runs"},
             elsewhere,
             name=f"pool_measured_elsewhere_{study}",
             namespace="reporting",
@@ -182,14 +184,13 @@ def _recording_nodes(sensors: Sequence[str], virtual: Sequence[str]) -> list[Nod
     recordings = {f"{sensor}_recordings": f"{sensor}.raw_logs.recordings" for sensor in sensors}
     noise = {f"{sensor}_noise": f"{sensor}.ground_truth.noise" for sensor in sensors}
     allan = {f"{sensor}_allan": f"{sensor}.ground_truth.allan" for sensor in sensors}
-    roles = {f"{sensor}_roles": f"{sensor}.windowed_splits.roles" for sensor in sensors}
     drawn = {f"{sensor}_virtual": f"{sensor}.virtual_gyros.recordings" for sensor in virtual}
     published = {"published": "params:published"}
     signal = {"recordings": f"{_SHOWN}.raw_logs.recordings", "bias": f"{_SHOWN}.ground_truth.bias"}
     settled = signal | {"ground_truth": "params:ground_truth"}
     made: list[tuple[str, _Function, dict[str, str]]] = [
         ("tables", tables.sensor_specifications, published | recordings | noise),
-        ("tables", tables.dataset_hours, published | recordings | roles | drawn),
+        ("tables", tables.dataset_hours, published | recordings | drawn),
         ("figures", signals.running_average, settled),
         ("figures", signals.calibrated_signal, signal),
         ("figures", signals.mg_convergence, settled),

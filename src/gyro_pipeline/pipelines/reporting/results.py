@@ -1,4 +1,4 @@
-"""From tracked runs to one row per result: folds and seeds pooled, with intervals."""
+"""From tracked runs to one row per result: seeds pooled, with intervals."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gyro_pipeline.conventions import ALL, BEST, FIRST, HOLD_OUT, LAST, PAPER
-from gyro_pipeline.estimators import DEFAULT
-from gyro_pipeline.parameters import Evaluation
+from gyro_pipeline.conventions import ALL, BEST, FIRST, LAST, PAPER
+from gyro_pipeline.estimators import DEFAULT, estimator_class
+from gyro_pipeline.parameters import Evaluation, Splits, Study, Training, VirtualGyros
 from gyro_pipeline.protocol.scores import (
     Estimate,
     ResampledCurve,
@@ -24,8 +24,8 @@ from gyro_pipeline.protocol.scores import (
     score,
     squared_errors,
 )
-from gyro_pipeline.studies import CNN, MEAN, RESIDUAL_NETWORK, Cell, run_params
-from gyro_pipeline.tracking import CURVE, ERRORS, StoredRun, metric_name
+from gyro_pipeline.studies import CNN, MEAN, RunSpec, run_params, run_spec
+from gyro_pipeline.tracking import CURVE, ERRORS, SCORES, StoredRun
 
 ROW = ["sensor", "source", "estimator", "method", "real_gyros", "virtual_gyros", "window_s"]
 """What names a result."""
@@ -33,65 +33,116 @@ ROW = ["sensor", "source", "estimator", "method", "real_gyros", "virtual_gyros",
 CNN_BEST = "cnn_best"
 """In a comparison of estimators: the paper's network at its best validation epoch."""
 
-COVERAGES = [metric_name(f"coverage_{sigmas}sigma", ALL) for sigmas in (1, 2)]
+COVERAGES = ["coverage_1sigma_pct", "coverage_2sigma_pct"]
 
 CEILINGS = ["ceiling_rmse_dps", "ceiling_time_saving_pct", "ceiling_accuracy_gain_pct"]
 
 
+def column(score_name: str, windows: str = FIRST, bound: str = "") -> str:
+    """Name of a column of results.
+
+    Args:
+        score_name: Such as ``test_rmse_dps``.
+        windows: ``first`` or ``all``; the latter is named.
+        bound: ``lo`` or ``hi`` for an end of the 95 % interval.
+    """
+    return "_".join([score_name, *([ALL] if windows == ALL else []), *([bound] if bound else [])])
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the runs of a study must have been made with.
+
+    Attributes:
+        study, training, splits, virtual_gyros: The parameters.
+        evaluation: Resamples and seed of the intervals.
+    """
+
+    study: Study
+    training: Training
+    splits: Splits
+    virtual_gyros: VirtualGyros
+    evaluation: Evaluation
+
+    def params(self, row: RunSpec) -> dict[str, str]:
+        """Parameters of the run that makes a row, as the store has them."""
+        spec = run_spec(row, self.study.unseen_devices)
+        made = run_params(spec, self.study, self.training, self.splits, self.virtual_gyros)
+        return {name: str(value) for name, value in made.items()}
+
+
 def pool(
-    rows: Iterable[Sequence[Cell]],
-    runs: Sequence[StoredRun],
-    settings: tuple[Any, ...],
-    evaluation: Evaluation,
+    rows: Iterable[Sequence[RunSpec]], runs: Sequence[StoredRun], settings: Settings
 ) -> tuple[list[dict[str, Any]], dict[str, StoredRun]]:
     """Results of some rows.
 
     Args:
-        rows: From :func:`rows_of`; the running mean of a window before its networks.
+        rows: From :func:`rows_of`; the running mean of a window before others.
         runs: Finished ones count, newest first.
-        settings: Training, splits and virtual-gyroscope parameters.
-        evaluation: Resamples and seed of the intervals.
+        settings: What they must have been made with.
 
     Returns:
         A result for each row, with ``missing``, the command that makes it where its runs are not
         all there; and a run of the running mean by sensor.
     """
+    evaluation = settings.evaluation
     results: list[dict[str, Any]] = []
     means: dict[tuple[str, float], RunningMeans] = {}
     defaults: dict[tuple[str, float], pd.DataFrame] = {}
-    found_rows = [(cells, find_runs(cells, runs, settings)) for cells in rows]
-    for cells, found in found_rows:
-        if found and cells[0].estimator == DEFAULT:
-            defaults[cells[0].sensor, cells[0].window_s] = _errors(found)
-    for cells, stored in found_rows:
-        cell = cells[0]
-        key = cell.sensor, cell.window_s
+    run_of = Finder(runs, settings)
+    of_rows = [(row, run_of(row)) for row in rows]
+    for seeds, found in of_rows:
+        if found and seeds[0].estimator == DEFAULT:
+            defaults[seeds[0].sensor, seeds[0].window_s] = _errors(found)
+    for seeds, stored in of_rows:
+        spec = seeds[0]
+        key = spec.sensor, spec.window_s
         found = [replace(run, load=cache(run.load)) for run in stored]
-        row = {name: getattr(cell, name) for name in ROW} | {"missing": None, "run_ids": None}
-        if not found or (cell.estimator != MEAN and key not in means):
-            results.append(row | {"missing": command_for(cells)})
+        row = {name: getattr(spec, name) for name in ROW} | {"missing": None, "run_ids": None}
+        if not found or (spec.estimator != MEAN and key not in means):
+            results.append(row | {"missing": command_for(seeds)})
             continue
-        if cell.estimator == MEAN:
+        if spec.estimator == MEAN:
             means[key] = RunningMeans(found[0], evaluation)
             row |= mean_row(found[0])
             if key in defaults:
                 row |= differences(found, {DEFAULT: defaults[key]}, evaluation)
         else:
-            row |= network_row(found, means[key], cell.window_s)
+            row |= network_row(found, means[key], spec.window_s)
             if key in defaults:
                 references = {MEAN: means[key].errors, DEFAULT: defaults[key]}
                 row |= differences(found, references, evaluation)
-        row |= {name: found[0].metrics.get(name) for name in COVERAGES}
-        row["simulated"] = found[0].tags["simulated"] == "1"
+        scores = scores_of(found[0])
+        row |= {name: scores.get((name, ALL, "value")) for name in COVERAGES}
+        tags = found[0].tags
+        row["simulated"] = tags["simulated"] == "1"
+        row["recommended"] = tags.get("recommended") == "True"
+        row["uses_prior"] = "uses_prior" in tags
         row["folds"] = int(found[0].params["folds"])
         row["run_ids"] = " ".join(run.run_id for run in found)
         results.append(row)
-        if key in defaults and cell.estimator == CNN:
+        if key in defaults and spec.estimator == CNN:
             best = [best_epoch(run) for run in found]
-            scores = network_row(best, means[key], cell.window_s)
+            figures = network_row(best, means[key], spec.window_s)
             less = differences(best, references, evaluation)
-            results.append(row | scores | less | {"estimator": CNN_BEST})
+            results.append(row | figures | less | {"estimator": CNN_BEST})
     return results, {sensor: mean.run for (sensor, _), mean in reversed(means.items())}
+
+
+def scores_of(run: StoredRun) -> dict[tuple[str, str, str], float]:
+    """Scores of a run at the last epoch against the paper's truth.
+
+    Returns:
+        By score, windows, and ``value``, ``lo`` or ``hi``; those that are there.
+    """
+    table = run.load(SCORES)
+    table = table[(table.truth == PAPER) & (table.weights == LAST)]
+    return {
+        (row.score, row.windows, end): float(getattr(row, end))
+        for row in table.itertuples()
+        for end in ("value", "lo", "hi")
+        if pd.notna(getattr(row, end))
+    }
 
 
 def best_epoch(run: StoredRun) -> StoredRun:
@@ -101,85 +152,80 @@ def best_epoch(run: StoredRun) -> StoredRun:
     return replace(run, load={ERRORS: errors}.__getitem__)
 
 
-def command_for(cells: Sequence[Cell]) -> str:
+def command_for(row: Sequence[RunSpec]) -> str:
     """The command that makes the runs of a row."""
-    cell = cells[0]
-    only = {"sensor": cell.sensor, "window_s": f"{cell.window_s:g}"}
-    if cell.estimator in (CNN, RESIDUAL_NETWORK):
-        only |= {"real_gyros": str(cell.real_gyros), "virtual_gyros": str(cell.virtual_gyros)}
-    if len(cells) == 1 and cell.estimator == CNN:
-        only["seed"] = str(cell.seed)
+    spec = row[0]
+    only = {"sensor": spec.sensor, "window_s": f"{spec.window_s:g}"}
+    if estimator_class(spec.estimator).uses in ("real", "all"):
+        only |= {"real_gyros": str(spec.real_gyros), "virtual_gyros": str(spec.virtual_gyros)}
+    if len(row) == 1 and estimator_class(spec.estimator).seeded:
+        only["seed"] = str(spec.seed)
     params = ",".join(f"only.{key}={value}" for key, value in only.items())
-    return f"kedro run --pipeline={cell.study} --params={params}"
+    return f"kedro run --pipeline={spec.study} --params={params}"
 
 
-def rows_of(cells: Sequence[Cell]) -> Iterator[list[Cell]]:
-    """Cells that differ only in their seed: one row."""
-    key = lambda cell: tuple(getattr(cell, name) for name in ROW)  # noqa: E731
-    for _, group in groupby(cells, key):
+def rows_of(specs: Sequence[RunSpec]) -> Iterator[list[RunSpec]]:
+    """Specs that differ only in their seed: one row."""
+    key = lambda spec: tuple(getattr(spec, name) for name in ROW)  # noqa: E731
+    for _, group in groupby(specs, key):
         yield list(group)
 
 
-def find_runs(
-    cells: Sequence[Cell], runs: Sequence[StoredRun], settings: tuple[Any, ...]
-) -> list[StoredRun]:
-    """The newest finished run of every seed and fold of a row, made with the current settings.
+class Finder:
+    """Finds the newest finished runs that were made with the current settings.
 
     Args:
-        cells: One per seed.
         runs: Finished ones count, newest first.
-        settings: Training, splits and virtual-gyroscope parameters.
-
-    Returns:
-        All runs of the row, on one version of the data; empty if any is missing.
+        settings: What they must have been made with.
     """
-    chosen: dict[tuple[int, int], StoredRun] = {}
-    for cell in cells:
+
+    def __init__(self, runs: Sequence[StoredRun], settings: Settings) -> None:
+        self._settings = settings
+        self._runs: dict[frozenset[tuple[str, str]], StoredRun] = {}
         for run in runs:
-            if not run.finished or run.params["estimator"] != cell.estimator:
-                continue
-            fold, folds = int(run.params["fold"]), int(run.params["folds"])
-            expected = run_params(replace(cell, fold=fold), folds, *settings)
-            if {key: str(value) for key, value in expected.items()} == dict(run.params):
-                chosen.setdefault((cell.seed, fold), run)
-    if not chosen:
-        return []
-    newest = max(chosen.values(), key=lambda run: run.started_ms)
-    found = [r for r in chosen.values() if r.tags["data_hash"] == newest.tags["data_hash"]]
-    folds = int(newest.params["folds"]) if cells[0].estimator == CNN else 1
-    return found if len(found) == folds * len(cells) else []
+            if run.finished:
+                params = {(key, value) for key, value in run.params.items() if key != "folds"}
+                self._runs.setdefault(frozenset(params), run)
+
+    def __call__(self, row: Sequence[RunSpec]) -> list[StoredRun]:
+        """The runs of all seeds of a row; none if any is missing, or of other data."""
+        keys = dict.fromkeys(frozenset(self._settings.params(spec).items()) for spec in row)
+        found = [self._runs[key] for key in keys if key in self._runs]
+        alike = len({run.tags["data_hash"] for run in found}) == 1
+        return found if alike and len(found) == len(keys) else []
 
 
-def why_unused(run: StoredRun, cells: Sequence[Cell], settings: tuple[Any, ...]) -> str:
+def why_unused(run: StoredRun, specs: Sequence[RunSpec], settings: Settings) -> str:
     """Why a finished run that no result uses is not used.
 
     Args:
         run: It.
-        cells: All of its study.
-        settings: The current ones, as in :func:`find_runs`.
+        specs: All rows of its study.
+        settings: The current ones.
     """
-    cell = _cell(run.params)
-    expected = run_params(cell, int(run.params["folds"]), *settings)
-    changed = [
-        f"{key} {run.params.get(key)}, now {expected.get(key)}"
-        for key in sorted({*run.params, *expected})
-        if run.params.get(key) != (str(expected[key]) if key in expected else None)
-    ]
-    if changed:
-        return "other settings: " + "; ".join(changed)
-    if replace(cell, fold=HOLD_OUT) not in cells:
-        return "not in the study's grid"
-    return "a newer run, other data, or a result that is not complete"
+    fields = {name: run.params.get(name) for name in RunSpec.names()}
+    for spec in specs:
+        expected = settings.params(spec)
+        if all(expected[name] == value for name, value in fields.items()):
+            changed = [
+                f"{key} {run.params.get(key)}, now {expected.get(key)}"
+                for key in sorted({*run.params, *expected} - {"folds"})
+                if run.params.get(key) != expected.get(key)
+            ]
+            if changed:
+                return "other settings: " + "; ".join(changed)
+            return "a newer run, other data, or a result that is not complete"
+    return "not in the study's grid"
 
 
 def mean_row(mean: StoredRun) -> dict[str, Any]:
     """The result of the running mean, from its own run."""
     row: dict[str, Any] = {"recording_s": float(mean.load(CURVE).time_s.max())}
+    scores, ends = scores_of(mean), {"value": "", "lo": "lo", "hi": "hi"}
     for windows in (ALL, FIRST):
-        for base in ["test_rmse_dps", *CEILINGS]:
-            for bound in ("", "lo", "hi"):
-                name = metric_name(base, windows, truth=PAPER, bound=bound)
-                row[name] = mean.metrics.get(name)
+        for name in ["test_rmse_dps", *CEILINGS]:
+            for end, bound in ends.items():
+                row[column(name, windows, bound)] = scores.get((name, windows, end))
     return row
 
 
@@ -229,10 +275,10 @@ def _resampled(errors: pd.DataFrame, evaluation: Evaluation) -> np.ndarray:
 
 
 def network_row(runs: Sequence[StoredRun], mean: RunningMeans, window_s: float) -> dict[str, Any]:
-    """One row of a table: errors of all folds and seeds pooled, networks at the last epoch.
+    """One row of a table: errors of all seeds pooled, networks at the last epoch.
 
     Args:
-        runs: All seeds and folds.
+        runs: All seeds.
         mean: The running mean on the same recordings.
         window_s: T0, seconds.
 
@@ -250,14 +296,12 @@ def network_row(runs: Sequence[StoredRun], mean: RunningMeans, window_s: float) 
         of_seeds = errors.values() if len(errors) > 1 else ()
         single = [mean.scores(table, windows, window_s) for table in of_seeds]
         for base, estimate in pooled.items():
-            row[metric_name(base, windows)] = estimate.value
-            row[metric_name(base, windows, bound="lo")] = estimate.lo
-            row[metric_name(base, windows, bound="hi")] = estimate.hi
+            row[column(base, windows)] = estimate.value
+            row[column(base, windows, "lo")] = estimate.lo
+            row[column(base, windows, "hi")] = estimate.hi
             values = [one[base].value for one in single]
             several = len(values) > 1 and np.isfinite(values).all()
-            row[metric_name(base, windows) + "_seed_sd"] = (
-                np.std(values, ddof=1) if several else None
-            )
+            row[column(base, windows) + "_seed_sd"] = np.std(values, ddof=1) if several else None
     limits = mean_row(mean.run)
     return row | {k: v for k, v in limits.items() if k.startswith(("ceiling", "recording_s"))}
 
@@ -268,7 +312,7 @@ def differences(
     """Errors less those of other estimators on all the same windows, paired over recordings.
 
     Args:
-        runs: All seeds and folds of the row.
+        runs: All seeds of the row.
         references: Errors by the names of the others.
         evaluation: Resamples and seed of the intervals.
 
@@ -316,17 +360,6 @@ def pooled_curve(mean: StoredRun) -> pd.DataFrame:
     pooled = pd.concat(parts)
     pooled.insert(0, "sensor", mean.params["sensor"])
     return pooled
-
-
-def _cell(params: Mapping[str, str]) -> Cell:
-    """The cell that a run is of; parameters of stored runs are texts."""
-    given: dict[str, Any] = {name: params[name] for name in Cell.names()}
-    whole = ("method", "real_gyros", "virtual_gyros", "seed", "fold")
-    return Cell(
-        **given
-        | {name: int(given[name]) for name in whole}
-        | {"window_s": float(given["window_s"])}
-    )
 
 
 def _errors(runs: Sequence[StoredRun]) -> pd.DataFrame:

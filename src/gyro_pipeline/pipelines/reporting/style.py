@@ -9,7 +9,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from gyro_pipeline.estimators import ESTIMATORS
+from gyro_pipeline.estimators import ESTIMATORS, estimator_class
 
 # Okabe and Ito's palette: distinct for all common kinds of colour vision.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
@@ -45,7 +45,7 @@ def estimator_look(name: str) -> dict[str, Any]:
     """
     found = [(c, names.index(name)) for c, names in _FAMILIES.items() if name in names]
     colour, place = found[0] if found else (_UNKNOWN, 0)
-    recommended = name in ESTIMATORS and ESTIMATORS[name]().recommended
+    recommended = name in ESTIMATORS and estimator_class(name).recommended
     return {
         "color": colour,
         "marker": MARKERS[place],

@@ -16,20 +16,18 @@ from gyro_pipeline.conventions import (
     MDPS,
     PAPER,
     TEST,
-    TEST_IMU,
-    TRAIN,
     TRUE,
-    VALIDATION,
     InputError,
     Missing,
 )
-from gyro_pipeline.estimators import DEFAULT, ESTIMATORS
+from gyro_pipeline.estimators import DEFAULT, ESTIMATORS, estimator_class
 from gyro_pipeline.parameters import (
     Published,
     PublishedHours,
     PublishedResult,
     PublishedSpecification,
 )
+from gyro_pipeline.protocol.recordings import tested_imu
 from gyro_pipeline.studies import CNN, MEAN, RESIDUAL_NETWORK
 
 logger = logging.getLogger(__name__)
@@ -95,14 +93,13 @@ def comparison(results: pd.DataFrame, elsewhere: pd.DataFrame) -> pd.DataFrame |
 
 def _compared(row: pd.Series, group: pd.DataFrame) -> dict[str, Any]:
     mean = group[group.estimator == MEAN].test_rmse_dps_all.iloc[0]
-    known = ESTIMATORS[row.estimator]() if row.estimator in ESTIMATORS else None
     return {
         "Sensor": row.sensor,
         "Source": source_of(row),
         "Window s": row.window_s,
         "Estimator": row.estimator,
-        "Recommended": "yes" if known and known.recommended else "no",
-        "Stored prior": "yes" if known is None or known.uses_prior else "no",
+        "Recommended": "yes" if row.recommended else "no",
+        "Stored prior": "yes" if row.uses_prior else "no",
         "RMSE mdps": round(row.test_rmse_dps_all / MDPS, 3),
         "RMSE / running mean's": round(row.test_rmse_dps_all / mean, 3),
         "Less running mean mdps": _difference(row, MEAN),
@@ -113,8 +110,8 @@ def _compared(row: pd.Series, group: pd.DataFrame) -> dict[str, Any]:
             for name in (MEAN, DEFAULT)
         },
         "Ceiling mdps": round(row.ceiling_rmse_dps_all / MDPS, 3),
-        "Within ±1σ %": _covered(row.coverage_1sigma_all),
-        "Within ±2σ %": _covered(row.coverage_2sigma_all),
+        "Within ±1σ %": _covered(row.coverage_1sigma_pct),
+        "Within ±2σ %": _covered(row.coverage_2sigma_pct),
         "Recordings": int(group.recordings.max()),
         "Split": _split(row),
         "Runs": _short(row.run_ids),
@@ -161,7 +158,7 @@ def _ratios(rows: pd.DataFrame) -> pd.DataFrame:
 
 def _marked(name: str) -> str:
     """An estimator's name, and whether it is a recommended one."""
-    known = name in ESTIMATORS and ESTIMATORS[name]().recommended
+    known = name in ESTIMATORS and estimator_class(name).recommended
     return name.replace("_", " ") + (" (recommended)" if known else "")
 
 
@@ -399,7 +396,7 @@ def dataset_hours(published: Published, **stored: Any) -> pd.DataFrame:
 
     Args:
         published: The paper's hours, and how they are read where it contradicts itself.
-        **stored: ``<sensor>_recordings`` and ``<sensor>_roles``, or ``<sensor>_virtual``.
+        **stored: ``<sensor>_recordings``, or ``<sensor>_virtual``.
     """
     rates = {sheet.sensor: sheet.rate_hz for sheet in published.specifications}
     table = pd.DataFrame(_hours(row, rates[row.sensor], stored) for row in published.hours)
@@ -424,7 +421,7 @@ def _hours(
         test = xr.zeros_like(train)
     else:
         recordings = stored[f"{sensor}_recordings"]
-        train, test = _counted(recordings, stored[f"{sensor}_roles"])
+        train, test = _counted(recordings)
     samples, used_hz = recordings["samples"].load(), recordings.attrs["rate_hz"]
     source = source_name(recordings.attrs["source"], bool(recordings.attrs["simulated"]))
     parts = (train, test, train | test)
@@ -473,14 +470,17 @@ def _gyroscope_recordings(recordings: xr.Dataset) -> xr.DataArray:
     )
 
 
-def _counted(recordings: xr.Dataset, roles: pd.DataFrame) -> tuple[xr.DataArray, xr.DataArray]:
-    """Which recordings of which gyroscopes train (validation included), and which test."""
+def _counted(recordings: xr.Dataset) -> tuple[xr.DataArray, xr.DataArray]:
+    """Which recordings of which gyroscopes train (validation included), and which test.
+
+    Without a split, in a k-fold, all of them do both.
+    """
     there = _gyroscope_recordings(recordings)
-    train, test = (
-        there & there.recording.isin(roles.recording[roles.role.isin(wanted)].unique())
-        for wanted in ([TRAIN, VALIDATION], [TEST])
-    )
-    return train, test & (there.imu == TEST_IMU)
+    tested = there & (there.imu == tested_imu(recordings))
+    if "split" not in recordings.coords:
+        return there, tested
+    held_out = recordings.split == TEST
+    return there & ~held_out, tested & held_out
 
 
 def _sum(name: str, rows: pd.DataFrame, note: str) -> dict[str, Any]:

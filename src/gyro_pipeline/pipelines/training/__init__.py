@@ -1,5 +1,5 @@
-"""One tracked run per network."""
+"""One tracked run per estimator, training set, window and seed."""
 
-from gyro_pipeline.pipelines.training.pipeline import create_leakage_pipeline, create_pipeline
+from gyro_pipeline.pipelines.training.pipeline import create_pipeline
 
-__all__ = ["create_leakage_pipeline", "create_pipeline"]
+__all__ = ["create_pipeline"]

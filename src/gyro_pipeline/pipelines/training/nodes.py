@@ -1,374 +1,328 @@
-"""Nodes of the training stage."""
+"""Nodes of the training stage: the runs that a study needs, and the fits that they lack."""
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
-from typing import Any, TypeVar
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
-from gyro_pipeline.conventions import AXES, TEST, TEST_IMU, TRAIN, VALIDATION, InputError
-from gyro_pipeline.estimators import ESTIMATORS
-from gyro_pipeline.fingerprints import code_hash, fingerprint
-from gyro_pipeline.learning import (
-    batched,
-    examples,
-    fused,
-    jobs,
-    network,
-    packing,
-    trainer,
-    trainings,
+from gyro_pipeline.conventions import (
+    ALL_RECORDINGS,
+    AXES,
+    ORIGIN_REAL,
+    ORIGIN_VIRTUAL,
+    TEST,
+    InputError,
 )
-from gyro_pipeline.learning.examples import Device, with_shuffled_labels
-from gyro_pipeline.learning.jobs import TrainingJob
-from gyro_pipeline.learning.trainings import run_trainings
+from gyro_pipeline.estimators import estimator_class, estimator_path, make_estimator
+from gyro_pipeline.estimators.fitting import FitJob, run_fits
+from gyro_pipeline.estimators.training import TrainingSet
+from gyro_pipeline.fingerprints import code_hash, data_hash, fingerprint
 from gyro_pipeline.parameters import Execution, Only, Splits, Study, Training, VirtualGyros
-from gyro_pipeline.protocol import windows
-from gyro_pipeline.protocol.recordings import present
-from gyro_pipeline.protocol.splits import check_devices, check_roles, refuse_two_roles, with_role
-from gyro_pipeline.protocol.windows import UsableWindows, window_size
-from gyro_pipeline.studies import (
-    CNN,
-    CNN_SHUFFLED,
-    NETWORKS,
-    Cell,
-    over_folds,
-    run_params,
-    study_cells,
-)
-from gyro_pipeline.tracking import FINGERPRINT, HISTORY, TRAINED_IN, WEIGHTS, StoredRun, TrainedRun
+from gyro_pipeline.physics.bias import fill_masked
+from gyro_pipeline.protocol.windows import window_size
+from gyro_pipeline.studies import LEFT_OUT, RunSpec, planned, run_params, run_specs, study_rows
+from gyro_pipeline.tracking import FINGERPRINT, FittedRun, RunIdentity, StoredRun
 
 logger = logging.getLogger(__name__)
 
-_ADVICE = "lower windows_s of the study, or bring recordings that lost fewer samples"
+
+@dataclass
+class TrainingSets:
+    """Training sets of the runs of one study and sensor, each made once.
+
+    Attributes:
+        windows: The windows table.
+        recordings: Real recordings.
+        virtual: Virtual recordings, where the study uses some.
+    """
+
+    windows: pd.DataFrame
+    recordings: xr.Dataset
+    virtual: xr.Dataset | None
+    _made: dict[Any, dict[str, TrainingSet]] = field(default_factory=dict)
+
+    def of(self, spec: RunSpec) -> dict[str, TrainingSet]:
+        """What each fold of a run trains on, by the fold's name.
+
+        Raises:
+            InputError: The recordings cannot give what the run asks for.
+        """
+        key = spec.protocol, spec.window_s, spec.window_stride_s
+        counts = spec.method, spec.real_imus, spec.virtual_imus
+        if (key, counts) not in self._made:
+            rows = self.table_of(spec)
+            tested = rows.imu[rows.role == TEST].unique()
+            only = int(tested[0]) if len(tested) == 1 else None  # else an unseen device
+            self._made[key, counts] = {
+                str(fold): self._training_set(spec, own, only)
+                for fold, own in rows.groupby("fold", observed=True, sort=False)
+            }
+        return self._made[key, counts]
+
+    def table_of(self, spec: RunSpec) -> pd.DataFrame:
+        """Rows of the windows table that are of the run's protocol, window and stride."""
+        w = self.windows
+        chosen = w.protocol == spec.protocol
+        chosen &= (w.window_s == spec.window_s) & (w.window_stride_s == spec.window_stride_s)
+        return w[chosen]
+
+    def _training_set(self, spec: RunSpec, rows: pd.DataFrame, tested: int | None) -> TrainingSet:
+        """What a fold trains on; the tested IMU first, where it trains, then others in order."""
+        tests = rows.imu[rows.role == TEST].unique()
+        device = int(tests[0]) if len(tests) else tested
+        learned = rows[rows.role != TEST]
+        real = sorted(
+            learned.imu[learned.origin == ORIGIN_REAL].unique().tolist(),
+            key=lambda imu: (imu != device, imu),
+        )
+        if spec.real_imus > len(real):
+            raise InputError(
+                f"{spec.sensor}: {spec.real_gyros} gyroscopes asked by {spec.study}, the "
+                f"{spec.source} recordings hold {len(AXES) * len(real)} that train; narrow with "
+                "--params=only.real_gyros=..."
+            )
+        imus = {
+            ORIGIN_REAL: real[: spec.real_imus],
+            ORIGIN_VIRTUAL: range(1, 1 + spec.virtual_imus),
+        }
+        used = [(learned.origin == origin) & learned.imu.isin(of) for origin, of in imus.items()]
+        attributes, samples = self.recordings.attrs, self.recordings.sizes["sample"]
+        return TrainingSet(
+            self.recordings,
+            self.virtual if spec.virtual_imus else None,
+            learned[used[0] | used[1]],
+            window_size(spec.window_s, attributes["rate_hz"], samples, spec.sensor),
+            device,
+            tuple(imus[ORIGIN_REAL]) if spec.method == 1 else (),
+        )
 
 
-def plan(
+def plan_runs(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     study: Study,
     recordings: xr.Dataset,
-    roles: pd.DataFrame,
+    windows: pd.DataFrame,
     windows_s: list[float],
     seeds: list[int],
     only: Only,
     training: Training,
     virtual: xr.Dataset | None = None,
 ) -> pd.DataFrame:
-    """List the runs that the study needs on this sensor, before anything is trained.
+    """List the runs that a study needs on a sensor, before anything is trained.
 
     Args:
         study: Its grid.
         recordings: Real recordings.
-        roles: Which of them train, validate and test, in each fold.
+        windows: The windows table.
         windows_s: Calibration times, seconds.
-        seeds: Of the networks.
+        seeds: Of estimators that draw at random.
         only: Narrows the grid.
-        training: Hyper-parameters; part of each fingerprint.
+        training: Hyper-parameters; part of the fingerprints of estimators that have some.
         virtual: Virtual recordings, where the study uses some.
 
     Returns:
-        A row per run: the fields of :class:`~gyro_pipeline.studies.Cell`, ``folds`` and the
-        ``fingerprint`` of all that its training depends on.
+        A row per run: the fields of :class:`~gyro_pipeline.studies.RunSpec`; the ``fingerprint``
+        of all that it depends on; and ``left_out``, why it cannot be made.
 
     Raises:
-        InputError: If the recordings cannot give what the grid asks for.
+        InputError: The recordings cannot give what the grid asks for.
     """
-    check = check_devices if study.unseen_devices else check_roles
-    check(roles)
     sensor, source = recordings.attrs["sensor"], recordings.attrs["source"]
-    folds = sorted(roles.fold.unique().tolist())
-    cells = study_cells(study, sensor, source, windows_s, seeds, only)
-    for cell in cells:
-        check_cell(cell, recordings, training)
-        if not study.unseen_devices:
-            check_present(cell, recordings)
-    tested = tested_folds(study.experiment, cells, recordings, roles)
-    cells = [one for cell in cells for one in over_folds([cell], tested[cell.window_s], only)]
-    code = training_code()
-    rows = []
-    for cell in cells:
-        content = cell.content | {"recordings": recordings.attrs["data_hash"]}
-        if cell.estimator in NETWORKS:
-            content |= {"training": training.model_dump(), "code": code}
-            content |= {"roles": roles[roles.fold == cell.fold].role.tolist()}
-        else:
-            content |= {"tested": {fold: with_role(roles, fold, TEST) for fold in folds}}
-        if cell.virtual_gyros and virtual is not None:
-            content |= {"virtual": virtual.attrs["data_hash"]}
-        hashed = fingerprint(content)
-        made_of = {FINGERPRINT: hashed, "folds": len(tested[cell.window_s])}
-        rows.append({name: getattr(cell, name) for name in Cell.names()} | made_of)
-    return pd.DataFrame(rows)
+    rows = study_rows(study, sensor, source, windows_s, seeds, only)
+    sets, settings = TrainingSets(windows, recordings, virtual), study.training_of(training)
+    runs = []
+    for spec in run_specs(rows, study.unseen_devices):
+        folds = sets.of(spec)
+        content = _content(spec, sets, settings)
+        problem = _problem(spec, folds, settings)
+        if problem:
+            logger.warning("%s is left out: %s", _name(spec), problem)
+        runs.append(vars(spec) | {FINGERPRINT: fingerprint(content), LEFT_OUT: problem})
+    return pd.DataFrame(runs)
 
 
-def tested_folds(
-    study: str, cells: Sequence[Cell], recordings: xr.Dataset, roles: pd.DataFrame
-) -> dict[float, list[int]]:
-    """Folds with a window to test, for each window length; the log says which windows are lost.
+def _content(spec: RunSpec, sets: TrainingSets, settings: Training) -> list[Any]:
+    """All that a run depends on: code, settings, data and windows, but not its study."""
+    estimator = estimator_class(spec.estimator)
+    return [
+        code_hash("gyro_pipeline.estimators.fitting", estimator_path(spec.estimator)),
+        spec.estimator,
+        [sets.recordings.attrs["data_hash"]] if spec.real_imus else [],
+        [sets.virtual.attrs["data_hash"]] if spec.virtual_imus and sets.virtual else [],
+        {fold: training.windows_hash for fold, training in sets.of(spec).items()},
+        data_hash(pd.util.hash_pandas_object(_tests(sets.table_of(spec))).to_numpy(), None),
+        [spec.seed, settings.model_dump()] if estimator.seeded else [],
+        [spec.sensor, spec.method, spec.window_s],
+    ]
+
+
+def _tests(table: pd.DataFrame) -> pd.DataFrame:
+    tests = table[table.role == TEST]
+    return tests[["fold", "imu", "recording", "start"]].reset_index(drop=True)
+
+
+def _problem(spec: RunSpec, folds: Mapping[str, TrainingSet], settings: Training) -> str:
+    """Why an estimator cannot be fitted in some fold; empty where it can in all.
 
     Raises:
-        InputError: No fold has one.
+        InputError: The settings do not suit the windows.
     """
-    sensor, rate_hz = recordings.attrs["sensor"], recordings.attrs["rate_hz"]
-    windows, tests = UsableWindows(recordings), roles[roles.role == TEST]
-    tests = tests if "imu" in tests else tests.assign(imu=TEST_IMU)
-    folds: dict[float, list[int]] = {}
-    for window_s in dict.fromkeys(cell.window_s for cell in cells):
-        size, label = round(window_s * rate_hz), f"{study} {sensor}, {window_s:g} s windows"
-        log_losses(label, windows, size)
-        places = zip(tests.imu.tolist(), tests.recording.tolist(), strict=True)
-        counts = [windows.count([imu], number, size) for imu, number in places]
-        folds[window_s] = sorted(tests.fold[np.array(counts) > 0].unique().tolist())
-        if not folds[window_s]:
-            raise InputError(f"{label}: no test recording has one that can be used; {_ADVICE}")
-    return folds
+    estimator = make_estimator(spec.estimator, settings, spec.seed)
+    for fold, training in folds.items():
+        if training.recordings_of_device < estimator.fewest_recordings:
+            return (
+                f"{fold}: {spec.estimator} needs {estimator.fewest_recordings} training "
+                f"recordings, got {training.recordings_of_device}"
+            )
+    estimator.work(next(iter(folds.values())))
+    return ""
 
 
 def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
-    cells: pd.DataFrame,
+    study: Study,
+    plan: pd.DataFrame,
     tracked: list[StoredRun],
     recordings: xr.Dataset,
-    bias: pd.DataFrame,
-    roles: pd.DataFrame,
+    windows: pd.DataFrame,
     training: Training,
     splits: Splits,
     virtual_gyros: VirtualGyros,
     execution: Execution,
     virtual: xr.Dataset | None = None,
-) -> Iterator[TrainedRun]:
-    """Train what the plan asks for and no study has trained yet; each run is saved when it ends.
+) -> Iterator[FittedRun]:
+    """Fit what the plan asks for and no study has fitted yet; each fit is saved when it ends.
 
     Args:
-        cells: From :func:`plan`.
-        tracked: All trained runs on these logs, of any study.
+        study: Whose runs.
+        plan: From :func:`plan_runs`.
+        tracked: All runs on these logs, of any study.
         recordings: Real recordings; workers read only what they need of them.
-        bias: Their ground truth.
-        roles: Which of them train and validate, in each fold.
+        windows: The windows table.
         training: Hyper-parameters.
         splits: Recorded with each run.
-        virtual_gyros: Which virtual recordings train.
-        execution: How trainings are run.
+        virtual_gyros: Likewise.
+        execution: How estimators are fitted.
         virtual: Virtual recordings, where the study uses some.
 
     Yields:
-        Runs that wait for their evaluation.
+        The fits of runs that then wait for their evaluation.
     """
-    planned = {row[FINGERPRINT]: _cell(row) for row in cells.to_dict("records")}
-    folds = dict(zip(planned.values(), cells.folds.tolist(), strict=True))
-    devices = Devices(recordings, labelled_bias(bias), roles, virtual, virtual_gyros)
-    yield from train_missing(
-        planned,
-        tracked,
-        recordings.attrs,
-        execution,
-        params=lambda cell: run_params(cell, folds[cell], training, splits, virtual_gyros),
-        job=lambda name, cell: devices.job(name, cell, training),
-    )
-
-
-def training_code() -> list[str]:
-    """What the results of a training depend on beside its settings and data."""
-    modules = [batched, examples, fused, jobs, network, packing, trainer, trainings, windows]
-    return [code_hash(modules), *(path.read_text() for path in fused.SOURCES)]
-
-
-def log_losses(label: str, windows: UsableWindows, size: int) -> None:
-    """Say which windows of a study are left out, if any is."""
-    if losses := windows.losses(size):
-        logger.warning("%s: %s", label, losses)
-
-
-C = TypeVar("C", bound=Cell)
-
-
-def train_missing(
-    planned: Mapping[str, C],
-    tracked: Sequence[StoredRun],
-    data: Mapping[str, Any],
-    execution: Execution,
-    params: Callable[[C], dict[str, Any]],
-    job: Callable[[str, C], TrainingJob],
-) -> Iterator[TrainedRun]:
-    """Train the cells of one study and sensor that are not trained yet.
-
-    Args:
-        planned: All of them by fingerprint.
-        tracked: All trained runs on these logs, of any study.
-        data: Attributes of the recordings.
-        execution: How trainings are run.
-        params: What the run of a cell carries.
-        job: The training of a cell, by its fingerprint.
-
-    Yields:
-        Runs that wait for their evaluation.
-    """
-    tagged = {"data_hash": data["data_hash"], "simulated": str(data["simulated"])}
-
-    def run(fp: str, started: float, tags: dict[str, str], **left: Any) -> TrainedRun:
-        tags = tagged | {FINGERPRINT: fp} | tags
-        carried = params(planned[fp])
-        return TrainedRun(planned[fp].study, carried, tags, _ms(started), _ms(time.time()), **left)
-
-    study = next(iter(planned.values())).study
-    here = {run.fingerprint for run in tracked if run.study == study}
-    elsewhere = {run.fingerprint: run for run in tracked}
-    missing = [fp for fp in planned if fp not in here]
-    shared = [fp for fp in missing if fp in elsewhere]
-    networks = [fp for fp in missing if planned[fp].estimator in NETWORKS]
-    to_train = [fp for fp in networks if fp not in elsewhere]
-    label = f"{study} {data['sensor']}"
+    sets, settings = TrainingSets(windows, recordings, virtual), study.training_of(training)
+    specs = planned(plan)
+    here = {run.fingerprint: run for run in reversed(tracked) if run.study == study.experiment}
+    elsewhere = {run.fingerprint: run for run in reversed(tracked) if run.trained}
+    missing = {
+        key: [fold for fold in sets.of(spec) if key not in here or fold not in here[key].fits]
+        for key, spec in specs.items()
+        if key not in here or not here[key].trained
+    }
+    shared = [key for key in missing if key in elsewhere]
+    label = f"{study.experiment} {recordings.attrs['sensor']}"
     logger.info(
-        "%s: %d runs planned, %d skipped (trained before), %d shared with another study, "
-        "%d to train",
-        *(label, len(planned), len(planned) - len(missing), len(shared), len(to_train)),
+        "%s: %d runs planned, %d skipped (made before), %d shared with another study, %d to fit",
+        *(label, len(specs), len(specs) - len(missing), len(shared), len(missing) - len(shared)),
     )
-    for fp in missing:
-        if fp in shared:
-            twin = elsewhere[fp]
-            left = _copied(twin) if fp in networks else {}
-            yield run(fp, time.time(), {TRAINED_IN: twin.tags.get(TRAINED_IN, twin.study)}, **left)
-        elif fp not in to_train:
-            yield run(fp, time.time(), {})
-    todo = [job(fp, planned[fp]) for fp in to_train]
-    for done, trained in run_trainings(todo, execution, label):
-        artifacts = {WEIGHTS: trained.artifact, HISTORY: trained.history}
-        ended = {
-            "best_epoch": str(trained.artifact["best_epoch"]),
-            "last_epoch": str(trained.history.epoch.iloc[-1]),
-            "engine": trained.engine,
-        }
-        yield run(done.name, trained.started, ended, history=trained.history, artifacts=artifacts)
 
+    def fitted(key: str, fold: str, estimator: Any, began: float, ended: float) -> FittedRun:
+        spec = specs[key]
+        params = run_params(spec, study, training, splits, virtual_gyros)
+        return _fitted(spec, key, params, sets, fold, estimator, began, ended)
 
-class Devices:
-    """Training devices of each cell: real IMUs first, the test IMU first of all."""
-
-    def __init__(
-        self,
-        recordings: xr.Dataset,
-        bias: xr.DataArray,
-        roles: pd.DataFrame,
-        virtual: xr.Dataset | None,
-        virtual_gyros: VirtualGyros,
-    ) -> None:
-        self._recordings, self._bias, self._roles = recordings, bias, roles
-        self._virtual, self._virtual_gyros = virtual, virtual_gyros
-        self._windows = UsableWindows(recordings)
-
-    def job(self, name: str, cell: Cell, training: Training) -> TrainingJob:
-        """The training of a cell, under a name of the caller's choice.
-
-        Raises:
-            InputError: If a recording would be used in two roles, be it by different IMUs, or no
-                window is left to train on.
-        """
-        samples, rate_hz = self._recordings.sizes["sample"], self._recordings.attrs["rate_hz"]
-        imus = tuple(self._recordings.imu.to_numpy()[: cell.real_imus].tolist())
-        inputs = [imus] if cell.method == 1 else [(imu,) for imu in imus]
-        window = window_size(cell.window_s, rate_hz, samples, cell.sensor)
-        devices = [self._real(side_by_side, cell.fold, TRAIN, window) for side_by_side in inputs]
-        if not devices[0].numbers:  # whose centre the estimates are about
-            raise InputError(
-                f"{cell.study} {cell.sensor} fold {cell.fold}, {cell.window_s:g} s windows: no "
-                f"training recording has one that can be used; {_ADVICE}"
-            )
-        devices = [device for device in devices if device.numbers]
-        validation = self._real(inputs[0], cell.fold, VALIDATION, window)
-        tested = [(TEST_IMU, number) for number in with_role(self._roles, cell.fold, TEST)]
-        used = {TRAIN: _used(devices), VALIDATION: _used([validation]), TEST: tested}
-        refuse_two_roles(used, f"{cell.sensor} fold {cell.fold}")
-        devices += [self._virtual_imu(imu) for imu in range(1, 1 + cell.virtual_imus)]
-        shuffled = cell.estimator == CNN_SHUFFLED
-        if shuffled:
-            generator = np.random.default_rng(cell.seed)
-            devices = [with_shuffled_labels(device, generator) for device in devices]
-        return TrainingJob(
-            name=name,
-            devices=devices,
-            validation=validation if validation.numbers else None,
-            window=window,
-            settings=training,
-            seed=cell.seed,
-            cell=cell if shuffled else replace(cell, seed=0),  # a seed has labels of its own
+    for key in shared:
+        for fold in missing[key]:
+            now = time.time()
+            yield fitted(key, fold, elsewhere[key].load_fit(fold), now, now)
+    jobs = [
+        FitJob(
+            key, fold, specs[key].estimator, settings, specs[key].seed, sets.of(specs[key])[fold]
         )
-
-    def _real(self, imus: tuple[int, ...], fold: int, role: str, window: int) -> Device:
-        numbers = [
-            number
-            for number in with_role(self._roles, fold, role)
-            if self._windows.count(imus, number, window)
-        ]
-        return Device(self._recordings.angular_rate, self._bias, imus, tuple(numbers))
-
-    def _virtual_imu(self, imu: int) -> Device:
-        if self._virtual is None:
-            raise InputError("virtual gyroscopes asked of a pipeline that makes none")
-        numbers = range(1, 1 + self._virtual_gyros.train_recordings)
-        return Device(
-            self._virtual.angular_rate, self._virtual.recording_mean.load(), (imu,), tuple(numbers)
-        )
+        for key in missing
+        if key not in shared
+        for fold in missing[key]
+    ]
+    for job, fit in run_fits(jobs, execution, label):
+        yield fitted(job.name, job.fold, fit.estimator, fit.started, fit.ended)
 
 
-def _used(devices: Sequence[Device]) -> list[tuple[int, int]]:
-    """IMU and number of every recording."""
-    return [(imu, n) for device in devices for imu in device.imus for n in device.numbers]
+def _fitted(  # noqa: PLR0917 - what a fit is stored with
+    spec: RunSpec,
+    key: str,
+    params: Mapping[str, Any],
+    sets: TrainingSets,
+    fold: str,
+    estimator: Any,
+    began: float,
+    ended: float,
+) -> FittedRun:
+    folds, attributes = sets.of(spec), sets.recordings.attrs
+    is_model = fold == ALL_RECORDINGS or ALL_RECORDINGS not in folds and fold == next(iter(folds))
+    training = folds[fold]
+    tags = {"data_hash": attributes["data_hash"], "simulated": str(attributes["simulated"])}
+    return FittedRun(
+        run=RunIdentity(
+            study=spec.study,
+            fingerprint=key,
+            params=dict(params) | {"folds": sum(name != ALL_RECORDINGS for name in folds)},
+            tags=tags,
+            folds=tuple(folds),
+            name=_name(spec),
+            note=_note(spec, folds),
+        ),
+        fold=fold,
+        estimator=estimator,
+        started_ms=int(1000 * began),
+        ended_ms=int(1000 * ended),
+        is_model=is_model,
+        example=_example(spec, training, sets.recordings) if is_model else None,
+        dataset={
+            "name": f"{spec.sensor} recordings",
+            "digest": attributes["data_hash"],
+            "source": attributes["source"],
+        },
+    )
 
 
-def check_cell(cell: Cell, recordings: xr.Dataset, training: Training) -> None:
-    """Refuse a cell that the recordings cannot give.
-
-    Raises:
-        InputError: A window that does not fit, or more IMUs than there are.
-    """
-    if cell.estimator not in (*NETWORKS, *ESTIMATORS):
-        raise InputError(
-            f"{cell.study}: unknown estimator {cell.estimator!r}; there are {CNN}, "
-            f"{', '.join(ESTIMATORS)}"
-        )
-    samples, rate_hz = recordings.sizes["sample"], recordings.attrs["rate_hz"]
-    size = window_size(cell.window_s, rate_hz, samples, cell.sensor)
-    if cell.estimator in NETWORKS:
-        jobs.sized(training, cell.real_gyros if cell.method == 1 else len(AXES), size)
-    if cell.real_imus > recordings.sizes["imu"]:
-        available = len(AXES) * recordings.sizes["imu"]
-        raise InputError(
-            f"{cell.sensor}: {cell.real_gyros} gyroscopes asked by {cell.study}, the "
-            f"{cell.source} recordings hold {available}; narrow with --params=only.real_gyros=..."
-        )
+def _example(spec: RunSpec, training: TrainingSet, recordings: xr.Dataset) -> np.ndarray:
+    """A window as the estimator sees it, (1, gyroscopes, samples), deg/s."""
+    imus = spec.real_imus if spec.method == 1 else 1
+    first = recordings.angular_rate.isel(
+        imu=slice(imus), recording=0, sample=slice(training.size)
+    ).transpose("imu", "axis", "sample")
+    return fill_masked(first.to_numpy().reshape(1, -1, training.size)).astype(np.float32)
 
 
-def check_present(cell: Cell, recordings: xr.Dataset) -> None:
-    """Refuse a recording that one of the IMUs that are seen side by side lacks.
-
-    Raises:
-        InputError: Naming the recording.
-    """
-    if cell.method != 1 or cell.real_imus == 1:
-        return  # a recording that an IMU lacks is not used for it
-    there = present(recordings).isel(imu=slice(cell.real_imus))
-    for number in recordings.recording[~there.all("imu").to_numpy()].to_numpy():
-        raise InputError(
-            f"{cell.sensor} recording {number}: expected {cell.real_imus} IMUs side by side for "
-            f"{cell.study} (method 1), not all are there"
-        )
+def _name(spec: RunSpec) -> str:
+    """Sensor, estimator, training set, window and seed, at a glance in a list of runs."""
+    stride = spec.window_stride_s
+    parts = [
+        spec.sensor,
+        spec.estimator,
+        f"{spec.real_gyros}+{spec.virtual_gyros}" + " side by side" * (spec.method == 1),
+        f"{spec.window_s:g} s" + f" every {stride:g} s" * (stride != spec.window_s),
+    ]
+    parts += [spec.protocol] if spec.protocol != "by_recording" else []
+    parts += [f"seed {spec.seed}"] if estimator_class(spec.estimator).seeded else []
+    return " ".join(parts)
 
 
-def _cell(row: Mapping[Any, Any]) -> Cell:
-    return Cell(**{name: row[name] for name in Cell.names()})
-
-
-def labelled_bias(bias: pd.DataFrame) -> xr.DataArray:
-    """The bias table as an array (imu, recording, axis), deg/s."""
-    return bias.set_index(["imu", "recording", "axis"]).bias_dps.to_xarray()
-
-
-def _copied(twin: StoredRun) -> dict[str, Any]:
-    history = twin.load(HISTORY)
-    return {"history": history, "artifacts": {WEIGHTS: twin.load(WEIGHTS), HISTORY: history}}
-
-
-def _ms(seconds: float) -> int:
-    return int(1000 * seconds)
+def _note(spec: RunSpec, folds: Mapping[str, TrainingSet]) -> str:
+    """What was trained on what, in two sentences."""
+    model = folds.get(ALL_RECORDINGS) or next(iter(folds.values()))
+    counts = model.windows.groupby("origin", observed=True).recording.agg(["nunique", "size"])
+    shown = " and ".join(
+        f"{row['size']} windows of {row['nunique']} {origin} recordings"
+        for origin, row in counts.iterrows()
+    )
+    tested = [fold for fold in folds if fold != ALL_RECORDINGS]
+    judged = "a hold-out" if len(tested) == 1 else f"{len(tested)} folds, each fitted by itself"
+    final = "; the model is fitted once more, to all recordings" * (ALL_RECORDINGS in folds)
+    return (
+        f"`{spec.estimator}` estimates the bias of {spec.sensor} from {spec.window_s:g} s, learned "
+        f"from {shown or 'nothing'} ({spec.real_gyros} real and {spec.virtual_gyros} virtual "
+        f"gyroscopes, source {spec.source}). It is judged on {judged} (protocol {spec.protocol})"
+        f"{final}."
+    )

@@ -6,15 +6,15 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from gyro_pipeline.conventions import AXES, DIMENSIONS, HOLD_OUT, MDPS, TRAIN, InputError
+from gyro_pipeline.conventions import AXES, DIMENSIONS, MDPS, TRAIN, InputError
 from gyro_pipeline.fingerprints import data_hash
 from gyro_pipeline.parameters import VirtualGyros
 from gyro_pipeline.physics.bias import recording_mean
-from gyro_pipeline.protocol.splits import with_role
+from gyro_pipeline.protocol.recordings import common_length
 
 
 def synthesise(
-    recordings: xr.Dataset, bias: pd.DataFrame, roles: pd.DataFrame, virtual_gyros: VirtualGyros
+    recordings: xr.Dataset, bias: pd.DataFrame, virtual_gyros: VirtualGyros
 ) -> xr.Dataset:
     """Virtual gyroscopes like the real ones in training (paper, section IV-A).
 
@@ -22,25 +22,27 @@ def synthesise(
     white noise of the real gyroscopes' sample sigma around it, in every recording.
 
     Args:
-        recordings: The real ones, for their rate and length, which all have.
-        bias: Their ground truth; only training recordings are used.
-        roles: Which recordings train.
+        recordings: The real ones, for their rate, the length that studies cut them to, and the
+            ``split`` that says which of them train.
+        bias: Their ground truth; that of training recordings is used.
         virtual_gyros: Counts, turn-on jitter and seed.
 
     Returns:
         Recordings in the layout of the real ones, with ``recording_mean`` (imu, recording, axis);
-        the attribute ``train_recordings`` says how many of each train.
+        the attribute ``train_recordings`` says how many of each train, ``drawn_from`` from which
+        real recordings they were drawn.
 
     Raises:
         InputError: If the split is a k-fold: each fold would need gyroscopes of its own.
     """
     sensor = recordings.attrs["sensor"]
-    if (roles.fold != HOLD_OUT).any():
+    if "split" not in recordings.coords:
         raise InputError(
-            f"{sensor}: virtual gyroscopes need a hold-out split, got a k-fold of "
-            f"{roles.recording.nunique()} recordings; set virtual_gyros to 0 in this study"
+            f"{sensor}: virtual gyroscopes need a hold-out, got {recordings.sizes['recording']} "
+            "recordings, so few that they make a k-fold; set virtual_gyros to 0 in this study"
         )
-    training = bias[bias.recording.isin(with_role(roles, HOLD_OUT, TRAIN))]
+    drawn_from = recordings.recording[recordings.split == TRAIN].to_numpy()
+    training = bias[bias.recording.isin(drawn_from)]
     sigma = np.sqrt(np.mean(training.sample_sigma_dps**2))
     generator = np.random.default_rng([virtual_gyros.seed, zlib.crc32(sensor.encode())])
     shape = (virtual_gyros.imus, virtual_gyros.recordings, len(AXES))
@@ -48,7 +50,7 @@ def synthesise(
         training.bias_dps.min(), training.bias_dps.max(), size=(shape[0], 1, shape[2])
     )
     jitter = generator.standard_normal(shape) * virtual_gyros.turn_on_jitter_mdps * MDPS
-    samples = generator.standard_normal((*shape, recordings.sizes["sample"]), dtype=np.float32)
+    samples = generator.standard_normal((*shape, common_length(recordings)), dtype=np.float32)
     samples *= np.float32(sigma)
     samples += (drawn + jitter)[..., None].astype(np.float32)
     labels = {"imu": np.arange(1, shape[0] + 1), "recording": np.arange(1, shape[1] + 1)}
@@ -65,6 +67,7 @@ def synthesise(
             "simulated": 1,
             "rate_hz": recordings.attrs["rate_hz"],
             "train_recordings": virtual_gyros.train_recordings,
+            "drawn_from": drawn_from,
             "data_hash": data_hash(samples, [sensor, "virtual"]),
         },
     )

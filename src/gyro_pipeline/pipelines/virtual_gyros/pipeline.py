@@ -12,14 +12,14 @@ def create_pipeline(sensor: str) -> Pipeline:
             Node(
                 synthesise,
                 [
-                    f"{sensor}.windowed_splits.recordings",
-                    f"{sensor}.windowed_splits.bias",
-                    f"{sensor}.windowed_splits.roles",
+                    f"{sensor}.raw_logs.recordings",
+                    f"{sensor}.ground_truth.bias",
                     "params:virtual_gyros",
                 ],
                 f"{sensor}.virtual_gyros.recordings",
                 name=f"synthesise_{sensor}",
                 namespace="virtual_gyros",
+                tags=[sensor],
             )
         ]
     )

@@ -1,24 +1,66 @@
-"""Nodes of the windowed-splits stage. Windows are cut as views where they are used."""
+"""Nodes of the windowed-splits stage: which windows train, validate and test."""
 
 import logging
+from collections.abc import Mapping
 
+import numpy as np
 import pandas as pd
 import xarray as xr
 
-from gyro_pipeline.conventions import AXES, TEST, TRAIN
+from gyro_pipeline.conventions import (
+    AXES,
+    BY_RECORDING,
+    K_FOLD,
+    LEAVE_ONE_DEVICE_OUT,
+    ORIGIN_REAL,
+    ORIGIN_VIRTUAL,
+    TEST,
+    TRAIN,
+    UNUSED,
+    InputError,
+)
 from gyro_pipeline.fingerprints import data_hash
-from gyro_pipeline.parameters import Splits
+from gyro_pipeline.parameters import Only, Splits, Study
 from gyro_pipeline.physics.bias import recording_mean, sample_sigma
-from gyro_pipeline.protocol.recordings import cut, one_by_one, recordings_of_test_imu
-from gyro_pipeline.protocol.splits import assign_roles, leave_one_device_out, refuse_copies
+from gyro_pipeline.pipelines.windowed_splits.protocols import (
+    PROTOCOLS,
+    Candidates,
+    check_table,
+)
+from gyro_pipeline.protocol.recordings import common_length, cut, one_by_one, tested_imu
+from gyro_pipeline.protocol.windows import describe_losses, usable_windows, window_size
+from gyro_pipeline.studies import study_rows
 
 logger = logging.getLogger(__name__)
 
+APART = {BY_RECORDING: "recording", K_FOLD: "recording", LEAVE_ONE_DEVICE_OUT: "imu"}
+"""What has one role in a fold of each honest protocol; the leaks part nothing."""
 
-def cut_to_shortest(
+_PLACE = ["imu", "recording"]
+
+WINDOWS_TABLE = [
+    "protocol",
+    "window_s",
+    "window_stride_s",
+    "fold",
+    "role",
+    "origin",
+    *_PLACE,
+    "start",
+]
+"""Columns of a windows table."""
+
+_COMPACT = dict.fromkeys(["protocol", "fold", "role", "origin"], "category") | dict.fromkeys(
+    [*_PLACE, "start"], "int32"
+)
+
+
+def cut_to_common_length(
     recordings: xr.Dataset, bias: pd.DataFrame, quality: pd.DataFrame
-) -> tuple[xr.Dataset, pd.DataFrame]:
-    """Recordings of one length, which studies need; the length and who set it are logged.
+) -> tuple[xr.Dataset, pd.DataFrame, pd.DataFrame]:
+    """Cut recordings to one length, which studies need, and list what is in them.
+
+    The length and who set it are logged.
 
     Args:
         recordings: Of a length each; what is cut off stays in their file.
@@ -26,108 +68,192 @@ def cut_to_shortest(
         quality: The table of the raw-logs stage, for the name of the shortest one's file.
 
     Returns:
-        Recordings as long as the shortest one, and the biases and sample sigmas of what is left of
-        them: the truth of a study is the mean of recordings of the study's length.
+        Recordings of the length that keeps most samples, with their means: the truth of a study is
+        the mean of recordings of the study's length. Their ground truth, measured again where they
+        were cut. And a row for each: ``imu, recording``; ``content``, a hash of its samples; and
+        ``masked``, the numbers of its masked samples.
     """
-    sensor, rate_hz = recordings.attrs["sensor"], recordings.attrs["rate_hz"]
+    length, lengths = common_length(recordings), recordings["samples"].to_numpy()
+    lengths, rate_hz = lengths[lengths > 0], recordings.attrs["rate_hz"]
+    alike = cut(recordings, length)
+    if (lengths != length).any():
+        _log_lengths(recordings.attrs["sensor"], quality, length, rate_hz)
+        bias = _biases(alike)
+    else:
+        logger.info("%s: all recordings are %.1f s", recordings.attrs["sensor"], length / rate_hz)
+    means = bias.set_index([*_PLACE, "axis"]).bias_dps.to_xarray()
+    alike = alike.assign(recording_mean=means.reindex_like(alike[[*_PLACE, "axis"]]))
+    rows = [
+        (imu, number, data_hash(rates, None), np.flatnonzero(np.isnan(rates).any(axis=0)))
+        for imu, number, rates in one_by_one(alike)
+    ]
+    return alike, bias, pd.DataFrame(rows, columns=[*_PLACE, "content", "masked"])
+
+
+def _log_lengths(sensor: str, quality: pd.DataFrame, length: int, rate_hz: float) -> None:
+    """Say to which length recordings are cut, who set it, and which are too short."""
     used = quality.dropna(subset="stop")
     lengths = (used["stop"] - used["start"]).to_numpy(int)
-    shortest, longest = int(lengths.min()), int(lengths.max())
-    if shortest == longest:
-        logger.info("%s: all recordings are %.1f s", sensor, shortest / rate_hz)
-        return recordings, bias
-    first = used.iloc[int(lengths.argmin())]
+    first = used.iloc[int(np.flatnonzero(lengths == length)[0])]
+    shorter = used[lengths < length]
+    left_out = [
+        f"IMU {row.imu} recording {row.recording} ({row.file})" for row in shorter.itertuples()
+    ]
     logger.info(
         "%s: recordings are %.1f to %.1f s; studies use the first %.1f s of each, the length of "
-        "IMU %d recording %d, %s. quality.length_s rejects shorter ones",
-        *(sensor, shortest / rate_hz, longest / rate_hz, shortest / rate_hz),
+        "IMU %d recording %d, %s, which keeps most samples%s. quality.length_s sets another length",
+        *(sensor, lengths.min() / rate_hz, lengths.max() / rate_hz, length / rate_hz),
         *(first.imu, first.recording, first.file),
-    )
-    alike = cut(recordings, shortest)
-    return alike, pd.concat(
-        [
-            pd.DataFrame(
-                {
-                    "sensor": sensor,
-                    "imu": imu,
-                    "recording": number,
-                    "axis": list(AXES),
-                    "bias_dps": recording_mean(samples),
-                    "sample_sigma_dps": sample_sigma(samples),
-                }
-            )
-            for imu, number, samples in one_by_one(alike)
-        ],
-        ignore_index=True,
+        f", and leave out {', '.join(left_out[:5])}{', …' * (len(left_out) > 5)}" * bool(left_out),  # noqa: PLR2004
     )
 
 
-def split_recordings(recordings: xr.Dataset, splits: Splits) -> pd.DataFrame:
-    """Roles of the recordings, by recording, before any window is cut.
-
-    Recordings that the tested IMU lacks cannot test: they train, unless the source gave them to
-    test.
-
-    Args:
-        recordings: With ``given_split`` where the source came split.
-        splits: Counts and the seed.
-
-    Returns:
-        Columns ``fold, recording, role``.
-
-    Raises:
-        InputError: If no recording is left for a role, one is there twice, with two roles, or the
-            tested IMU has none.
-    """
-    there, given = recordings_of_test_imu(recordings), _given(recordings)
-    numbers = recordings.recording.to_numpy()
-    roles = assign_roles(numbers[there].tolist(), splits, given)
-    others = [n for n in numbers[~there].tolist() if given is None or given[n] != TEST]
-    added = [(fold, number, TRAIN) for fold in roles.fold.unique() for number in others]
-    if added:
-        roles = pd.concat([roles, pd.DataFrame(added, columns=roles.columns)], ignore_index=True)
-    refuse_copies(_contents(recordings), roles)
-    return roles
-
-
-def split_devices(recordings: xr.Dataset, splits: Splits) -> pd.DataFrame:
-    """Roles of the recordings where every IMU in turn is an unseen device.
-
-    Args:
-        recordings: With ``given_split`` where the source came split.
-        splits: Counts.
-
-    Returns:
-        Columns ``fold`` (the unseen IMU), ``imu``, ``recording``, ``role``.
-
-    Raises:
-        InputError: Fewer than two IMUs, or a recording that is there twice, with two roles.
-    """
-    contents = _contents(recordings)
-    present: dict[int, list[int]] = {}
-    for imu, number in sorted(contents):
-        present.setdefault(imu, []).append(number)
-    roles = leave_one_device_out(present, splits, _given(recordings))
-    untested = sorted(set(present) - set(roles.fold))
-    if untested:
-        logger.info(
-            "%s: IMUs %s have no test recording and only train",
-            *(recordings.attrs["sensor"], ", ".join(map(str, untested))),
+def _biases(recordings: xr.Dataset) -> pd.DataFrame:
+    tables = [
+        pd.DataFrame(
+            {
+                "sensor": recordings.attrs["sensor"],
+                "imu": imu,
+                "recording": number,
+                "axis": list(AXES),
+                "bias_dps": recording_mean(samples),
+                "sample_sigma_dps": sample_sigma(samples),
+            }
         )
-    refuse_copies(contents, roles)
-    return roles
+        for imu, number, samples in one_by_one(recordings)
+    ]
+    return pd.concat(tables, ignore_index=True)
 
 
-def _given(recordings: xr.Dataset) -> dict[int, str] | None:
-    """The role of each recording, where the source came split."""
-    if "given_split" not in recordings:
+def split_windows(  # noqa: PLR0917 - a node's arguments are its datasets
+    study: Study,
+    recordings: xr.Dataset,
+    contents: pd.DataFrame,
+    splits: Splits,
+    windows_s: list[float],
+    only: Only,
+    virtual: xr.Dataset | None = None,
+) -> pd.DataFrame:
+    """Make the windows table of a study: which windows train, validate and test.
+
+    Args:
+        study: Its protocol, windows and strides.
+        recordings: Real recordings, all of one length.
+        contents: What is in them, from :func:`cut_to_common_length`.
+        splits: Counts, the seed, and which windows train.
+        windows_s: Window lengths, where the study has none of its own.
+        only: Narrows the study.
+        virtual: Virtual recordings, all of whose windows train, where the study uses some.
+
+    Returns:
+        A row per window and fold; see :mod:`gyro_pipeline.conventions`.
+
+    Raises:
+        InputError: No window can be used, or the table breaks its protocol.
+    """
+    sensor, source = recordings.attrs["sensor"], recordings.attrs["source"]
+    rows = study_rows(study, sensor, source, windows_s, [0], only)
+    hashes = contents.set_index(_PLACE).content.to_dict()
+    drawn_from = [] if virtual is None else np.atleast_1d(virtual.attrs["drawn_from"]).tolist()
+    splits = splits.model_copy(update={"folds": study.folds or splits.folds})
+    tables = []
+    for protocol, window_s, stride_s in dict.fromkeys(
+        (row.protocol, row.window_s, row.window_stride_s) for row in rows
+    ):
+        size, stride = sizes_of(window_s, stride_s, recordings)
+        table = _real_windows(study, protocol, size, stride, recordings, contents, splits)
+        if virtual is not None:
+            drawn = _virtual_windows(virtual, size, splits)
+            table = pd.concat([table, drawn.merge(table[["fold"]].drop_duplicates(), how="cross")])
+        if protocol in APART:
+            check_table(table, APART[protocol], hashes, drawn_from)
+        place = {"protocol": protocol, "window_s": window_s, "window_stride_s": stride_s}
+        tables.append(table.assign(**place))
+    return pd.concat(tables, ignore_index=True)[WINDOWS_TABLE].astype(_COMPACT)
+
+
+def sizes_of(window_s: float, stride_s: float, recordings: xr.Dataset) -> tuple[int, int]:
+    """Samples of a window, and from the start of one to that of the next.
+
+    Raises:
+        InputError: A window is longer than a recording, or a stride is no sample.
+    """
+    rate_hz, sensor = recordings.attrs["rate_hz"], recordings.attrs["sensor"]
+    size = window_size(window_s, rate_hz, recordings.sizes["sample"], sensor)
+    stride = round(stride_s * rate_hz)
+    if stride < 1:
+        raise InputError(
+            f"{sensor}: a window stride of {stride_s:g} s is less than half a sample at "
+            f"{rate_hz:.5g} Hz; choose strides above {0.5 / rate_hz:.2g} s"
+        )
+    return size, stride
+
+
+def _real_windows(  # noqa: PLR0917 - what a table depends on
+    study: Study,
+    protocol: str,
+    size: int,
+    stride: int,
+    recordings: xr.Dataset,
+    contents: pd.DataFrame,
+    splits: Splits,
+) -> pd.DataFrame:
+    """Windows of real recordings in each fold: ``fold, role, origin, imu, recording, start``."""
+    samples, rate_hz = recordings.sizes["sample"], recordings.attrs["rate_hz"]
+    label = f"{study.experiment} {recordings.attrs['sensor']}, {size / rate_hz:g} s windows"
+    if losses := describe_losses(contents, samples, size):
+        logger.warning("%s: %s", label, losses)
+    split = _split(recordings) if study.recordings is None else None
+
+    def table(windows: pd.DataFrame) -> pd.DataFrame:
+        candidates = Candidates(windows, split, tested_imu(recordings), splits)
+        folds = [
+            windows[roles != UNUSED].assign(fold=fold, role=roles[roles != UNUSED])
+            for fold, roles in PROTOCOLS[protocol](candidates)
+        ]
+        return pd.concat(folds, ignore_index=True).assign(origin=ORIGIN_REAL)
+
+    if study.recordings is not None:
+        contents = _first_recordings(contents, samples, size, tested_imu(recordings), study)
+    tested = table(usable_windows(contents, samples, size, stride))
+    if not (tested.role == TEST).any():
+        raise InputError(
+            f"{label}: no test recording has one that can be used; lower windows_s of the study, "
+            "or bring recordings that lost fewer samples"
+        )
+    if splits.training_windows == "all" or stride != size:
+        return tested
+    first_only = splits.training_windows == "first"
+    training_stride = samples if first_only else round(splits.training_windows * rate_hz)
+    trained = table(usable_windows(contents, samples, size, max(training_stride, 1)))
+    return pd.concat([trained[trained.role != TEST], tested[tested.role == TEST]])
+
+
+def _first_recordings(
+    contents: pd.DataFrame, samples: int, size: int, tested: int, study: Study
+) -> pd.DataFrame:
+    """The first recordings of the tested IMU that have a window, as many as the study uses."""
+    own = contents[contents.imu == tested]
+    usable = usable_windows(own, samples, size, size).recording.unique()
+    return own[own.recording.isin(usable)].head(study.recordings)
+
+
+def _virtual_windows(virtual: xr.Dataset, size: int, splits: Splits) -> pd.DataFrame:
+    """Windows of the virtual recordings, all of which train."""
+    rate_hz, samples = virtual.attrs["rate_hz"], virtual.sizes["sample"]
+    starts = {"all": range(0, samples - size + 1, size), "first": range(1)}.get(
+        str(splits.training_windows)
+    ) or range(0, samples - size + 1, round(float(splits.training_windows) * rate_hz))
+    numbers = range(1, 1 + int(virtual.attrs["train_recordings"]))
+    index = pd.MultiIndex.from_product(
+        [virtual.imu.to_numpy(), numbers, starts], names=[*_PLACE, "start"]
+    )
+    return index.to_frame(index=False).assign(role=TRAIN, origin=ORIGIN_VIRTUAL)
+
+
+def _split(recordings: xr.Dataset) -> Mapping[int, str] | None:
+    """The role of each recording in a hold-out; None where few recordings make a k-fold."""
+    if "split" not in recordings.coords:
         return None
     numbers = recordings.recording.to_numpy().tolist()
-    return dict(zip(numbers, recordings.given_split.to_numpy().tolist(), strict=True))
-
-
-def _contents(recordings: xr.Dataset) -> dict[tuple[int, int], str]:
-    """A hash of each recording of each IMU."""
-    return {
-        (imu, number): data_hash(samples, None) for imu, number, samples in one_by_one(recordings)
-    }
+    return dict(zip(numbers, recordings.split.to_numpy().tolist(), strict=True))

@@ -2,49 +2,48 @@
 
 from kedro.pipeline import Node, Pipeline
 
-from gyro_pipeline.pipelines.windowed_splits.nodes import (
-    cut_to_shortest,
-    split_devices,
-    split_recordings,
-)
+from gyro_pipeline.pipelines.windowed_splits.nodes import cut_to_common_length, split_windows
 
 
-def create_cut_pipeline(sensor: str) -> Pipeline:
-    """One sensor's recordings, all of one length, and their biases."""
+def create_pipeline(study: str, sensor: str, virtual: bool) -> Pipeline:
+    """One sensor's recordings, all of one length, and the windows table of a study.
+
+    Args:
+        study: Its name.
+        sensor: Its name.
+        virtual: Whether virtual gyroscopes take part.
+    """
     stage = f"{sensor}.windowed_splits"
+    drawn = {"virtual": f"{sensor}.virtual_gyros.recordings"} if virtual else {}
     return Pipeline(
         [
             Node(
-                cut_to_shortest,
+                cut_to_common_length,
                 [
                     f"{sensor}.raw_logs.recordings",
                     f"{sensor}.ground_truth.bias",
                     f"{sensor}.raw_logs.quality",
                 ],
-                [f"{stage}.recordings", f"{stage}.bias"],
-                name=f"cut_to_shortest_{sensor}",
+                [f"{stage}.recordings", f"{stage}.bias", f"{stage}.contents"],
+                name=f"cut_to_common_length_{sensor}",
                 namespace="windowed_splits",
-            )
-        ]
-    )
-
-
-def create_pipeline(sensor: str, unseen_devices: bool = False) -> Pipeline:
-    """Recordings of one length of one sensor, and their roles.
-
-    Args:
-        sensor: Its name.
-        unseen_devices: Whether every IMU in turn is an unseen one.
-    """
-    made = (split_devices, "devices") if unseen_devices else (split_recordings, "roles")
-    return create_cut_pipeline(sensor) + Pipeline(
-        [
+                tags=[sensor],
+            ),
             Node(
-                made[0],
-                [f"{sensor}.windowed_splits.recordings", "params:splits"],
-                f"{sensor}.windowed_splits.{made[1]}",
-                name=f"{made[0].__name__}_{sensor}",
+                split_windows,
+                {
+                    "study": f"params:studies.{study}",
+                    "recordings": f"{stage}.recordings",
+                    "contents": f"{stage}.contents",
+                    "splits": "params:splits",
+                    "windows_s": "params:windows_s",
+                    "only": "params:only",
+                }
+                | drawn,
+                f"{study}.{sensor}.windowed_splits.windows",
+                name=f"split_windows_{study}_{sensor}",
                 namespace="windowed_splits",
-            )
+                tags=[study, sensor],
+            ),
         ]
     )

@@ -1,0 +1,218 @@
+"""Protocols: short functions that say which windows train, validate and test in each fold.
+
+The honest ones never part what belongs together: a recording (of all IMUs, which were recorded
+together) or a device has one role in a fold. The leaks of the leak study break this on purpose.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from gyro_pipeline.conventions import (
+    ALL_RECORDINGS,
+    BEST_EPOCH_ON_TEST,
+    BY_RECORDING,
+    HOLD_OUT,
+    K_FOLD,
+    LEAVE_ONE_DEVICE_OUT,
+    ORIGIN_REAL,
+    TEST,
+    TEST_IN_TRAINING,
+    TRAIN,
+    UNUSED,
+    VALIDATION,
+    WINDOW_SPLIT,
+    InputError,
+)
+from gyro_pipeline.parameters import Splits
+from gyro_pipeline.protocol.splits import choose_validation, deal
+
+Texts = NDArray[np.object_]
+Folds = Iterator[tuple[str, Texts]]
+"""The name of each fold, and the roles (n,) of all windows in it."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Windows that a protocol deals with.
+
+    Attributes:
+        windows: A row per usable window of a real recording: ``imu, recording, start``.
+        split: Role of each recording in a hold-out; None where few recordings make a k-fold.
+        tested: The IMU whose recordings test.
+        splits: Counts, and the seed of every deal.
+    """
+
+    windows: pd.DataFrame
+    split: Mapping[int, str] | None
+    tested: int
+    splits: Splits
+
+    @property
+    def numbers(self) -> list[int]:
+        """Recordings of the tested IMU that have a window, in order."""
+        of_tested = self.windows.recording[self.windows.imu == self.tested]
+        return sorted(of_tested.unique().tolist())
+
+    def roles(self, of_recordings: Mapping[int, str]) -> Texts:
+        """Roles of windows by their recordings; only the tested IMU tests."""
+        roles = self.windows.recording.map(of_recordings).fillna(UNUSED).to_numpy(object)
+        return np.where((roles == TEST) & (self.windows.imu != self.tested), UNUSED, roles)
+
+
+def by_recording(candidates: Candidates) -> Folds:
+    """Hold the test recordings of the split out; without a split, every recording tests once.
+
+    Recordings that the tested IMU lacks cannot test: in a k-fold they train in every fold.
+    """
+    if candidates.split is not None:
+        yield HOLD_OUT, candidates.roles(candidates.split)
+        return
+    numbers, splits = candidates.numbers, candidates.splits
+    if len(numbers) <= splits.leave_one_out_up_to:
+        parts = [[number] for number in numbers]
+    else:
+        dealt = deal(len(numbers), splits.folds, splits.split_seed)
+        parts = [sorted(numbers[place] for place in part) for part in dealt]
+    others = dict.fromkeys(candidates.windows.recording.unique().tolist(), TRAIN)
+    for fold, test in enumerate([*parts, []]):
+        rest = [number for number in numbers if number not in set(test)]
+        wanted = splits.fold_validation_recordings
+        validation = choose_validation(rest, wanted, splits.split_seed, fold + 1)
+        roles = others | dict.fromkeys(validation, VALIDATION) | dict.fromkeys(test, TEST)
+        yield f"fold {fold}" if test else ALL_RECORDINGS, candidates.roles(roles)
+
+
+def k_fold(candidates: Candidates) -> Folds:
+    """Deal recordings to folds; none validates."""
+    numbers, splits = candidates.numbers, candidates.splits
+    parts = deal(len(numbers), splits.folds, splits.split_seed)
+    for fold, part in enumerate([*parts, np.array([], np.intp)]):
+        test = {numbers[place] for place in part}
+        roles = {number: TEST if number in test else TRAIN for number in numbers}
+        yield f"fold {fold}" if test else ALL_RECORDINGS, candidates.roles(roles)
+
+
+def leave_one_device_out(candidates: Candidates) -> Folds:
+    """Let every IMU in turn be the unseen device: it tests, and all others train.
+
+    Where there is a split, only test recordings test and only the others train, so recordings made
+    together with a test recording never train. Without one, all of the device's recordings test
+    and all of the others' train: few recordings are all needed, and what IMUs that were recorded
+    together share is no bias. An IMU without a recording to test only trains.
+    """
+    imus, split = candidates.windows.imu.to_numpy(), candidates.split
+    held_out = np.ones(len(imus), bool)
+    if split is not None:
+        held_out = candidates.windows.recording.map(split).to_numpy() == TEST
+    kept = np.ones(len(imus), bool) if split is None else ~held_out
+    for unseen in np.unique(imus).tolist():
+        tests = held_out & (imus == unseen)
+        if tests.any():
+            trains = kept & (imus != unseen)
+            yield f"without IMU {unseen}", np.select([tests, trains], [TEST, TRAIN], UNUSED)
+    yield ALL_RECORDINGS, np.full(len(imus), TRAIN, object)
+
+
+def window_split(candidates: Candidates) -> Folds:
+    """Leak: windows are dealt at random, so test windows share recordings with training ones."""
+    of_tested = np.flatnonzero(candidates.windows.imu == candidates.tested)
+    splits = candidates.splits
+    for fold, part in enumerate(deal(len(of_tested), splits.folds, splits.split_seed)):
+        roles = np.where(candidates.windows.imu == candidates.tested, TRAIN, UNUSED).astype(object)
+        roles[of_tested[part]] = TEST
+        yield f"fold {fold}", roles
+
+
+def test_in_training(candidates: Candidates) -> Folds:
+    """Leak: all windows train, and all test."""
+    roles = np.where(candidates.windows.imu == candidates.tested, TRAIN, UNUSED).astype(object)
+    yield HOLD_OUT, roles
+    yield HOLD_OUT, np.where(roles == TRAIN, TEST, UNUSED)
+
+
+def best_epoch_on_test(candidates: Candidates) -> Folds:
+    """Leak: an honest k-fold by recording whose test windows also choose the best epoch."""
+    for fold, roles in k_fold(candidates):
+        if fold != ALL_RECORDINGS:
+            yield fold, roles
+            yield fold, np.where(roles == TEST, VALIDATION, UNUSED)
+
+
+PROTOCOLS: Mapping[str, Callable[[Candidates], Folds]] = {
+    BY_RECORDING: by_recording,
+    LEAVE_ONE_DEVICE_OUT: leave_one_device_out,
+    K_FOLD: k_fold,
+    WINDOW_SPLIT: window_split,
+    TEST_IN_TRAINING: test_in_training,
+    BEST_EPOCH_ON_TEST: best_epoch_on_test,
+}
+"""By the word that a study's ``protocol`` has."""
+
+
+def check_table(
+    table: pd.DataFrame,
+    apart: str,
+    contents: Mapping[tuple[int, int], str],
+    drawn_from: Sequence[int],
+) -> None:
+    """Refuse what an honest windows table may not have.
+
+    Args:
+        table: Columns ``fold, role, origin, imu, recording`` and more.
+        apart: What has one role in a fold: ``recording``, of all IMUs together, or ``imu``.
+        contents: A hash of the samples of each real recording, by IMU and number.
+        drawn_from: Real recordings from which the virtual ones were drawn.
+
+    Raises:
+        InputError: A recording or device has two roles in a fold; a recording is there twice, with
+            two roles; a virtual recording that trains was drawn from one that tests; or a fold that
+            tests has nothing to train on. It names the fold and the recordings.
+    """
+    places = table.drop_duplicates(["fold", "role", "origin", "imu", "recording"])
+    for fold, rows in places.groupby("fold", observed=True, sort=False):
+        real = rows[rows.origin == ORIGIN_REAL]
+        _refuse_two_roles(str(fold), real, apart)
+        _refuse_copies(str(fold), real, contents)
+        tests = set(real.recording[real.role == TEST])
+        seen = sorted(tests & set(drawn_from)) if len(real) < len(rows) else []
+        if seen:
+            raise InputError(
+                f"{fold}: virtual recordings that train were drawn from recordings "
+                f"{', '.join(map(str, seen))}, which test; draw them from training recordings alone"
+            )
+        if tests and not (rows.role == TRAIN).any():
+            raise InputError(
+                f"{fold}: no recording is left to train on; lower splits.test_fraction or bring "
+                "more recordings"
+            )
+
+
+def _refuse_two_roles(fold: str, rows: pd.DataFrame, apart: str) -> None:
+    if apart == "imu":  # of a device that tests; the others may train and validate
+        rows = rows.assign(role=np.where(rows.role == TEST, TEST, TRAIN))
+    roles = rows.drop_duplicates([apart, "role"]).groupby(apart, observed=True).role
+    for name, own in roles:
+        if len(own) > 1:
+            uses = rows[rows[apart] == name].groupby("role", observed=True).imu.unique()
+            shown = (f"{role} (IMU {', '.join(map(str, imus))})" for role, imus in uses.items())
+            raise InputError(
+                f"{fold}: {apart} {name} has more than one role: {', '.join(shown)}; a recording "
+                "trains, validates or tests, for all IMUs recorded together, and an unseen device "
+                "never trains"
+            )
+
+
+def _refuse_copies(fold: str, rows: pd.DataFrame, contents: Mapping[tuple[int, int], str]) -> None:
+    first: dict[str, tuple[int, int, str]] = {}
+    for imu, number, role in rows[["imu", "recording", "role"]].itertuples(index=False):
+        twin = first.setdefault(contents[imu, number], (imu, number, role))
+        if twin[2] != role and twin[:2] != (imu, number):
+            raise InputError(
+                f"{fold}: IMU {imu} recording {number} ({role}) holds the same samples as IMU "
+                f"{twin[0]} recording {twin[1]} ({twin[2]}); leave one of them out, or give both "
+                "the same role"
+            )
