@@ -105,6 +105,11 @@ def leave_one_device_out(candidates: Candidates) -> Folds:
     together share is no bias. An IMU without a recording to test only trains.
     """
     imus, split = candidates.windows.imu.to_numpy(), candidates.split
+    if len(np.unique(imus)) < 2:  # noqa: PLR2004
+        raise InputError(
+            f"unseen devices: expected at least 2 IMUs, got {len(np.unique(imus))}; bring "
+            "recordings of more, or leave the sensor out of the study"
+        )
     held_out = np.ones(len(imus), bool)
     if split is not None:
         held_out = candidates.windows.recording.map(split).to_numpy() == TEST
