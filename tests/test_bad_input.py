@@ -264,6 +264,7 @@ CASES = {
     "key": Case(("--env=mine", "--params=trainin.epochs=3"), ("trainin: unknown key",)),
     "constant": Case(("--env=mine",), ("IMU 1 recording 7", "axis z"), with_one((6, 2), 0.25)),
     "pickled": Case(("--env=mine",), ("never loaded",), np.array([{"a": 1}])),
+    "node": Case(("--env=mine", "--nodes=bias_memsense"), ("['ground_truth.bias_memsense']",)),
     "foreign": Case(("--env=mine",), ("expected an MLflow store",), spoil=foreign),
 }
 

@@ -1,25 +1,33 @@
 """What happens around a run: checks before it, provenance for its runs, directions after it."""
 
+import getpass
 import hashlib
 import logging
 import platform
+import shlex
 import subprocess
 import sys
+from collections import defaultdict
+from collections.abc import Iterable
 from importlib.metadata import version
 from pathlib import Path
+from traceback import walk_tb
 from types import TracebackType
 from typing import Any
 
+import kedro
 from kedro.framework.context import KedroContext
 from kedro.framework.hooks import hook_impl
+from kedro.framework.session import KedroSession
 from kedro.io import CatalogProtocol, DatasetError
 from kedro.pipeline import Node, Pipeline
+from kedro.runner import ParallelRunner
 from pydantic import ValidationError
 
 from gyro_pipeline import pipeline_registry
 from gyro_pipeline.conventions import InputError, Missing
 from gyro_pipeline.datasets.atomic import check_writable
-from gyro_pipeline.datasets.tracked_runs import TrackedRuns
+from gyro_pipeline.datasets.tracked_runs import USER_INTERFACE, TrackedRuns, run_link
 from gyro_pipeline.parameters import Parameters, ReaderOptions
 from gyro_pipeline.studies import DEFAULT, check_possible
 
@@ -27,6 +35,35 @@ logger = logging.getLogger(__name__)
 
 _OTHER_ARGUMENTS = "must only contain arguments valid for the constructor"
 """In Kedro's words: a key of a catalog entry is unknown, or lacking."""
+
+
+class Session(KedroSession):
+    """A session that refuses ways to run which cannot end well, before anything is loaded."""
+
+    def run(self, *arguments: Any, **options: Any) -> dict[str, Any]:
+        """Run pipelines, as :meth:`kedro.framework.session.KedroSession.run` does.
+
+        Raises:
+            InputError: The runner or an option is of no use here.
+        """
+        sys.excepthook = _explain
+        runner = options.get("runner")
+        if options.get("only_missing_outputs"):
+            raise InputError(
+                "--only-missing-outputs: a run store is there or not, whatever it lacks; type "
+                "kedro run without it, which makes the runs that are not FINISHED, and no others"
+            )
+        if isinstance(runner, ParallelRunner):
+            raise InputError(
+                "--runner=ParallelRunner: each node shares out its own work; type kedro run "
+                "without it, and --params=execution.workers=N for N processes"
+            )
+        if getattr(runner, "_is_async", False):
+            raise InputError(
+                "--async: results are saved one by one as they are made, which Kedro cannot do in "
+                "the background; type kedro run without it"
+            )
+        return super().run(*arguments, **options)
 
 
 class Preflight:
@@ -82,8 +119,9 @@ class Preflight:
         for name in pipeline.all_outputs() & {"reporting.report"}:
             for path in _paths(catalog.get(name)):
                 logger.info("report:             %s", _relative(path, self._project))
-        if folders:
-            logger.info("compare runs:       mlflow ui")
+        for link in _run_links(catalog.get(name) for name in sorted(pipeline.datasets())):
+            start = "mlflow ui, then " if link.startswith(USER_INTERFACE) else ""
+            logger.info("compare runs:       %s%s", start, link)
         logger.info("see the lineage:    kedro viz")
 
 
@@ -104,6 +142,9 @@ class Provenance:
             "lock_hash": _file_hash(project / "requirements.lock"),
             "mlflow.source.git.commit": _git(project, "rev-parse", "HEAD"),
             "git_dirty": str(bool(_git(project, "status", "--porcelain"))),
+            "mlflow.user": _user(),
+            "mlflow.source.name": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+            "mlflow.source.type": "LOCAL",
         }
         for name in pipeline.datasets():
             dataset = catalog.get(name)
@@ -131,8 +172,24 @@ def _check_logs_are_read(
         )
 
 
+def _run_links(datasets: Iterable[Any]) -> list[str]:
+    """Where to look at the runs of each study."""
+    by_study = defaultdict(list)
+    for dataset in datasets:
+        if isinstance(dataset, TrackedRuns) and dataset.study is not None:
+            by_study[dataset.study].append(dataset)
+    return [link for runs in by_study.values() if (link := run_link(runs)) is not None]
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # a container may have a number and no name
+        return "unknown"
+
+
 def _explain(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Print what is wrong with an input without the way Kedro took to find it."""
+    """Print what is wrong with an input or a command, without the way Kedro took to find it."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, InputError):
         cause = cause.__cause__
@@ -140,8 +197,18 @@ def _explain(kind: type[BaseException], error: BaseException, trace: TracebackTy
         logger.error("error: %s", cause)
     elif isinstance(error, DatasetError) and _OTHER_ARGUMENTS in str(error):
         logger.error("error: catalog: %s", " ".join(str(error).split()))
+    elif isinstance(error, ValueError) and _is_about_the_command(trace):
+        logger.error("error: %s", " ".join(str(error).split()))
     else:
         sys.__excepthook__(kind, error, trace)
+
+
+def _is_about_the_command(trace: TracebackType | None) -> bool:
+    """Whether Kedro itself refused what it was asked for, before a node ran."""
+    files = [Path(frame.f_code.co_filename) for frame, _ in walk_tb(trace)]
+    kedros = Path(kedro.__file__).parent
+    in_runner = any(file.is_relative_to(kedros / "runner") for file in files)
+    return bool(files) and files[-1].is_relative_to(kedros) and not in_runner
 
 
 def _explained(error: ValidationError) -> str:

@@ -1,7 +1,8 @@
 """Kedro settings (https://docs.kedro.org)."""
 
-from gyro_pipeline.hooks import Preflight, Provenance
+from gyro_pipeline.hooks import Preflight, Provenance, Session
 
+SESSION_CLASS = Session
 HOOKS = (Preflight(), Provenance())
 
 CONFIG_LOADER_ARGS = {

@@ -20,6 +20,10 @@ _STUDIES = "select experiment_id, name, lifecycle_stage, artifact_location from 
 _COUNTS = "select lifecycle_stage, count(*) from runs where experiment_id = ? group by 1"
 _MOVE_STUDY = "update experiments set artifact_location = ? where experiment_id = ?"
 _MOVE_RUNS = "update runs set artifact_uri = ? || substr(artifact_uri, ?) where experiment_id = ?"
+_MOVE_MODELS = (
+    "update logged_models set artifact_location = ? || substr(artifact_location, ?) "
+    "where experiment_id = ?"
+)
 _MB = 1e6
 
 
@@ -64,7 +68,7 @@ def relocate(store: Path, location: str) -> int:
     Raises:
         InputError: Artifacts are not there.
     """
-    base = location.rstrip("/") if _is_address(location) else Path(location).resolve().as_uri()
+    base = location.rstrip("/") if _is_address(location) else Path(location).absolute().as_uri()
     with closing(sqlite3.connect(f"{store.resolve().as_uri()}?mode=rw", uri=True)) as db, db:
         told = 0
         for number, name, _, old in db.execute(_STUDIES).fetchall():
@@ -73,6 +77,7 @@ def relocate(store: Path, location: str) -> int:
             folder = _folder(new)
             if runs and folder is not None and not folder.is_dir():
                 raise InputError(f"{folder}: artifacts of {name} are not there; move them first")
+            db.execute(_MOVE_MODELS, [new, len(old) + 1, number])
             db.execute(_MOVE_STUDY, [new, number])
             told += runs
     return told

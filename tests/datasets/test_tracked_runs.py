@@ -1,3 +1,4 @@
+import logging
 import os
 import shutil
 import signal
@@ -5,21 +6,33 @@ import sqlite3
 import subprocess
 import sys
 from functools import partial
+from importlib import import_module
 from pathlib import Path
+from urllib.parse import parse_qs
 
+import mlflow
 import numpy as np
 import pandas as pd
+import psutil
 import pytest
-import torch
 from kedro.io import DatasetError
 from mlflow import MlflowClient
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets import tracked_runs
-from gyro_pipeline.datasets.tracked_runs import TrackedRuns
-from gyro_pipeline.tracking import EvaluatedRun, TrainedRun
+from gyro_pipeline.datasets.tracked_runs import TrackedRuns, run_link
+from gyro_pipeline.store import relocate
+from gyro_pipeline.tracking import EvaluatedRun, FittedRun, RunIdentity
 
 STARTED_MS, ENDED_MS = 1_700_000_000_000, 1_700_000_060_000
+NAME = "dot constant 3+0 10 s seed 0"
+MODEL = "hold-out"
+WINDOWS = np.random.default_rng(0).normal(0, 0.05, (2, 3, 40))
+
+
+sys.path.insert(0, str(Path(__file__).with_name("outside")))
+Constant = import_module("constant").Constant
+Unwritable = import_module("constant").Unwritable
 
 
 @pytest.fixture(scope="session")
@@ -51,17 +64,32 @@ def params(**changes):
         "virtual_gyros": 0,
         "window_s": 10.0,
         "seed": 0,
-        "fold": -1,
-        "estimator": "cnn",
+        "estimator": "constant",
     }
     return given | changes
 
 
-def trained(tags=None, started_ms=STARTED_MS, history=None, artifacts=None, **changes):
+def fitted(tags=None, fold=MODEL, folds=(MODEL,), estimator=None, **changes):
+    started_ms = changes.pop("started_ms", STARTED_MS)
     given = params(**changes)
-    tags = {"fingerprint": "f00d"} | (tags or {})
-    return TrainedRun(
-        given["study"], given, tags, started_ms, ENDED_MS, history, artifacts=artifacts or {}
+    run = RunIdentity(
+        study=given["study"],
+        fingerprint=f"f00d{given['seed']}",
+        params=given,
+        tags=tags or {},
+        folds=folds,
+        name=f"dot constant 3+0 10 s seed {given['seed']}",
+        note="It was trained on this and tested on that.",
+    )
+    return FittedRun(
+        run=run,
+        fold=fold,
+        estimator=estimator or Constant(),
+        started_ms=started_ms,
+        ended_ms=ENDED_MS,
+        is_model=fold == MODEL,
+        example=WINDOWS,
+        dataset={"name": "dot", "digest": "abc", "source": "simulated", "recordings": "83"},
     )
 
 
@@ -77,37 +105,123 @@ def statuses(store, study="real2real"):
     return {run.info.run_name: run.info.status for run in client.search_runs([experiment])}
 
 
-def test_a_trained_run_waits_for_its_evaluation(store):
-    tracked(store).save(
-        trained({"data_hash": "abc"}, history=history(3), artifacts={"history.csv": history(3)})
-    )
+def test_a_fitted_run_waits_for_its_evaluation(store):
+    tracked(store).save(fitted({"data_hash": "abc"}, estimator=Constant(0.1, history(3))))
     (run,) = tracked(store).load()
+    assert run.trained
     assert not run.finished
     assert run.study == "real2real"
     assert run.started_ms == STARTED_MS
     assert run.params == {key: str(value) for key, value in params().items()}
     assert run.tags["data_hash"] == "abc"
-    assert run.fingerprint == "f00d"
+    assert run.fingerprint == "f00d0"
+    assert run.fits == {MODEL}
+    assert run.load_fit(MODEL).bias == 0.1
     assert run.metrics == {"train_loss": pytest.approx(1 / 3), "val_loss": pytest.approx(5 / 6)}
-    assert statuses(store) == {"dot 3+0 10 s seed 0": "RUNNING"}
+    pd.testing.assert_frame_equal(run.load("history.csv"), history(3), check_exact=True)
+    assert statuses(store) == {NAME: "RUNNING"}
 
 
-@pytest.mark.parametrize(
-    ("changes", "name"),
-    [
-        ({"real_gyros": 12, "virtual_gyros": 24, "seed": 4}, "dot 12+24 10 s seed 4"),
-        ({"fold": 7, "window_s": 2.5}, "dot 3+0 2.5 s seed 0 fold 7"),
-        ({"estimator": "mean", "real_gyros": 0, "window_s": 30.0}, "dot mean 30 s"),
-    ],
-)
-def test_the_name_of_a_run_tells_what_it_is(store, changes, name):
-    tracked(store).save(trained(**changes))
-    assert statuses(store) == {name: "RUNNING"}
+def test_what_a_user_of_mlflow_looks_for_is_there(store):
+    tracked(store).save(fitted())
+    client = MlflowClient(f"sqlite:///{store}")
+    experiment = client.get_experiment_by_name("real2real")
+    assert "One run is one row of the study" in experiment.tags["mlflow.note.content"]
+    (run,) = client.search_runs([experiment.experiment_id])
+    tags = run.data.tags
+    assert tags["mlflow.note.content"] == "It was trained on this and tested on that."
+    assert (tags["study"], tags["sensor"], tags["estimator"]) == ("real2real", "dot", "constant")
+    assert tags["recommended"] == "True"
+    (dataset,) = run.inputs.dataset_inputs
+    assert (dataset.dataset.name, dataset.dataset.digest) == ("dot", "abc")
+    assert '"recordings": "83"' in dataset.dataset.profile
+    (model,) = run.outputs.model_outputs
+    assert client.get_logged_model(model.model_id).status == "READY"
+
+
+@pytest.fixture
+def elsewhere(store):
+    """The store as a notebook sees it."""
+    mlflow.set_tracking_uri(f"sqlite:///{store}")
+    yield
+    mlflow.set_tracking_uri(None)
+
+
+def test_the_model_of_a_run_is_loaded_and_applied_to_windows(store, elsewhere):
+    tracked(store).save(fitted(estimator=Constant(0.25)))
+    (run,) = tracked(store).load()
+    model = mlflow.pyfunc.load_model(f"runs:/{run.run_id}/model")
+    estimates = model.predict(WINDOWS)
+    np.testing.assert_array_equal(estimates["bias_dps"], np.full((2, 3), 0.25))
+    np.testing.assert_array_equal(estimates["sigma_dps"], np.full((2, 3), 0.5))
+    later = model.predict(WINDOWS, params={"target": "recording_mean", "start_s": [1.0, 2.0]})
+    np.testing.assert_array_equal(later["bias_dps"][:, 0], [1.25, 2.25])
+    np.testing.assert_allclose(model.input_example, WINDOWS[:1], atol=1e-6)
+    requirements = Path(mlflow.pyfunc.get_model_dependencies(model_uri(run)))
+    assert "gyro-pipeline==" in requirements.read_text()
+
+
+def model_uri(run):
+    return f"runs:/{run.run_id}/model"
+
+
+APPLY = """
+import sys
+import mlflow, numpy
+mlflow.set_tracking_uri(sys.argv[1])
+for uri in sys.argv[2:]:
+    print(*mlflow.pyfunc.load_model(uri).predict(numpy.zeros((1, 3, 9)))["bias_dps"][0])
+"""
+
+
+def test_the_model_of_a_class_from_outside_the_package_brings_its_code(
+    store, tmp_path, monkeypatch
+):
+    monkeypatch.syspath_prepend(tmp_path / "code")
+    source = sys.modules["constant"].__file__
+    kinds = ("theirs_file", "theirs_package.__init__", "theirs_folder.inner")
+    for seed, module in enumerate(kinds):
+        file = tmp_path / "code" / f"{module.replace('.', '/')}.py"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(source, file)
+        kind = import_module(module.removesuffix(".__init__")).Constant
+        tracked(store).save(fitted(estimator=kind(float(seed)), seed=seed))
+    models = [model_uri(run) for run in reversed(tracked(store).load())]
+    command = [sys.executable, "-c", APPLY, f"sqlite:///{store}", *models]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    said = {line.split()[0] for line in done.stdout.splitlines()}
+    assert said == {"0.0", "1.0", "2.0"}, done.stderr
+
+
+FOLDS = ("fold 0", "without IMU 3", MODEL)
+
+
+def test_the_fits_of_a_run_are_saved_as_they_end(store):
+    runs = tracked(store)
+    for number, fold in enumerate(FOLDS):
+        assert not any(run.trained for run in tracked(store).load())
+        runs.save(fitted(fold=fold, folds=FOLDS, estimator=Constant(number)))
+    (run,) = tracked(store).load()
+    assert run.trained
+    assert run.fits == set(FOLDS)
+    assert [run.load_fit(fold).bias for fold in FOLDS] == [0, 1, 2]
+    stored = sorted(path.parent.name for path in store.parent.rglob("estimator.pkl"))
+    assert stored == ["fit", "fold_0", "without_IMU_3"]  # each once
+
+
+def test_runs_of_other_rows_are_told_apart_while_they_are_fitted(store):
+    runs = tracked(store)
+    for fold in FOLDS:
+        for seed in range(2):
+            runs.save(fitted(fold=fold, folds=FOLDS, seed=seed))
+    assert [run.fits for run in tracked(store).load()] == [set(FOLDS)] * 2
+    runs.save(fitted())  # asked for once more, where what was trained is left as it is
+    assert len(tracked(store).load()) == 3
 
 
 @pytest.mark.parametrize(("epochs", "points"), [(7, 7), (50, 50), (120, 40), (1200, 50)])
 def test_curves_are_thinned_and_keep_the_last_epoch(store, epochs, points):
-    tracked(store).save(trained(history=history(epochs)))
+    tracked(store).save(fitted(estimator=Constant(0, history(epochs))))
     (run,) = tracked(store).load()
     client = MlflowClient(f"sqlite:///{store}")
     for name in ("train_loss", "val_loss"):
@@ -123,7 +237,7 @@ def test_curves_are_thinned_and_keep_the_last_epoch(store, epochs, points):
 
 def test_an_evaluated_run_is_finished_and_keeps_what_it_had(store):
     runs = tracked(store)
-    runs.save(trained(history=history(3), artifacts={"history.csv": history(3)}))
+    runs.save(fitted(estimator=Constant(0, history(3))))
     (waiting,) = runs.load()
     errors = pd.DataFrame({"recording": [81, 81], "error_dps": [1e-3, -2e-3]})
     metrics = {"test_rmse_dps": 1.25e-3, "time_saving_pct": -12.5}
@@ -135,7 +249,7 @@ def test_an_evaluated_run_is_finished_and_keeps_what_it_had(store):
     assert run.run_id == waiting.run_id
     assert run.metrics == dict(waiting.metrics) | metrics
     assert run.tags["evaluated_with"] == "x1"
-    assert run.fingerprint == "f00d"
+    assert run.fingerprint == "f00d0"
     pd.testing.assert_frame_equal(run.load("errors.parquet"), errors)
     pd.testing.assert_frame_equal(run.load("history.csv"), history(3))
     info = MlflowClient(f"sqlite:///{store}").get_run(run.run_id).info
@@ -145,7 +259,7 @@ def test_an_evaluated_run_is_finished_and_keeps_what_it_had(store):
 def test_a_second_evaluation_replaces_what_is_shown(store):
     """Also by a lower value: of equal times MLflow would show the larger one."""
     runs = tracked(store)
-    runs.save(trained())
+    runs.save(fitted())
     (run,) = runs.load()
     for rmse, judged_with in ((2e-3, "first"), (1e-3, "second")):
         errors = pd.DataFrame({"error_dps": [rmse]})
@@ -172,7 +286,7 @@ def test_loading_narrows_to_study_sensor_and_source(store):
         for source in ("simulated", "published")
     ]
     for study, sensor, source in everything:
-        tracked(store).save(trained(study=study, sensor=sensor, source=source))
+        tracked(store).save(fitted(study=study, sensor=sensor, source=source))
 
     def found(**only):
         return sorted(
@@ -193,7 +307,7 @@ def test_loading_narrows_to_study_sensor_and_source(store):
 
 def test_each_study_is_an_experiment_with_its_artifacts_beside_the_store(store):
     for study in ("real2real", "augmentation"):
-        tracked(store).save(trained(study=study, artifacts={"history.csv": history(1)}))
+        tracked(store).save(fitted(study=study, estimator=Constant(0, history(1))))
     experiments = {e.name: e for e in MlflowClient(f"sqlite:///{store}").search_experiments()}
     assert {"real2real", "augmentation"} <= set(experiments)
     for study in ("real2real", "augmentation"):
@@ -204,14 +318,14 @@ def test_each_study_is_an_experiment_with_its_artifacts_beside_the_store(store):
 
 def test_runs_come_newest_first(store):
     for seed, started_ms in enumerate([2000, 3000, 1000]):
-        tracked(store).save(trained(seed=seed, started_ms=started_ms))
+        tracked(store).save(fitted(seed=seed, started_ms=started_ms))
     assert [run.params["seed"] for run in tracked(store).load()] == ["1", "0", "2"]
 
 
 def test_all_runs_are_found_where_the_store_answers_in_pages(store):
     runs = tracked(store)
     for seed in range(5):
-        runs.save(trained(seed=seed))
+        runs.save(fitted(seed=seed))
     runs._client.search_runs = partial(runs._client.search_runs, max_results=2)
     assert sorted(run.params["seed"] for run in runs.load()) == list("01234")
 
@@ -225,7 +339,7 @@ def test_a_store_without_runs_is_empty(store, tmp_path):
 def test_new_runs_carry_the_provenance_and_their_own_tags_win(store):
     runs = tracked(store)
     runs.provenance |= {"kedro_run": "2024-09-01T00.00.00", "torch": "2.13.0"}
-    runs.save(trained({"torch": "of the run itself"}))
+    runs.save(fitted({"torch": "of the run itself"}))
     (run,) = tracked(store).load()
     assert run.tags["kedro_run"] == "2024-09-01T00.00.00"
     assert run.tags["torch"] == "of the run itself"
@@ -233,13 +347,6 @@ def test_new_runs_carry_the_provenance_and_their_own_tags_win(store):
 
 def test_artifacts_come_back_as_they_were(store):
     generator = np.random.default_rng(0)
-    weights = {
-        "architecture": {"gyroscopes": 3, "window": 1083},
-        "scaling": {"centre": torch.rand(3, dtype=torch.float64), "input_scale": 1 / 3},
-        "last": {"convolution.weight": torch.rand(8, 3, 10)},
-        "best": None,
-        "best_epoch": 17,
-    }
     errors = pd.DataFrame(
         {
             "recording": [81, 82],
@@ -248,108 +355,166 @@ def test_artifacts_come_back_as_they_were(store):
             "error_dps": generator.normal(size=2).astype(np.float32),
         }
     )
-    losses = pd.DataFrame({"epoch": range(1, 501), "train_loss": generator.lognormal(size=500)})
-    given = {
-        "weights.pt": weights,
-        "errors.parquet": errors,
-        "history.csv": losses,
-        "notes.json": {"ceiling": [1 / 3, None, "deg/s"]},
-    }
-    tracked(store).save(trained(artifacts=given))
+    scores = pd.DataFrame({"score": ["accuracy_gain_pct"], "value": generator.normal(size=1)})
+    tracked(store).save(fitted())
     (run,) = tracked(store).load()
-    stored = run.load("weights.pt")
-    for path in (("scaling", "centre"), ("last", "convolution.weight")):
-        before, after = (tree[path[0]].pop(path[1]) for tree in (weights, stored))
-        assert after.dtype == before.dtype
-        assert torch.equal(after, before)
-    assert stored == weights
+    given = {"errors.parquet": errors, "scores.csv": scores}
+    tracked(store).save(EvaluatedRun(run.run_id, {}, {}, given))
     pd.testing.assert_frame_equal(run.load("errors.parquet"), errors, check_exact=True)
-    pd.testing.assert_frame_equal(run.load("history.csv"), losses, check_exact=True)
-    assert run.load("notes.json") == given["notes.json"]
-
-
-def test_weights_that_could_run_code_are_not_loaded(store, tmp_path):
-    tracked(store).save(trained(artifacts={"weights.pt": {"last": Path("/tmp")}}))
-    (run,) = tracked(store).load()
-    with pytest.raises(Exception, match="Weights only load failed"):
-        run.load("weights.pt")
+    pd.testing.assert_frame_equal(run.load("scores.csv"), scores, check_exact=True)
 
 
 KILLED = """
 import os, signal, sys
-from gyro_pipeline.datasets import tracked_runs
-from gyro_pipeline.datasets.tracked_runs import TrackedRuns
-from gyro_pipeline.tracking import TrainedRun
+sys.path.insert(0, sys.argv[2])
+from test_tracked_runs import MODEL, Constant, fitted, tracked
 
-class Fatal:
-    def to_parquet(self, path):
+class Fatal(Constant):
+    def save(self, folder):
         os.kill(os.getpid(), signal.SIGKILL)
 
-runs = TrackedRuns(sys.argv[1], "simulated")
-for seed, artifacts in enumerate([{}, {"errors.parquet": Fatal()}]):
-    params = {"sensor": "dot", "source": "simulated", "real_gyros": 3, "virtual_gyros": 0,
-              "window_s": 10, "seed": seed, "fold": -1, "estimator": "cnn"}
-    runs.save(TrainedRun("real2real", params, {"fingerprint": "f00d"}, 1, 2, artifacts=artifacts))
+runs = tracked(sys.argv[1])
+runs.save(fitted(seed=0))
+for fold, estimator in (("fold 0", Constant(0.5)), ("fold 1", Fatal())):
+    runs.save(fitted(fold=fold, folds=("fold 0", "fold 1", MODEL), seed=1, estimator=estimator))
 """
 
 
-def test_of_a_killed_process_trained_runs_wait_and_half_written_ones_end(store):
-    done = subprocess.run([sys.executable, "-c", KILLED, str(store)], check=False, timeout=120)
+def test_after_a_kill_trained_runs_are_evaluated_and_others_continued(store):
+    command = [sys.executable, "-c", KILLED, str(store), str(Path(__file__).parent)]
+    done = subprocess.run(command, check=False, timeout=120)
     assert done.returncode == -signal.SIGKILL
-    waiting, half_written = "dot 3+0 10 s seed 0", "dot 3+0 10 s seed 1"
-    assert statuses(store) == {waiting: "RUNNING", half_written: "RUNNING"}
-    (run,) = tracked(store).load()
-    assert run.params["seed"] == "0"
-    assert not run.finished
-    assert statuses(store) == {waiting: "KILLED", half_written: "KILLED"}
-    tracked(store).save(EvaluatedRun(run.run_id, {"test_rmse_dps": 1e-3}, {}, {}))
-    assert statuses(store) == {waiting: "FINISHED", half_written: "KILLED"}
+    waiting, unfinished = NAME, NAME.replace("seed 0", "seed 1")
+    assert statuses(store) == {waiting: "RUNNING", unfinished: "RUNNING"}
+    runs = {run.params["seed"]: run for run in tracked(store).load()}
+    assert statuses(store) == {waiting: "KILLED", unfinished: "KILLED"}
+    assert [runs[seed].trained for seed in "01"] == [True, False]
+    assert runs["1"].fits == {"fold 0"}
+    assert runs["1"].load_fit("fold 0").bias == 0.5
+    tracked(store).save(EvaluatedRun(runs["0"].run_id, {"rmse_mdps": 1.0}, {}, {}))
+    again = tracked(store)
+    for fold in ("fold 1", MODEL):
+        again.save(fitted(fold=fold, folds=("fold 0", "fold 1", MODEL), seed=1))
+    assert statuses(store) == {waiting: "FINISHED", unfinished: "RUNNING"}
+    continued = next(run for run in tracked(store).load() if run.params["seed"] == "1")
+    assert continued.run_id == runs["1"].run_id
+    assert continued.trained
+    assert continued.fits == {"fold 0", "fold 1", MODEL}
 
 
-def half_written(store, seed=0):
-    """A run that this process could not write to its end; its id and owner."""
-    with pytest.raises(DatasetError):
-        tracked(store).save(trained(seed=seed, artifacts={"errors.parquet": "no table"}))
+def unfinished(store, seed=0, **owner):
+    """A run that lacks a fit, and the owner it is left with: host, pid, started."""
+    tracked(store).save(fitted(fold="fold 0", folds=("fold 0", MODEL), seed=seed))
     client = MlflowClient(f"sqlite:///{store}")
     experiment = client.get_experiment_by_name("real2real").experiment_id
     newest, *_ = client.search_runs([experiment], f"params.seed = '{seed}'")
-    return newest.info.run_id, newest.data.tags["process"].split()
+    before = dict(zip(("host", "pid", "started"), newest.data.tags["process"].split(), strict=True))
+    client.set_tag(newest.info.run_id, "process", " ".join((before | owner).values()))
+    return newest.info.run_id
 
 
-def test_a_half_written_run_of_a_living_process_is_left_alone(store):
-    half_written(store)
+def test_the_unfinished_run_of_another_living_process_is_left_alone(store):
+    parent = psutil.Process(os.getppid())
+    theirs = unfinished(store, pid=str(parent.pid), started=str(parent.create_time()))
     assert tracked(store).load() == []
-    assert statuses(store) == {"dot 3+0 10 s seed 0": "RUNNING"}
+    assert statuses(store) == {NAME: "RUNNING"}
+    tracked(store).save(fitted())
+    (mine,) = tracked(store).load()
+    assert mine.run_id != theirs
+
+
+@pytest.fixture(scope="session")
+def gone():
+    """The number of a process that has ended."""
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    return str(ended.pid)
 
 
 @pytest.mark.parametrize(
-    ("change", "status"),
+    ("owner", "status"),
     [
-        ({1: "{gone}"}, "KILLED"),
-        ({2: "1.5"}, "KILLED"),  # another process got its number
-        ({0: "elsewhere", 1: "{gone}"}, "RUNNING"),  # cannot be known from here
+        ({"pid": "gone"}, "KILLED"),
+        ({"started": "1.5"}, "KILLED"),  # another process got its number
+        ({"host": "elsewhere", "pid": "gone"}, "RUNNING"),  # cannot be known from here
     ],
 )
-def test_whose_process_is_gone_is_told_by_host_number_and_start(store, change, status):
-    run_id, owner = half_written(store)
-    gone = subprocess.Popen([sys.executable, "-c", ""])
-    gone.wait()
-    for place, value in change.items():
-        owner[place] = value.format(gone=gone.pid)
-    MlflowClient(f"sqlite:///{store}").set_tag(run_id, "process", " ".join(owner))
-    assert tracked(store).load() == []
-    assert statuses(store) == {"dot 3+0 10 s seed 0": status}
+def test_whose_process_is_gone_is_told_by_host_number_and_start(store, gone, owner, status):
+    run_id = unfinished(store, **{key: gone if at == "gone" else at for key, at in owner.items()})
+    assert [run.run_id for run in tracked(store).load()] == [run_id] * (status == "KILLED")
+    assert statuses(store) == {NAME: status}
 
 
-def test_half_written_runs_end_whatever_is_loaded_and_however_many_there_are(store):
+def test_unfinished_runs_end_whatever_is_loaded_and_however_many_there_are(store):
     for seed in range(3):
-        run_id, owner = half_written(store, seed)
-        owner[2] = "1.5"
-        MlflowClient(f"sqlite:///{store}").set_tag(run_id, "process", " ".join(owner))
+        unfinished(store, seed, started="1.5")
     runs = tracked(store, source="published", sensor="ng")
     runs._client.search_runs = partial(runs._client.search_runs, max_results=2)
     assert runs.load() == []
     assert set(statuses(store).values()) == {"KILLED"}
+
+
+def test_a_run_that_is_not_described_yet_is_described_when_it_is_continued(store):
+    """As a kill leaves it that comes before its parameters are written."""
+    run_id = unfinished(store)
+    with sqlite3.connect(store) as connection:
+        connection.execute("delete from params")
+    connection.close()
+    assert tracked(store).load() == []
+    tracked(store).save(fitted(folds=("fold 0", MODEL)))
+    (run,) = tracked(store).load()
+    assert (run.run_id, run.fits, run.trained) == (run_id, {"fold 0", MODEL}, True)
+    assert run.params["sensor"] == "dot"
+
+
+def test_a_fit_that_cannot_be_written_is_not_taken_for_stored(store):
+    with pytest.raises(DatasetError, match="not to be written"):
+        tracked(store).save(fitted(estimator=Unwritable()))
+    (run,) = tracked(store).load()
+    assert (run.fits, run.trained) == (set(), False)
+    tracked(store).save(fitted(estimator=Constant(3)))
+    (run,) = tracked(store).load()
+    assert run.load_fit(MODEL).bias == 3
+
+
+def test_runs_of_an_older_layout_are_counted_once_and_never_read(store, caplog):
+    client = MlflowClient(f"sqlite:///{store}")
+    experiment = client.create_experiment("real2real")
+    for number in range(3):
+        client.create_run(experiment, tags={"fingerprint": f"f00d{number}", "trained": "1"})
+    client.create_run(experiment, tags={"mlflow.note.content": "of somebody else"})
+    tracked(store).save(fitted())
+    with caplog.at_level(logging.WARNING):
+        for _ in range(2):
+            assert len(tracked(store, study="real2real").load()) == 1
+    assert caplog.messages == ["3 runs of an older layout are not read"]
+
+
+def test_a_link_opens_the_runs_of_a_study_best_first(store, monkeypatch):
+    everywhere = TrackedRuns(str(store), study="real2real")
+    assert run_link([everywhere]) is None
+    tracked(store).save(fitted())
+    sensors = [tracked(store, study="real2real", sensor=sensor) for sensor in ("dot", "ng")]
+    address, _, query = run_link([everywhere, *sensors]).partition("?")
+    assert address == "http://127.0.0.1:5000/#/experiments/1/runs"
+    asked = {key: value for key, (value,) in parse_qs(query).items()}
+    assert asked["searchFilter"] == "tags.layout = '2' and params.source = 'simulated'"
+    assert asked["orderByKey"] == "metrics.`accuracy_gain_pct`"
+    assert "and+params.sensor+%3D+%27dot%27&" in run_link([everywhere, sensors[0]])
+
+
+def test_artifacts_are_never_written_to_where_a_copy_is_from(store, tmp_path):
+    tracked(store).save(fitted())
+    copy = tmp_path / "a copy" / "mlflow.db"
+    shutil.copytree(store.parent / "mlruns", copy.parent / "mlruns")
+    shutil.copy(store, copy)
+    for use in (TrackedRuns.load, lambda runs: runs.save(fitted(seed=1))):
+        with pytest.raises(DatasetError, match="--artifacts-in mlruns"):
+            use(tracked(copy))
+    relocate(copy, str(copy.parent / "mlruns"))
+    tracked(copy).save(fitted(seed=1))
+    shutil.rmtree(store.parent / "mlruns")
+    assert [run.load_fit(MODEL).bias for run in tracked(copy).load()] == [0, 0]
 
 
 def damaged_in_the_middle(path):
@@ -388,9 +553,9 @@ def foreign(path):
         (foreign, "expected an MLflow store, got an SQLite file with tables bookmarks"),
     ],
 )
-@pytest.mark.parametrize("use", [TrackedRuns.load, lambda runs: runs.save(trained())])
+@pytest.mark.parametrize("use", [TrackedRuns.load, lambda runs: runs.save(fitted())])
 def test_a_file_that_is_no_sound_store_is_refused_and_left_as_it_is(store, spoil, told, use):
-    tracked(store).save(trained())
+    tracked(store).save(fitted())
     spoil(store)
     before = store.read_bytes()
     around = set(store.parent.iterdir())
@@ -433,12 +598,12 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_a_store_whose_writer_was_killed_in_mid_write_is_not_taken_for_damaged(store):
-    tracked(store).save(trained())
+    tracked(store).save(fitted())
     done = subprocess.run([sys.executable, "-c", INTERRUPTED, str(store)], check=False, timeout=60)
     assert done.returncode == -signal.SIGKILL
     assert store.with_name("mlflow.db-journal").stat().st_size > 0
     (run,) = tracked(store).load()
-    assert run.fingerprint == "f00d"
+    assert run.fingerprint == "f00d0"
     with sqlite3.connect(store) as connection:  # what was half written is rolled back
         rows = connection.execute("select count(*) from experiment_tags where value like 'x%'")
         assert rows.fetchone() == (0,)
@@ -477,10 +642,10 @@ def test_a_tracking_uri_of_the_environment_wins(store, new_store, tmp_path, monk
     monkeypatch.chdir(other.parent)  # where MLflow then keeps artifacts
     before = store.read_bytes()
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{other}")
-    tracked(store).save(trained(artifacts={"history.csv": history(2)}))
+    tracked(store).save(fitted(estimator=Constant(0, history(2))))
     (run,) = tracked(store).load()
     pd.testing.assert_frame_equal(run.load("history.csv"), history(2))
-    assert statuses(other) == {"dot 3+0 10 s seed 0": "RUNNING"}
+    assert statuses(other) == {NAME: "RUNNING"}
     assert store.read_bytes() == before
     assert tracked(tmp_path / "none.db").exists()
     monkeypatch.delenv("MLFLOW_TRACKING_URI")

@@ -1,34 +1,77 @@
 """Runs in an MLflow store as catalog datasets."""
 
 import json
+import logging
 import os
 import platform
+import re
 import sqlite3
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import closing
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlencode
 
 import pandas as pd
 import psutil
 from kedro.io import AbstractDataset
 from mlflow import MlflowClient
-from mlflow.entities import Metric, Param, Run, RunStatus, RunTag, ViewType
+from mlflow.artifacts import download_artifacts
+from mlflow.entities import (
+    Dataset,
+    DatasetInput,
+    Experiment,
+    InputTag,
+    Metric,
+    Param,
+    Run,
+    RunStatus,
+    RunTag,
+    ViewType,
+)
 from mlflow.exceptions import MlflowException
 from mlflow.utils.file_utils import local_file_uri_to_path
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.atomic import check_writable, replacing
-from gyro_pipeline.tracking import EvaluatedRun, StoredRun, TrainedRun
+from gyro_pipeline.datasets.tracked_models import log_model, model_fit_uri, model_of
+from gyro_pipeline.estimators.base import Estimator
+from gyro_pipeline.tracking import (
+    FINGERPRINT,
+    HISTORY,
+    LAYOUT,
+    LAYOUT_TAG,
+    EvaluatedRun,
+    FittedRun,
+    StoredRun,
+)
+
+logger = logging.getLogger(__name__)
 
 _TRAINED = "trained"
-"""Tag, set last: the run holds all that its training made. Without it, a run is unfinished."""
+"""Tag, set last: when the last fit ended. A run without it lacks fits."""
+
+_FITS, _BETWEEN = "fits", "; "
+"""Tag, and folder of artifacts: the folds whose fits are stored."""
+
+_MODEL_FOLD = "model_fold"
+"""Tag: the fold whose fit is the model of the run, and is stored nowhere else."""
 
 _OWNER = "process"
 """Tag: the process that writes a run, as ``host pid started``."""
+
+_DESCRIPTION = "mlflow.note.content"
+
+_ABOUT = """Study `{study}` of gyro_pipeline. One run is one row of the study: an estimator, its
+training set, a window length and a seed.
+
+`accuracy_gain_pct` says by how much the estimator's error is below that of the mean of the window,
+`time_saving_pct` how much shorter its window may be for the same error: both over all windows of
+the test recordings. Names that end in `_first` are over first windows only. `scores.csv` has the
+rest."""
 
 # One bar for each small artifact would bury everything else on a terminal.
 os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
@@ -36,18 +79,22 @@ os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
 _BUSY_S = 20
 """How long to wait for another process that writes to the store."""
 
-_MOVED = "if the store was moved, `python -m gyro_pipeline.store --artifacts-in mlruns` tells it so"
+_MOVED = "type `python -m gyro_pipeline.store --artifacts-in mlruns`"
+
+USER_INTERFACE = "http://127.0.0.1:5000"
+"""Where ``mlflow ui`` listens unless told otherwise."""
 
 _CURVE_POINTS = 50
-_LOG_BATCH = 1000  # most metrics that one call takes
+
+_told_of_older_runs: set[str] = set()
 
 
-class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
-    """Trained runs of one study, or of all, of one source, or of all, and of one sensor, or of all.
+class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
+    """Runs of one study, or of all, of one source, or of all, and of one sensor, or of all.
 
-    Loading returns the trained runs, newest first, and ends what dead processes left unfinished as
-    KILLED; of these, a trained run can still be evaluated. Saving takes one run at a time: a
-    :class:`TrainedRun` becomes a run that waits for its evaluation, an :class:`EvaluatedRun`
+    Loading returns the runs, newest first: trained ones, and those that a dead process left
+    unfinished, which are ended as KILLED and can be continued. Saving takes one item at a time: a
+    :class:`FittedRun` begins a run or adds to an unfinished one, an :class:`EvaluatedRun`
     completes it and sets it FINISHED.
     """
 
@@ -70,61 +117,85 @@ class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
         """
         self._path = Path(path)
         wanted = {"source": source, "sensor": sensor}
-        self._only = {key: value for key, value in wanted.items() if value}
-        self._study = study
+        self.only = {key: value for key, value in wanted.items() if value}
+        self.study = study
         self.metadata = metadata
         self.provenance: dict[str, str] = {}
         """Tags that every new run gets; set once per ``kedro run``."""
+        self._begun: dict[tuple[str, str], str] = {}
+        """Ids of the runs that fits are added to, by study and fingerprint."""
 
     def load(self) -> list[StoredRun]:
-        """Trained runs, newest first.
+        """Runs, newest first.
 
         Raises:
-            InputError: If the store is damaged or is no MLflow store.
+            InputError: If the store is damaged, is no MLflow store, or was moved.
         """
-        experiments = {e.experiment_id: e.name for e in self._experiments()}
+        experiments = self._experiments()
         if not experiments:
             return []
-        search = partial(self._client.search_runs, list(experiments))
+        studies = {e.experiment_id: e.name for e in experiments}
+        search = partial(self._client.search_runs, list(studies))
         # all pages first: what is ended is no longer on the next one
         for run in list(_pages(partial(search, "attributes.status = 'RUNNING'"))):
             if _is_dead(run.data.tags.get(_OWNER, "")):
                 self._client.set_terminated(run.info.run_id, "KILLED")
-        wanted = " and ".join(f"params.{key} = '{value}'" for key, value in self._only.items())
-        trained = [
-            self._stored(run, experiments[run.info.experiment_id])
-            for run in _pages(partial(search, wanted))
-            if _TRAINED in run.data.tags
+        self._tell_of_older_runs(search)
+        wanted = [f"tags.{LAYOUT_TAG} = '{LAYOUT}'"]
+        wanted += [f"params.{key} = '{value}'" for key, value in self.only.items()]
+        stored = [
+            self._stored(run, studies[run.info.experiment_id])
+            for run in _pages(partial(search, " and ".join(wanted)))
+            if _TRAINED in run.data.tags or _is_left(run)
         ]
-        return sorted(trained, key=lambda run: run.started_ms, reverse=True)
+        return sorted(stored, key=lambda run: run.started_ms, reverse=True)
 
-    def save(self, data: TrainedRun | EvaluatedRun) -> None:
-        """Add a trained run, or complete an evaluated one."""
-        if isinstance(data, TrainedRun):
-            self._save_trained(data)
+    def save(self, data: FittedRun | EvaluatedRun) -> None:
+        """Add a fit to its run, or complete an evaluated run."""
+        if isinstance(data, FittedRun):
+            self._save_fitted(data)
         else:
             self._save_evaluated(data)
 
     @cached_property
+    def _uri(self) -> str:
+        return os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{self._path}"
+
+    @cached_property
+    def _is_own_file(self) -> bool:
+        return not os.environ.get("MLFLOW_TRACKING_URI")
+
+    @cached_property
     def _client(self) -> MlflowClient:
-        uri = os.environ.get("MLFLOW_TRACKING_URI")
-        if not uri:
+        if self._is_own_file:
             if not self._path.exists():
                 _make_store(self._path)
             _check_store(self._path)
             check_writable(self._path.parent / "mlruns" / "artifacts")
-            uri = f"sqlite:///{self._path}"
         try:
-            return MlflowClient(tracking_uri=uri)
+            client = MlflowClient(tracking_uri=self._uri)
         except Exception as error:  # alembic and SQLAlchemy have no common base
             raise InputError(
-                f"{uri}: not a run store that this MLflow can open ({error}); move it away, or "
-                "run `mlflow db upgrade` on it"
+                f"{self._uri}: not a run store that this MLflow can open ({error}); move it away, "
+                "or run `mlflow db upgrade` on it"
             ) from error
+        if self._is_own_file:
+            for experiment in _pages(partial(client.search_experiments, ViewType.ACTIVE_ONLY)):
+                _check_not_moved(experiment, self._path)
+        return client
 
-    def _experiments(self) -> list[Any]:
+    def _experiments(self) -> list[Experiment]:
         experiments = _pages(partial(self._client.search_experiments, ViewType.ACTIVE_ONLY))
-        return [e for e in experiments if self._study in (None, e.name)]
+        return [e for e in experiments if self.study in (None, e.name)]
+
+    def _tell_of_older_runs(self, search: Callable[..., Any]) -> None:
+        """Count the runs that are not read, once for each store."""
+        if self._uri in _told_of_older_runs:
+            return
+        _told_of_older_runs.add(self._uri)
+        earlier = _pages(partial(search, f"tags.{LAYOUT_TAG} IS NULL"))
+        if count := sum(FINGERPRINT in run.data.tags for run in earlier):
+            logger.warning("%d runs of an older layout are not read", count)
 
     def _stored(self, run: Run, study: str) -> StoredRun:
         return StoredRun(
@@ -132,46 +203,115 @@ class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
             experiment_id=run.info.experiment_id,
             study=study,
             finished=run.info.status == RunStatus.to_string(RunStatus.FINISHED),
+            trained=_TRAINED in run.data.tags,
             started_ms=run.info.start_time,
             params=run.data.params,
             tags=run.data.tags,
             metrics=run.data.metrics,
-            load=partial(self._load_artifact, run.info.run_id),
+            fits=_fits(run),
+            load=partial(self._load_artifact, run),
+            load_fit=partial(self._load_fit, run),
         )
 
-    def _load_artifact(self, run_id: str, name: str) -> Any:
-        with tempfile.TemporaryDirectory() as folder:
-            try:
-                path = Path(self._client.download_artifacts(run_id, name, folder))
-            except MlflowException as error:
-                raise InputError(
-                    f"run {run_id}: its artifact {name} cannot be read ({error}); {_MOVED}"
-                ) from error
+    def _load_artifact(self, run: Run, name: str) -> Any:
+        with self._downloaded(run, f"{run.info.artifact_uri}/{name}") as path:
             return _READERS[path.suffix](path)
 
-    def _save_trained(self, trained: TrainedRun) -> None:
-        owner = psutil.Process()
-        owned = {_OWNER: f"{platform.node()} {owner.pid} {owner.create_time()}"}
-        tags = self.provenance | dict(trained.tags) | owned
-        run = self._client.create_run(
-            self._experiment_id(trained.study), trained.started_ms, tags, _run_name(trained.params)
+    def _load_fit(self, run: Run, fold: str) -> Estimator:
+        if fold == run.data.tags.get(_MODEL_FOLD):
+            source = model_fit_uri(self._client, run)
+        else:
+            source = f"{run.info.artifact_uri}/{_fit_folder(fold)}"
+        with self._downloaded(run, source) as path:
+            return Estimator.load(path)
+
+    @contextmanager
+    def _downloaded(self, run: Run, uri: str) -> Iterator[Path]:
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                path = download_artifacts(uri, dst_path=folder, tracking_uri=self._uri)
+            except (MlflowException, OSError) as error:
+                raise InputError(
+                    f"run {run.info.run_id}: {uri} cannot be read ({error}); delete the run, and "
+                    "the next `kedro run` makes it again"
+                ) from error
+            yield Path(path)
+
+    def _save_fitted(self, fitted: FittedRun) -> None:
+        key = (fitted.run.study, fitted.run.fingerprint)
+        if key not in self._begun:
+            self._begun[key] = self._begin(fitted)
+        run = self._client.get_run(self._begun[key])
+        run_id, tags = run.info.run_id, {}
+        if fitted.is_model:
+            log_model(self._client, run, fitted.estimator, fitted.example)
+            self._log_history(run_id, fitted)
+            tags[_MODEL_FOLD] = fitted.fold
+        else:
+            with tempfile.TemporaryDirectory() as folder:
+                fitted.estimator.save(Path(folder))
+                self._client.log_artifacts(run_id, folder, _fit_folder(fitted.fold))
+        fits = _fits(run) | {fitted.fold}
+        tags[_FITS] = _BETWEEN.join(sorted(fits))
+        if fits >= set(fitted.run.folds):
+            tags[_TRAINED] = str(fitted.ended_ms)
+            del self._begun[key]
+        self._client.log_batch(run_id, tags=_tags(tags))
+
+    def _begin(self, fitted: FittedRun) -> str:
+        """Id of the run that a fit is added to: one that was left unfinished, or a new one."""
+        experiment_id, wanted = self._experiment_id(fitted.run.study), fitted.run
+        left = _pages(
+            partial(
+                self._client.search_runs,
+                [experiment_id],
+                f"tags.{LAYOUT_TAG} = '{LAYOUT}' and tags.{FINGERPRINT} = '{wanted.fingerprint}'",
+            )
         )
-        run_id = run.info.run_id
-        params = [Param(key, str(value)) for key, value in trained.params.items()]
-        self._client.log_batch(run_id, params=params)
-        if trained.history is not None:
-            self._log_metrics(run_id, _thinned(trained.history, trained.ended_ms))
-        self._log_artifacts(run_id, trained.artifacts)
-        self._client.log_batch(run_id, tags=[RunTag(_TRAINED, str(trained.ended_ms))])
+        run = next((run for run in left if _is_left(run)), None)
+        if run is None:
+            tags = self._tags_of(fitted)
+            run = self._client.create_run(experiment_id, fitted.started_ms, tags, wanted.name)
+        else:
+            self._client.update_run(run.info.run_id, "RUNNING")
+            self._client.set_tag(run.info.run_id, _OWNER, _this_process())
+        if not run.data.params:
+            params = [Param(key, str(value)) for key, value in wanted.params.items()]
+            self._client.log_batch(run.info.run_id, params=params)
+            self._client.log_inputs(run.info.run_id, [_dataset(fitted.dataset)])
+        return str(run.info.run_id)
+
+    def _tags_of(self, fitted: FittedRun) -> dict[str, str]:
+        run = fitted.run
+        shown = {key: str(run.params[key]) for key in ("sensor", "estimator") if key in run.params}
+        return {
+            **self.provenance,
+            **shown,
+            "study": run.study,
+            "recommended": str(fitted.estimator.recommended),
+            **run.tags,
+            FINGERPRINT: run.fingerprint,
+            LAYOUT_TAG: LAYOUT,
+            _OWNER: _this_process(),
+            _DESCRIPTION: run.note,
+        }
+
+    def _log_history(self, run_id: str, fitted: FittedRun) -> None:
+        history = fitted.estimator.history
+        if history is not None:
+            self._client.log_batch(run_id, metrics=_thinned(history, fitted.ended_ms))
+            self._log_artifacts(run_id, {HISTORY: history})
 
     def _save_evaluated(self, evaluated: EvaluatedRun) -> None:
         run = self._client.get_run(evaluated.run_id)
         now_ms = int(time.time() * 1000)  # MLflow shows the newest value of a metric
-        metrics = [Metric(key, value, now_ms, 0) for key, value in evaluated.metrics.items()]
-        self._log_metrics(evaluated.run_id, metrics)
+        metrics = [
+            Metric(key, value, now_ms, 0, model_id=model_of(run))
+            for key, value in evaluated.metrics.items()
+        ]
+        self._client.log_batch(evaluated.run_id, metrics=metrics)
         self._log_artifacts(evaluated.run_id, evaluated.artifacts)
-        tags = [RunTag(key, value) for key, value in evaluated.tags.items()]
-        self._client.log_batch(evaluated.run_id, tags=tags)
+        self._client.log_batch(evaluated.run_id, tags=_tags(evaluated.tags))
         trained_ms = int(run.data.tags[_TRAINED])
         self._client.set_terminated(evaluated.run_id, "FINISHED", trained_ms)
 
@@ -184,16 +324,15 @@ class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
                 "good with `mlflow gc`"
             )
         if existing is not None:
-            _check_not_moved(existing.artifact_location)
-            return str(existing.experiment_id)
-        location = None
-        if not os.environ.get("MLFLOW_TRACKING_URI"):
-            location = (self._path.parent / "mlruns" / study).as_uri()
-        return str(self._client.create_experiment(study, location))
-
-    def _log_metrics(self, run_id: str, metrics: list[Metric]) -> None:
-        for start in range(0, len(metrics), _LOG_BATCH):
-            self._client.log_batch(run_id, metrics=metrics[start : start + _LOG_BATCH])
+            experiment_id = existing.experiment_id
+        else:
+            own = self._path.parent / "mlruns" / study
+            location = own.as_uri() if self._is_own_file else None
+            experiment_id = self._client.create_experiment(study, location)
+        if existing is None or _DESCRIPTION not in existing.tags:
+            about = _ABOUT.format(study=study)
+            self._client.set_experiment_tag(experiment_id, _DESCRIPTION, about)
+        return str(experiment_id)
 
     def _log_artifacts(self, run_id: str, artifacts: Mapping[str, Any]) -> None:
         with tempfile.TemporaryDirectory() as folder:
@@ -203,10 +342,38 @@ class TrackedRuns(AbstractDataset[TrainedRun | EvaluatedRun, list[StoredRun]]):
             self._client.log_artifacts(run_id, folder)
 
     def _exists(self) -> bool:
-        return bool(os.environ.get("MLFLOW_TRACKING_URI")) or self._path.exists()
+        return not self._is_own_file or self._path.exists()
 
     def _describe(self) -> dict[str, Any]:
-        return {"path": str(self._path), "study": self._study, **self._only}
+        return {"path": str(self._path), "study": self.study, **self.only}
+
+
+def run_link(runs: Sequence[TrackedRuns]) -> str | None:
+    """Address at which MLflow's user interface shows the runs of a study, the best first.
+
+    Args:
+        runs: Datasets of one study; the link is narrowed to their source and sensor if all that
+            name one agree.
+
+    Returns:
+        The link; None if the study has no runs.
+    """
+    first = runs[0]
+    experiment = next(iter(first._experiments()), None)
+    if experiment is None:
+        return None
+    wanted = [f"tags.{LAYOUT_TAG} = '{LAYOUT}'"]
+    for key in ("source", "sensor"):
+        values = {dataset.only[key] for dataset in runs if key in dataset.only}
+        wanted += [f"params.{key} = '{value}'" for value in values if len(values) == 1]
+    query = {
+        "workflowType": "machine_learning",
+        "searchFilter": " and ".join(wanted),
+        "orderByKey": "metrics.`accuracy_gain_pct`",
+        "orderByAsc": "false",
+    }
+    server = first._uri.rstrip("/") if first._uri.startswith("http") else USER_INTERFACE
+    return f"{server}/#/experiments/{experiment.experiment_id}/runs?{urlencode(query)}"
 
 
 def _make_store(path: Path) -> None:
@@ -235,12 +402,56 @@ def _check_store(path: Path) -> None:
         )
 
 
-def _check_not_moved(location: str) -> None:
-    """Refuse to write artifacts where the store used to be."""
-    if location.startswith("file:"):
-        project = Path(local_file_uri_to_path(location)).parents[1]
-        if not project.is_dir():
-            raise InputError(f"{project}, where the store keeps artifacts, is not there; {_MOVED}")
+def _check_not_moved(experiment: Experiment, store: Path) -> None:
+    """Refuse to write artifacts where the store used to be, or where the original of a copy is."""
+    location = experiment.artifact_location
+    if not location.startswith("file:"):
+        return
+    folder = Path(local_file_uri_to_path(location))
+    is_ours = (folder.parent.name, folder.name) == ("mlruns", experiment.name)
+    if is_ours and folder.parents[1].resolve() != store.parent.resolve():
+        raise InputError(
+            f"{store}: the artifacts of {experiment.name} are to be in {folder.parent}, which is "
+            f"not beside this store; if the project was copied or moved, {_MOVED}"
+        )
+
+
+def _dataset(described: Mapping[str, str]) -> DatasetInput:
+    """The recordings that a run was fitted to, as MLflow shows them."""
+    rest = {key: value for key, value in described.items() if key not in ("name", "digest")}
+    dataset = Dataset(
+        name=described["name"],
+        digest=described["digest"],
+        source_type="local",
+        source=json.dumps({"uri": described["source"]}),
+        profile=json.dumps(rest),
+    )
+    return DatasetInput(dataset, [InputTag("mlflow.data.context", "training")])
+
+
+def _fits(run: Run) -> frozenset[str]:
+    return frozenset(filter(None, run.data.tags.get(_FITS, "").split(_BETWEEN)))
+
+
+def _fit_folder(fold: str) -> str:
+    return f"{_FITS}/{re.sub('[^a-zA-Z0-9-]', '_', fold)}"
+
+
+def _tags(tags: Mapping[str, str]) -> list[RunTag]:
+    return [RunTag(key, value) for key, value in tags.items()]
+
+
+def _this_process() -> str:
+    process = psutil.Process()
+    return f"{platform.node()} {process.pid} {process.create_time()}"
+
+
+def _is_left(run: Run) -> bool:
+    """Whether a run lacks fits that nobody else is about to add."""
+    owner = run.data.tags.get(_OWNER, "")
+    running = run.info.status == RunStatus.to_string(RunStatus.RUNNING)
+    nobody_else = not running or owner == _this_process() or _is_dead(owner)
+    return _TRAINED not in run.data.tags and nobody_else
 
 
 def _pages(search: Callable[..., Any]) -> Iterable[Any]:
@@ -264,23 +475,6 @@ def _is_dead(owner: str) -> bool:
         return True
 
 
-def _run_name(params: Mapping[str, Any]) -> str:
-    """Readable at a glance in a list of runs."""
-    fold = f" fold {params['fold']}" if params["fold"] >= 0 else ""
-    if "leak" in params:
-        shuffled = " shuffled labels" if params["estimator"] == "cnn_shuffled" else ""
-        return (
-            f"{params['sensor']} leak {params['leak']}{shuffled} {params['window_s']:g} s every "
-            f"{params['window_stride_s']:g} s seed {params['seed']}{fold}"
-        )
-    if params["estimator"] != "cnn":
-        return f"{params['sensor']} {params['estimator']} {params['window_s']:g} s"
-    return (
-        f"{params['sensor']} {params['real_gyros']}+{params['virtual_gyros']} "
-        f"{params['window_s']:g} s seed {params['seed']}{fold}"
-    )
-
-
 def _thinned(history: pd.DataFrame, ended_ms: int) -> list[Metric]:
     """About 50 points of each curve: the whole history is an artifact."""
     step = -(-len(history) // _CURVE_POINTS)
@@ -292,27 +486,13 @@ def _thinned(history: pd.DataFrame, ended_ms: int) -> list[Metric]:
     ]
 
 
-def _write_weights(content: Any, path: Path) -> None:
-    import torch  # noqa: PLC0415 - 2 s that only runs with weights need
-
-    torch.save(content, path)
-
-
-def _read_weights(path: Path) -> Any:
-    import torch  # noqa: PLC0415
-
-    return torch.load(path, weights_only=True)
-
-
 _WRITERS: dict[str, Callable[[Any, Path], Any]] = {
     ".parquet": lambda content, path: content.to_parquet(path),
     ".csv": lambda content, path: content.to_csv(path, index=False),
     ".json": lambda content, path: path.write_text(json.dumps(content, indent=1)),
-    ".pt": _write_weights,
 }
 _READERS: dict[str, Callable[[Path], Any]] = {
     ".parquet": pd.read_parquet,
     ".csv": pd.read_csv,
     ".json": lambda path: json.loads(path.read_text()),
-    ".pt": _read_weights,
 }

@@ -1,0 +1,97 @@
+"""The model of a run, as MLflow keeps and serves it."""
+
+import inspect
+import logging
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import mlflow.pyfunc
+import numpy as np
+from mlflow import MlflowClient
+from mlflow.entities import LoggedModelOutput, Run
+from mlflow.models import Model, ModelSignature
+from mlflow.types import ParamSchema, ParamSpec, Schema, TensorSpec
+
+from gyro_pipeline.conventions import BIAS
+from gyro_pipeline.estimators.base import Estimator
+from gyro_pipeline.tracking import MODEL
+
+# It tells of every model that its example is valid.
+logging.getLogger("mlflow.pyfunc").setLevel(logging.WARNING)
+
+_FIT = "fit"
+_REQUIREMENTS = ("gyro-pipeline", "numpy", "torch", "xarray")
+_EXAMPLE_DECIMALS = 6  # of deg/s: the example is text
+
+_DOUBLE = np.dtype(np.float64)
+_SIGNATURE = ModelSignature(
+    inputs=Schema([TensorSpec(_DOUBLE, (-1, -1, -1))]),
+    outputs=Schema([TensorSpec(_DOUBLE, (-1, -1), name) for name in ("bias_dps", "sigma_dps")]),
+    params=ParamSchema(
+        [ParamSpec("target", "string", BIAS), ParamSpec("start_s", "double", [0.0], (-1,))]
+    ),
+)
+
+
+def log_model(client: MlflowClient, run: Run, estimator: Estimator, example: np.ndarray) -> None:
+    """Store a fit as the model of a run, in place of one that was left half written.
+
+    Args:
+        client: Of the run's store.
+        run: It has no other model.
+        estimator: The fit.
+        example: Windows (n, gyroscopes, samples), deg/s; the first is shown as input example.
+    """
+    model_id = model_of(run) or _new_model(client, run, estimator)
+    with TemporaryDirectory() as folder:
+        fit, model = Path(folder, _FIT), Path(folder, MODEL)
+        fit.mkdir()
+        estimator.save(fit)
+        mlflow.pyfunc.save_model(
+            model,
+            loader_module="gyro_pipeline.estimators.served",
+            data_path=fit,
+            code_paths=_code_of(type(estimator)),
+            mlflow_model=Model(artifact_path=MODEL, run_id=run.info.run_id, model_id=model_id),
+            signature=_SIGNATURE,
+            input_example=np.round(example[:1].astype(np.float64), _EXAMPLE_DECIMALS),
+            pip_requirements=[f"{name}=={version(name)}" for name in _REQUIREMENTS],
+        )
+        client.log_model_artifacts(model_id, str(model))
+    client.finalize_logged_model(model_id, "READY")
+
+
+def model_fit_uri(client: MlflowClient, run: Run) -> str:
+    """Where the fit is that is the model of a run."""
+    return f"{client.get_logged_model(str(model_of(run))).artifact_location}/data/{_FIT}"
+
+
+def model_of(run: Run) -> str | None:
+    """Id of the model of a run, if it has one."""
+    return next((output.model_id for output in run.outputs.model_outputs), None)
+
+
+def _new_model(client: MlflowClient, run: Run, estimator: Estimator) -> str:
+    model: Any = client.create_logged_model(
+        run.info.experiment_id,
+        name=MODEL,
+        source_run_id=run.info.run_id,
+        params=run.data.params,
+        model_type=type(estimator).__name__,
+    )
+    client.log_outputs(run.info.run_id, [LoggedModelOutput(model.model_id, 0)])
+    return str(model.model_id)
+
+
+def _code_of(kind: type) -> list[str] | None:
+    """The file or folder that a class outside of this package and of site-packages is from."""
+    top = kind.__module__.partition(".")[0]
+    module = sys.modules[top]
+    folders = [*getattr(module, "__path__", [])]  # of a package
+    path = Path(folders[0] if folders else inspect.getfile(module))
+    if top == __name__.partition(".")[0] or "site-packages" in path.parts:
+        return None
+    return [str(path)]

@@ -1,0 +1,23 @@
+"""An estimator outside of the package, as a user's own is."""
+
+import numpy as np
+
+from gyro_pipeline.conventions import InputError
+from gyro_pipeline.estimators.base import Estimator
+
+
+class Constant(Estimator):
+    """It says the same bias of every window, one more for each second after power-on."""
+
+    recommended = True
+
+    def __init__(self, bias=0.0, history=None):
+        self.bias, self.history = bias, history
+
+    def _estimate(self, windows):
+        return self.bias + windows.start_s[:, np.newaxis], 0.5
+
+
+class Unwritable(Constant):
+    def save(self, folder):
+        raise InputError("not to be written")
