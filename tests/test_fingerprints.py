@@ -1,9 +1,12 @@
-import importlib.util
-from itertools import count
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import gyro_pipeline
+from gyro_pipeline import fingerprints
 from gyro_pipeline.fingerprints import code_hash, data_hash, fingerprint
 
 CODE = '''"""A module."""
@@ -32,21 +35,27 @@ def area(radius):
 
 
 @pytest.fixture
-def hash_of(tmp_path):
-    numbers = count()
+def hash_of(tmp_path, monkeypatch):
+    """The hash of a package of modules; those of the call before are gone."""
+    monkeypatch.syspath_prepend(tmp_path)
+    package = tmp_path / "made_for_a_test"
+    package.mkdir()
 
     def make(*sources):
-        modules = []
-        for source in sources:
-            path = tmp_path / f"module_{next(numbers)}.py"
-            path.write_text(source)
-            spec = importlib.util.spec_from_file_location(path.stem, path)
-            module = importlib.util.module_from_spec(spec)
-            spec.loader.exec_module(module)
-            modules.append(module)
-        return code_hash(modules)
+        imports = [f"from . import part_{number}" for number in range(len(sources))]
+        (package / "__init__.py").write_text("\n".join(imports))
+        for number, source in enumerate(sources):
+            (package / f"part_{number}.py").write_text(source)
+        forget()
+        return code_hash(package.name)
 
-    return make
+    yield make
+    forget()
+
+
+def forget():
+    for remembered in (code_hash, fingerprints._parsed, fingerprints._roots):
+        remembered.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -89,6 +98,93 @@ def test_code_counts(hash_of, old, new):
 def test_every_module_counts(hash_of):
     assert hash_of(CODE, "x = 1") != hash_of(CODE)
     assert hash_of(CODE, "x = 1") != hash_of(CODE, "x = 2")
+
+
+EDITS = """
+import pathlib, sys
+from gyro_pipeline import fingerprints
+from gyro_pipeline.fingerprints import code_hash
+
+def hashed():
+    for remembered in (code_hash, fingerprints._parsed, fingerprints._roots):
+        remembered.cache_clear()
+    return code_hash("strangers_estimator:Mine")
+
+def edit(path, text):
+    before, kept = hashed(), path.read_text()
+    path.write_text(kept + text)
+    changed = hashed() != before
+    path.write_text(kept)
+    assert hashed() == before
+    return changed
+
+root = pathlib.Path(sys.argv[1])
+for path in sorted([*root.rglob("*.py"), *root.rglob("*.c")]):
+    text = "/* another */" if path.suffix == ".c" else "\\nadded = 1\\n"
+    if edit(path, text):
+        print(path.relative_to(root).as_posix())
+"""
+
+STRANGER = """
+from beside import helped
+from gyro_pipeline.estimators.base import Estimator
+
+
+class Mine(Estimator):
+    def _fit(self, training):
+        from gyro_pipeline.learning.jobs import run_training
+"""
+
+
+@pytest.fixture(scope="module")
+def counting(tmp_path_factory):
+    """Files of a copy of the package whose edits change the hash of a stranger's estimator."""
+    root, package = tmp_path_factory.mktemp("copy"), Path(gyro_pipeline.__file__).parent
+    for path in [*package.rglob("*.py"), *package.rglob("*.c")]:
+        copied = root / "gyro_pipeline" / path.relative_to(package)
+        copied.parent.mkdir(parents=True, exist_ok=True)
+        copied.write_text(path.read_text())
+    (root / "strangers_estimator.py").write_text(STRANGER)
+    (root / "beside.py").write_text("import numpy, json\nhelped = 1\n")
+    (root / "unrelated.py").write_text("")
+    command = [sys.executable, "-c", EDITS, str(root)]
+    env = {"PYTHONPATH": str(root), "PATH": ""}
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
+
+
+def test_an_edit_of_any_module_that_is_imported_changes_the_hash(counting):
+    """Of a file outside the package, and of what it imports, also inside a function."""
+    expected = {"strangers_estimator.py", "beside.py"}
+    expected |= {
+        f"gyro_pipeline/{name}"
+        for name in (
+            "__init__.py",
+            "conventions.py",
+            "parameters.py",
+            "units.py",
+            *(f"estimators/{name}.py" for name in ("__init__", "base", "training")),
+            *(f"physics/{name}.py" for name in ("__init__", "allan", "bias")),
+            *(f"learning/{name}" for name in ("__init__.py", "jobs.py", "fused.py", "fused.c")),
+            *(f"learning/{name}.py" for name in ("examples", "network", "packing", "trainer")),
+        )
+    }
+    assert counting >= expected
+
+
+def test_what_is_not_imported_does_not_count(counting):
+    assert "unrelated.py" not in counting
+    assert not {path for path in counting if path.startswith("gyro_pipeline/pipelines")}
+    assert "gyro_pipeline/estimators/linear.py" not in counting
+
+
+def test_a_package_counts_with_all_its_modules():
+    assert code_hash("gyro_pipeline.physics") != code_hash("gyro_pipeline.physics.bias")
+
+
+def test_a_module_that_is_not_there_is_refused():
+    with pytest.raises(ModuleNotFoundError, match="no module 'not_there' whose source"):
+        code_hash("not_there:Mine")
 
 
 ARRAY = np.arange(24, dtype=np.float32).reshape(2, 3, 4)

@@ -63,6 +63,13 @@ TARGET_OF = {PAPER: RECORDING_MEAN, DISJOINT: BIAS, TRUE: BIAS}
 FIRST, ALL = "first", "all"
 """Test windows: the first of each recording (the paper's way), or all non-overlapping ones."""
 
+NOTHING, OWN, REAL = "nothing", "own", "real"
+"""Parts of a training set that an estimator can use, beside ``ALL`` of it: none, the device's own
+recordings (or all real ones where the device is unseen), or all real ones."""
+
+ORIGIN_REAL, ORIGIN_VIRTUAL = "real", "virtual"
+"""Where a window of a windows table is from: a real IMU, or a virtual one."""
+
 LAST, BEST = "last", "best"
 """Weights at the last epoch (the paper's way), or at the best validation epoch."""
 

@@ -2,18 +2,18 @@
 
 import ast
 import hashlib
-import importlib
-import inspect
+import importlib.util
 import json
-import pkgutil
-from collections.abc import Iterable
+import sysconfig
 from functools import cache
-from types import ModuleType
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 _DIGITS = 16
+_C_SOURCES = (".c", ".h")
+_THIS = __name__.partition(".")[0]
 
 
 def data_hash(array: np.ndarray, labels: Any) -> str:
@@ -24,28 +24,106 @@ def data_hash(array: np.ndarray, labels: Any) -> str:
     return digest.hexdigest()[:_DIGITS]
 
 
-def code_hash(modules: Iterable[ModuleType]) -> str:
-    """Hash of what modules do: comments, docstrings and layout do not count."""
-    digest = hashlib.sha256()
-    for module in modules:
-        tree = ast.parse(inspect.getsource(module))
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
-                node.body = [statement for statement in node.body if not _is_text(statement)]
-        digest.update(ast.dump(tree).encode())
-    return digest.hexdigest()[:_DIGITS]
-
-
-@cache  # of what was imported, which does not change
-def package_hash(package: ModuleType) -> str:
-    """Hash of what all modules of a package do."""
-    found = pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
-    return code_hash([package, *(importlib.import_module(module.name) for module in found)])
-
-
 def fingerprint(content: Any) -> str:
     """Hash of anything that JSON can hold."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:_DIGITS]
+
+
+@cache  # of what was imported, which does not change
+def code_hash(*entries: str) -> str:
+    """Hash of what modules do, with all modules that they import, directly or not.
+
+    Imports inside functions count; modules of Python and of installed packages do not. Neither do
+    comments, docstrings and layout. C sources that lie beside a module count as they are.
+
+    Args:
+        entries: ``package.module`` or ``package.module:Class``; of a package, all its modules.
+
+    Raises:
+        ModuleNotFoundError: There is no such module.
+    """
+    contents: dict[str, bytes] = {}
+    waiting = [name for entry in entries for name in _members(entry.partition(":")[0])]
+    while waiting:
+        name = waiting.pop()
+        path = _source(name)
+        if path is None or name in contents:
+            continue
+        package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+        contents[name], imported = _parsed(path, package)
+        waiting += [package, *imported]
+        beside = [file for file in path.parent.iterdir() if file.suffix in _C_SOURCES]
+        contents |= {f"{package}/{file.name}": file.read_bytes() for file in beside}
+    digest = hashlib.sha256()
+    for name in sorted(contents):
+        digest.update(b"\0".join([name.encode(), contents[name], b""]))
+    return digest.hexdigest()[:_DIGITS]
+
+
+def _members(name: str) -> list[str]:
+    """The module, and all modules in it if it is a package."""
+    path = _source(name)
+    if path is None:
+        raise ModuleNotFoundError(f"no module {name!r} whose source could be read", name=name)
+    inside = path.parent.rglob("*.py") if path.name == "__init__.py" else []
+    parts = [file.relative_to(path.parent).with_suffix("").parts for file in inside]
+    return [name, *(".".join([name, *part]) for part in parts if part[-1] != "__init__")]
+
+
+def _source(name: str) -> Path | None:
+    """The file of a module, which is not imported; None of one that is installed or not there."""
+    first, *rest = name.split(".")
+    for path in _roots(first):
+        if not rest and path.is_file():
+            return path
+        place = path.joinpath(*rest)
+        for file in (place / "__init__.py", place.with_suffix(".py")):
+            if file.is_file():
+                return file
+    return None
+
+
+@cache
+def _roots(name: str) -> tuple[Path, ...]:
+    """The file of a module that is in no package, or the folders of a package; none if installed.
+
+    This package counts wherever it is.
+    """
+    spec = importlib.util.find_spec(name) if name else None
+    if spec is None:
+        return ()
+    folders = spec.submodule_search_locations
+    found = [Path(place) for place in ([spec.origin] if folders is None else folders) if place]
+    return tuple(path for path in found if name == _THIS or not _installed(path))
+
+
+def _installed(path: Path) -> bool:
+    """Whether it is of Python or of an installed package."""
+    python = [Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib")]
+    of_python = any(path.is_relative_to(place) for place in python)
+    return (
+        of_python or not path.exists() or bool({"site-packages", "dist-packages"} & {*path.parts})
+    )
+
+
+@cache
+def _parsed(path: Path, package: str) -> tuple[bytes, tuple[str, ...]]:
+    """What a module does, without docstrings, and the full names of all that it imports.
+
+    Names of attributes are among them, which are no modules.
+    """
+    tree, imported = ast.parse(path.read_text(encoding="utf-8")), []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            imported += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            parents = package.split(".")
+            base = parents[: len(parents) - node.level + 1] if node.level else []
+            module = ".".join([*base, *filter(None, [node.module])])
+            imported += [module, *(f"{module}.{alias.name}" for alias in node.names)]
+        elif isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            node.body = [statement for statement in node.body if not _is_text(statement)]
+    return ast.dump(tree).encode(), tuple(imported)
 
 
 def _is_text(statement: ast.stmt) -> bool:

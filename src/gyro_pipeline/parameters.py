@@ -24,7 +24,6 @@ from gyro_pipeline.units import read_unit
 
 PerAxis = tuple[float, float, float]
 Seconds = Annotated[float, Field(gt=0)]
-Precision = Literal["float32", "bfloat16"]
 Gyroscopes = Annotated[int, Field(ge=0, multiple_of=len(AXES), description="a count of axes")]
 
 LEAST_BLOCKS = 10
@@ -356,15 +355,19 @@ class Training(NetworkSizes):
         ge=0,
         description="end once the learning rates still to come sum to less; 0: never early",
     )
-
-    precision: Precision = Field(
-        "float32", description="of samples, and of the kernels as they meet them, in training"
+    steps: int | None = Field(
+        None,
+        ge=1,
+        description="of the optimiser, at least: in place of epochs, of which the number of "
+        "windows then decides how many there are; null: epochs",
     )
 
-    def learning_rates(self) -> np.ndarray:
-        """Learning rate of every epoch until the end, shape (epochs,)."""
-        steps = np.arange(self.epochs) // self.decay_every
-        rates = self.learning_rate * self.decay**steps
+    def learning_rates(self, windows: int) -> np.ndarray:
+        """Learning rate of every epoch until the end, shape (epochs,), for so many windows."""
+        epochs = self.epochs
+        if self.steps is not None:
+            epochs = -(-self.steps // -(-windows // self.batch_size))
+        rates = self.learning_rate * self.decay ** (np.arange(epochs) // self.decay_every)
         to_come = rates[::-1].cumsum()[::-1]
         return rates[to_come >= self.stop_below]
 

@@ -179,5 +179,5 @@ def test_the_key_of_a_file_changes_with_it_its_options_and_the_readers(tmp_path,
     assert touched["2.csv"] == before["2.csv"]
     slow = {"dot": SENSORS["dot"] | {"recording_s": 20}}
     others = [keys(sensors=slow), keys(reader={"rate_tolerance_pct": 5})]
-    monkeypatch.setattr("gyro_pipeline.datasets.file_logs.package_hash", lambda _: "another")
+    monkeypatch.setattr("gyro_pipeline.datasets.file_logs.code_hash", lambda _: "another")
     assert len({entry["1.csv"] for entry in (before, touched, *others, keys())}) == 5

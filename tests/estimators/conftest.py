@@ -4,12 +4,14 @@ import os
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 
-from gyro_pipeline.conventions import AXES, DIMENSIONS, RECORDING_MEAN
+from gyro_pipeline.conventions import AXES, DIMENSIONS, ORIGIN_REAL, RECORDING_MEAN, TRAIN
+from gyro_pipeline.estimators.training import TrainingSet
+from gyro_pipeline.physics.bias import windows_at
 from gyro_pipeline.physics.noise import simulate_noise, warm_up
-from gyro_pipeline.protocol.windows import cut_windows
 
 
 def labelled(rates, rate_hz):
@@ -54,6 +56,34 @@ def simulate():
     return make
 
 
+def windows_table(recordings, size, roles=None):
+    """All non-overlapping windows of the recordings that are there, in no order."""
+    there = recordings["samples"].to_numpy() > 0
+    imus, numbers = (recordings[name].to_numpy() for name in ("imu", "recording"))
+    rows = [
+        ((roles or {}).get(numbers[n], TRAIN), ORIGIN_REAL, imus[i], numbers[n], start)
+        for i, n in np.argwhere(there)
+        for start in range(0, recordings.sizes["sample"] - size + 1, size)
+    ]
+    columns = ["role", "origin", "imu", "recording", "start"]
+    return pd.DataFrame(rows, columns=columns).sample(frac=1, random_state=0)
+
+
+@pytest.fixture(scope="session")
+def training_set():
+    """Recordings as a training set, with windows of 10 s or another length."""
+
+    def make(recordings, device=1, window_s=10, roles=None):
+        recordings = recordings[["angular_rate", "samples"]]
+        means = recordings.angular_rate.mean("sample", dtype=np.float64)
+        recordings = recordings.assign(recording_mean=means)
+        size = round(window_s * recordings.attrs["rate_hz"])
+        windows = windows_table(recordings, size, roles)
+        return TrainingSet(recordings, None, windows, size, device)
+
+    return make
+
+
 @pytest.fixture(scope="session")
 def judged():
     """Errors and sigmas of an estimator in all windows of IMU 1."""
@@ -65,9 +95,9 @@ def judged():
         for number in recordings.recording.to_numpy():
             one = recordings.sel(imu=1, recording=number)
             samples = one.angular_rate.to_numpy()
-            windows = cut_windows(samples, size).transpose(1, 0, 2)
-            starts = np.arange(len(windows)) * size / rate_hz
-            bias, sigma = estimator.estimate(windows, target, starts, int(number))
+            starts = np.arange(0, samples.shape[-1] - size + 1, size)
+            windows = windows_at(samples, size, starts).transpose(1, 0, 2)
+            bias, sigma = estimator.estimate(windows, target, starts / rate_hz, int(number))
             mean = samples.mean(axis=-1, dtype=np.float64)
             errors.append(bias - (mean if target == RECORDING_MEAN else one.true_bias.to_numpy()))
             sigmas.append(sigma)

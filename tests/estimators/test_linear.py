@@ -2,14 +2,8 @@ import numpy as np
 import pytest
 
 from gyro_pipeline.conventions import BIAS, MDPS, RECORDING_MEAN, InputError
-from gyro_pipeline.estimators import (
-    BestLinear,
-    EmpiricalBayes,
-    LastCalibration,
-    Ridge,
-    TrainingMean,
-)
-from gyro_pipeline.estimators.linear import ridge_regression
+from gyro_pipeline.estimators.linear import BestLinear, Ridge, ridge_regression
+from gyro_pipeline.estimators.shrinkage import EmpiricalBayes, LastCalibration, TrainingMean
 from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.recording_model import RecordingModel, block_edges, block_means
 from gyro_pipeline.physics.recording_model import constant_bias as model_of
@@ -26,10 +20,12 @@ def rms(errors):
 
 @pytest.mark.parametrize("target", [RECORDING_MEAN, BIAS])
 @pytest.mark.parametrize("start", [0, 800])
-def test_it_is_the_dense_conditional_mean_given_training_and_window(simulate, target, start):
+def test_it_is_the_dense_conditional_mean_given_training_and_window(
+    simulate, target, start, training_set
+):
     """One normal distribution of training recordings and the new one, with a diffuse mean."""
     recordings = simulate(COLOURED, 6)
-    estimator = BestLinear().fit(recordings.isel(recording=slice(5)))
+    estimator = BestLinear().fit(training_set(recordings.isel(recording=slice(5))))
     fitted = estimator.models[0]
     edges = block_edges(SAMPLES, 10)
     means = block_means(recordings.angular_rate.to_numpy()[0, :, 0].astype(np.float64), edges)
@@ -61,35 +57,37 @@ def test_it_is_the_dense_conditional_mean_given_training_and_window(simulate, ta
     assert estimated[0, 0] == pytest.approx(sigma, rel=1e-3)
 
 
-def test_on_white_noise_it_is_empirical_bayes(simulate, judged):
+def test_on_white_noise_it_is_empirical_bayes(simulate, judged, training_set):
     recordings = simulate(WHITE, 60, seed=1)
     training, tested = (
         recordings.isel(recording=slice(30)),
         recordings.isel(recording=slice(30, 60)),
     )
-    linear, bayes = (cls().fit(training) for cls in (BestLinear, EmpiricalBayes))
+    linear, bayes = (cls().fit(training_set(training)) for cls in (BestLinear, EmpiricalBayes))
     errors, sigma = judged(linear, tested, 10)
     other, other_sigma = judged(bayes, tested, 10)
     assert rms(errors - other) < 0.1 * rms(other)
     np.testing.assert_allclose(sigma, other_sigma, rtol=0.08)
 
 
-def test_noise_from_the_allan_fit_does_as_well(simulate, judged):
+def test_noise_from_the_allan_fit_does_as_well(simulate, judged, training_set):
     recordings = simulate(COLOURED, 80, seed=2)
     training, tested = (
         recordings.isel(recording=slice(40)),
         recordings.isel(recording=slice(40, 80)),
     )
-    reml, allan = (BestLinear(noise=noise).fit(training) for noise in ("reml", "allan"))
+    reml, allan = (
+        BestLinear(noise=noise).fit(training_set(training)) for noise in ("reml", "allan")
+    )
     assert rms(judged(allan, tested, 10)[0]) < 1.1 * rms(judged(reml, tested, 10)[0])
 
 
-def test_each_place_of_a_window_has_its_own_weights(simulate):
+def test_each_place_of_a_window_has_its_own_weights(simulate, training_set):
     model = RecordingModel(
         SAMPLES, RATE, WHITE.noise, np.array([0.0, 20 * MDPS]), np.diag([TAU**2, TAU**2]), 15.0
     )
     recordings = simulate(model, 12, seed=3)
-    estimator = BestLinear(warm_up=True).fit(recordings)
+    estimator = BestLinear(warm_up=True).fit(training_set(recordings))
     samples = recordings.angular_rate.to_numpy()[0, 0]
     windows = np.stack([samples[:, :SIZE], samples[:, 600 : 600 + SIZE]])
     both, _ = estimator.estimate(windows, start_s=np.array([0.0, 30.0]))
@@ -99,7 +97,7 @@ def test_each_place_of_a_window_has_its_own_weights(simulate):
     assert np.abs(wrong - both[1]).min() > MDPS
 
 
-def test_history_follows_a_bias_that_walks(simulate, judged):
+def test_history_follows_a_bias_that_walks(simulate, judged, training_set):
     errors = {BestLinear: [], LastCalibration: [], TrainingMean: [], EmpiricalBayes: []}
     for seed in range(6):
         recordings = simulate(WHITE, 40, seed)
@@ -108,7 +106,7 @@ def test_history_follows_a_bias_that_walks(simulate, judged):
         training, tested = recordings.isel(recording=slice(36)), recordings.isel(recording=[36])
         for cls, found in errors.items():
             options = {"history": True} if cls is BestLinear else {}
-            found.append(judged(cls(**options).fit(training), tested, 5)[0])
+            found.append(judged(cls(**options).fit(training_set(training)), tested, 5)[0])
     history, last, constant, bayes = (rms(np.concatenate(found)) for found in errors.values())
     assert history < 0.95 * min(last, bayes)
     assert history < 0.5 * constant
@@ -121,27 +119,27 @@ def test_an_unknown_noise_is_refused():
 
 def test_ridge_regression_solves_its_normal_equations():
     generator = np.random.default_rng(4)
-    x = generator.normal(size=(30, 2, 4)) + 5
-    y = x @ [1.0, -1.0, 0.5, 0.0] + 0.1 * generator.normal(size=(30, 2)) + 7
-    weights, constant = ridge_regression(x, y)
-    flat, centred = x.reshape(-1, 4), x.reshape(-1, 4) - x.mean(axis=(0, 1))
-    penalty = (centred.T @ (y.ravel() - y.mean() - centred @ weights)) / weights
+    x = generator.normal(size=(60, 4)) + 5
+    y = x @ [1.0, -1.0, 0.5, 0.0] + 0.1 * generator.normal(size=60) + 7
+    weights, constant = ridge_regression(x, y, groups=np.repeat(np.arange(30), 2))
+    centred = x - x.mean(axis=0)
+    penalty = (centred.T @ (y - y.mean() - centred @ weights)) / weights
     np.testing.assert_allclose(penalty, penalty[0], rtol=1e-6)
     assert penalty[0] > 0
-    assert constant == pytest.approx(y.mean() - flat.mean(axis=0) @ weights)
+    assert constant == pytest.approx(y.mean() - x.mean(axis=0) @ weights)
     np.testing.assert_allclose(weights, [1.0, -1.0, 0.5, 0.0], atol=0.1)
 
 
-def test_ridge_returns_the_constant_where_windows_tell_nothing(simulate):
+def test_ridge_returns_the_constant_where_windows_tell_nothing(simulate, training_set):
     flat = model_of(SAMPLES, RATE, NoiseFigures(N, 0, 0), 0.0, 0.0)
     recordings = simulate(flat, 60, seed=5)
     windows = recordings.angular_rate.to_numpy()[0, :, :, :SIZE]
-    bias, _ = Ridge().fit(recordings).estimate(windows)
+    bias, _ = Ridge().fit(training_set(recordings)).estimate(windows)
     constant = recordings.angular_rate.to_numpy()[0].mean(axis=(0, 2), dtype=np.float64)
     assert rms(bias - constant) < 0.2 * N / np.sqrt(SIZE / RATE)
 
 
-def test_ridge_of_the_same_time_copes_with_a_warm_up(simulate, judged):
+def test_ridge_of_the_same_time_copes_with_a_warm_up(simulate, judged, training_set):
     model = RecordingModel(
         SAMPLES, RATE, WHITE.noise, np.array([0.0, 20 * MDPS]), np.diag([TAU**2, TAU**2]), 15.0
     )
@@ -150,5 +148,7 @@ def test_ridge_of_the_same_time_copes_with_a_warm_up(simulate, judged):
         recordings.isel(recording=slice(70)),
         recordings.isel(recording=slice(70, 100)),
     )
-    same, any_time = (rms(judged(Ridge(t).fit(training), tested, 10)[0]) for t in (True, False))
+    same, any_time = (
+        rms(judged(Ridge(t).fit(training_set(training)), tested, 10)[0]) for t in (True, False)
+    )
     assert same < 0.9 * any_time

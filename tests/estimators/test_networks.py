@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from gyro_pipeline.conventions import BIAS, MDPS, RECORDING_MEAN
-from gyro_pipeline.estimators import BestLinear, ResidualNetwork, WindowMeanNetwork
-from gyro_pipeline.estimators.networks import helpful_share
+from gyro_pipeline.estimators.linear import BestLinear
+from gyro_pipeline.estimators.networks import ResidualNetwork, WindowMeanNetwork, helpful_share
 from gyro_pipeline.learning.perceptrons import train_perceptrons
 from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.recording_model import RecordingModel, constant_bias, innovations
@@ -43,37 +43,43 @@ def with_heater(recordings, generator):
     return heated
 
 
-def both(recordings, judged, make, target=RECORDING_MEAN):
+def both(recordings, judged, training_set, make, target=RECORDING_MEAN):
     """RMSE of the linear estimate and of the corrected one on the other half; shares of errors."""
     training, tested = (
         recordings.isel(recording=slice(80)),
         recordings.isel(recording=slice(80, 160)),
     )
-    network = make().fit(training)
+    network = make().fit(training_set(training))
     linear, _ = judged(network._linear, tested, 10, target)
     errors, sigma = judged(network, tested, 10, target)
     return rms(linear), rms(errors), np.mean(np.abs(errors) < sigma)
 
 
 @pytest.mark.parametrize("model", [WHITE, COLOURED, WARMING], ids=["white", "coloured", "warming"])
-def test_where_the_linear_model_holds_it_adds_next_to_nothing(simulate, judged, model):
+def test_where_the_linear_model_holds_it_adds_next_to_nothing(
+    simulate, judged, model, training_set
+):
     warm_up = model is WARMING
     made = simulate(model, 160, seed=5)
-    linear, corrected, _ = both(made, judged, lambda: ResidualNetwork(warm_up))
+    linear, corrected, _ = both(made, judged, training_set, lambda: ResidualNetwork(warm_up))
     assert corrected == pytest.approx(linear, rel=0.01)
 
 
-def test_it_finds_a_drift_that_the_linear_model_lacks(simulate, judged):
+def test_it_finds_a_drift_that_the_linear_model_lacks(simulate, judged, training_set):
     heated = with_heater(simulate(COLOURED, 160, seed=6), np.random.default_rng(6))
-    linear, corrected, within = both(heated, judged, lambda: ResidualNetwork(warm_up=False))
+    linear, corrected, within = both(
+        heated, judged, training_set, lambda: ResidualNetwork(warm_up=False)
+    )
     assert corrected < 0.9 * linear
     assert 0.6 < within < 0.8
 
 
-def test_it_learns_a_warm_up_that_its_linear_part_was_not_told_of(simulate, judged):
+def test_it_learns_a_warm_up_that_its_linear_part_was_not_told_of(simulate, judged, training_set):
     warming = simulate(WARMING, 160, seed=7)
     for target in (RECORDING_MEAN, BIAS):
-        linear, corrected, _ = both(warming, judged, lambda: ResidualNetwork(warm_up=False), target)
+        linear, corrected, _ = both(
+            warming, judged, training_set, lambda: ResidualNetwork(warm_up=False), target
+        )
         assert corrected < (0.6 if target == RECORDING_MEAN else 0.95) * linear
 
 
@@ -83,29 +89,31 @@ def test_the_recordings_say_whether_there_is_a_warm_up(simulate):
         assert fit_recording_model(rates, RATE, warm_up=None).mean.size == parameters
 
 
-def test_other_devices_train_it_and_do_not_move_its_bias(simulate, judged):
+def test_other_devices_train_it_and_do_not_move_its_bias(simulate, judged, training_set):
     heated = with_heater(simulate(COLOURED, 120, seed=9, imus=2), np.random.default_rng(9))
     training, tested = heated.isel(recording=slice(40)), heated.isel(recording=slice(40, None))
-    alone = ResidualNetwork(False).fit(training.isel(imu=[0]))
-    helped = ResidualNetwork(False).fit(training)
+    alone = ResidualNetwork(False).fit(training_set(training.isel(imu=[0])))
+    helped = ResidualNetwork(False).fit(training_set(training))
     few, more = (rms(judged(one, tested, 10)[0]) for one in (alone, helped))
     assert more < 1.02 * few
 
 
-def test_with_few_recordings_it_is_the_linear_predictor(simulate, judged):
+def test_with_few_recordings_it_is_the_linear_predictor(simulate, judged, training_set):
     recordings = simulate(WHITE, 25, seed=10)
     training, tested = recordings.isel(recording=slice(9)), recordings.isel(recording=slice(9, 25))
-    network = ResidualNetwork(False).fit(training)
-    linear = BestLinear().fit(training)
+    linear = BestLinear().fit(training_set(training))
     for window_s in (10, RECORDING_S):
+        network = ResidualNetwork(False).fit(training_set(training, window_s=window_s))
         ours, theirs = judged(network, tested, window_s), judged(linear, tested, window_s)
         np.testing.assert_array_equal(ours, theirs)
 
 
-def test_training_it_twice_gives_the_same_estimates(simulate):
+def test_training_it_twice_gives_the_same_estimates(simulate, training_set):
     heated = with_heater(simulate(COLOURED, 30, seed=11), np.random.default_rng(11))
-    windows = heated.angular_rate.to_numpy()[0, :, :, :150]
-    first, second = (ResidualNetwork(False).fit(heated).estimate(windows) for _ in range(2))
+    windows = heated.angular_rate.to_numpy()[0, :, :, :149]
+    first, second = (
+        ResidualNetwork(False).fit(training_set(heated)).estimate(windows) for _ in range(2)
+    )
     np.testing.assert_array_equal(first, second)
 
 
@@ -149,17 +157,19 @@ def test_networks_side_by_side_are_trained_on_their_own_examples():
     assert alone(inputs).shape == (1, 400, 1)
 
 
-def test_the_network_of_the_window_mean_learns_the_constant_and_no_more(simulate, judged):
+def test_the_network_of_the_window_mean_learns_the_constant_and_no_more(
+    simulate, judged, training_set
+):
     recordings = simulate(WHITE, 120, seed=13)
     training, tested = (
         recordings.isel(recording=slice(80)),
         recordings.isel(recording=slice(80, 120)),
     )
-    network = WindowMeanNetwork().fit(training)
-    windows = tested.angular_rate.to_numpy()[0, :, :, :150]
+    network = WindowMeanNetwork().fit(training_set(training))
+    windows = tested.angular_rate.to_numpy()[0, :, :, :149]
     shuffled = np.random.default_rng(0).permuted(windows, axis=-1)
     np.testing.assert_allclose(
         network.estimate(shuffled)[0], network.estimate(windows)[0], atol=1e-9
     )
-    linear = rms(judged(BestLinear().fit(training), tested, 10)[0])
+    linear = rms(judged(BestLinear().fit(training_set(training)), tested, 10)[0])
     assert linear < rms(judged(network, tested, 10)[0]) < 1.2 * linear

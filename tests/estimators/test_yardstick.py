@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gyro_pipeline.conventions import MDPS, PAPER, RECORDING_MEAN
-from gyro_pipeline.estimators import ESTIMATORS
+from gyro_pipeline.estimators import make_estimator
 from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.recording_model import RecordingModel, best_linear, constant_bias
 
@@ -45,41 +45,48 @@ def rms(errors):
     return np.sqrt(np.mean(errors**2))
 
 
-def ratios_to_the_oracle(simulate, judged, model, names, training, seeds):
+def ratios_to_the_oracle(simulate, judged, training_set, model, names, training, seeds):
     """One row per seed."""
     rows = []
     for seed in range(seeds):
         made = simulate(model, training + TESTED, seed=[training, seed])
         tested = made.isel(recording=slice(training, None))
         oracle = rms(judged(Oracle(model, made), tested, 10)[0])
-        fitted = [ESTIMATORS[n]().fit(made.isel(recording=slice(training))) for n in names]
+        fitted = [
+            make_estimator(n, None, 0).fit(training_set(made.isel(recording=slice(training))))
+            for n in names
+        ]
         rows.append([rms(judged(estimator, tested, 10)[0]) / oracle for estimator in fitted])
     return np.array(rows)
 
 
 @pytest.mark.parametrize(("training", "bar"), [(80, 1.03), (10, 1.08)])
-def test_on_white_noise_they_are_as_good_as_the_oracle(simulate, judged, training, bar):
+def test_on_white_noise_they_are_as_good_as_the_oracle(
+    simulate, judged, training, bar, training_set
+):
     names = ["empirical_bayes", "best_linear"]
-    ratios = ratios_to_the_oracle(simulate, judged, WHITE, names, training, seeds=6)
+    ratios = ratios_to_the_oracle(simulate, judged, training_set, WHITE, names, training, seeds=6)
     assert (ratios.mean(axis=0) <= bar).all(), ratios
     assert (ratios.mean(axis=0) > 0.99).all(), ratios
 
 
-def test_with_flicker_random_walk_and_warm_up_the_one_that_knows_is(simulate, judged):
+def test_with_flicker_random_walk_and_warm_up_the_one_that_knows_is(simulate, judged, training_set):
     names = ["best_linear_warm_up", "best_linear"]
-    (aware, stationary), *_ = ratios_to_the_oracle(simulate, judged, WARMING, names, 80, seeds=1)
+    (aware, stationary), *_ = ratios_to_the_oracle(
+        simulate, judged, training_set, WARMING, names, 80, seeds=1
+    )
     assert 0.98 < aware <= 1.08
     assert stationary >= 2
 
 
 @pytest.fixture(scope="module")
-def leave_one_out(memsense, judged):
+def leave_one_out(memsense, judged, training_set):
     """Errors and sigmas on the real recordings, by estimator and window length."""
     found = {}
     for i in range(memsense.sizes["recording"]):
         others = memsense.isel(recording=np.delete(np.arange(memsense.sizes["recording"]), i))
         for name in ("mean", "training_mean", "empirical_bayes", "best_linear"):
-            estimator = ESTIMATORS[name]().fit(others)
+            estimator = make_estimator(name, None, 0).fit(training_set(others))
             for window_s in (1, 5, 10, 30):
                 one = judged(estimator, memsense.isel(recording=[i]), window_s)
                 found.setdefault((name, window_s), []).append(one)
@@ -122,12 +129,12 @@ def test_coverage_on_memsense(leave_one_out, name, window_s):
         (WARMING, "best_linear_warm_up"),
     ],
 )
-def test_coverage_on_a_thousand_simulated_recordings(simulate, judged, model, name):
+def test_coverage_on_a_thousand_simulated_recordings(simulate, judged, model, name, training_set):
     """Of four devices: 80 recordings fix the spread of one, and so its sigma, to a tenth or so."""
     ratios = []
     for device in range(4):
         made = simulate(model, 330, seed=device)
-        estimator = ESTIMATORS[name]().fit(made.isel(recording=slice(80)))
+        estimator = make_estimator(name, None, 0).fit(training_set(made.isel(recording=slice(80))))
         errors, sigma = judged(estimator, made.isel(recording=slice(80, None)), 10)
         ratios.append(np.abs(errors) / sigma)
     assert 0.65 <= np.mean(np.array(ratios) < 1) <= 0.72
@@ -139,14 +146,17 @@ def sources(simulate):
     return {name: simulate(m, 100) for name, m in {"white": WHITE, "coloured": COLOURED}.items()}
 
 
-def of_five(recordings, judged, resamples):
+def of_five(recordings, judged, training_set, resamples):
     """Mean ratios of the recommended estimators to the running mean at 1, 10 and 30 s."""
     rows = []
     for resample in range(resamples):
         order = np.random.default_rng(resample).permutation(recordings.sizes["recording"])
         training = recordings.isel(recording=np.sort(order[:5]))
         tested = recordings.isel(recording=np.sort(order[5:45]))
-        fitted = [ESTIMATORS[name]().fit(training) for name in ("mean", *RECOMMENDED)]
+        fitted = [
+            make_estimator(name, None, 0).fit(training_set(training))
+            for name in ("mean", *RECOMMENDED)
+        ]
         errors = [[rms(judged(one, tested, w)[0]) for w in (1, 10, 30)] for one in fitted]
         rows.append(np.array(errors[1:]) / errors[0])
     return np.mean(rows, axis=0)
@@ -154,9 +164,11 @@ def of_five(recordings, judged, resamples):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("source", ["white", "coloured"])
-def test_five_training_recordings_suffice_not_to_be_worse_than_the_mean(sources, judged, source):
-    assert (of_five(sources[source], judged, 8) <= 1.05).all()
+def test_five_training_recordings_suffice_not_to_be_worse_than_the_mean(
+    sources, judged, source, training_set
+):
+    assert (of_five(sources[source], judged, training_set, 8) <= 1.05).all()
 
 
-def test_five_memsense_recordings_suffice_too(memsense, judged):
-    assert (of_five(memsense, judged, 15) <= 1.05).all()
+def test_five_memsense_recordings_suffice_too(memsense, judged, training_set):
+    assert (of_five(memsense, judged, training_set, 15) <= 1.05).all()

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from gyro_pipeline import readers
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.log_source import LogSource
-from gyro_pipeline.fingerprints import fingerprint, package_hash
+from gyro_pipeline.fingerprints import code_hash, fingerprint
 from gyro_pipeline.logs import LogEntry, Logs
 from gyro_pipeline.parameters import ReaderOptions
 
@@ -96,7 +96,7 @@ class FileLogs(LogSource):
         settings = [
             self._options.model_dump(mode="json"),
             self.entry.rate_hz,
-            package_hash(readers),
+            code_hash("gyro_pipeline.readers"),
         ]
         entries = [
             self._entry(name, imu, recording, settings)

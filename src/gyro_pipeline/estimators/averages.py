@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from gyro_pipeline.conventions import RECORDING_MEAN
-from gyro_pipeline.estimators.base import FittedEstimator, Windows
-from gyro_pipeline.estimators.training import TrainingRecordings
+from gyro_pipeline.conventions import NOTHING, RECORDING_MEAN
+from gyro_pipeline.estimators.base import Estimator, Windows
+from gyro_pipeline.estimators.training import TrainingSet
 
 
-class RunningMean(FittedEstimator):
+class RunningMean(Estimator):
     """Zero-order calibration: the mean of the window (paper, section II), the running mean.
 
     Sums are in float64. Usable without ``fit``, which only gives it sigma: N / sqrt(T0) for the
@@ -20,7 +20,7 @@ class RunningMean(FittedEstimator):
 
     _noise: NDArray[np.float64] | float = np.nan
 
-    def _fit(self, training: TrainingRecordings) -> None:
+    def _fit(self, training: TrainingSet) -> None:
         self._noise = training.white_noise
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
@@ -30,16 +30,21 @@ class RunningMean(FittedEstimator):
         return windows.samples.mean(axis=-1, dtype=np.float64), sigma
 
 
-class Median(FittedEstimator):
+class Median(Estimator):
     """The median of the window; single samples far off do not move it. Its sigma is not known."""
+
+    uses = NOTHING
+    fewest_recordings = 0
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
         return np.median(windows.samples.astype(np.float64), axis=-1), np.nan
 
 
-class TrimmedMean(FittedEstimator):
+class TrimmedMean(Estimator):
     """The mean of the window without its lowest and its highest 10 % of samples; no sigma."""
 
+    uses = NOTHING
+    fewest_recordings = 0
     cut: ClassVar[float] = 0.1
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:

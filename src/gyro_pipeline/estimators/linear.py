@@ -1,13 +1,16 @@
 """Linear estimators on block means: the best linear predictor, and ridge regression."""
 
 from dataclasses import replace
+from itertools import product
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gyro_pipeline.conventions import BIAS, PAPER, RECORDING_MEAN, TRUE, InputError
-from gyro_pipeline.estimators.base import FittedEstimator, Windows
-from gyro_pipeline.estimators.training import TrainingRecordings
+from gyro_pipeline.estimators.base import Estimator, Windows
+from gyro_pipeline.estimators.training import TrainingSet
+from gyro_pipeline.physics.bias import windows_at
 from gyro_pipeline.physics.history import BiasHistory
 from gyro_pipeline.physics.recording_model import (
     BLOCK_S,
@@ -29,14 +32,19 @@ _Place = tuple[int, int, int, str, int | None]
 """Axis, first sample, samples, target and number of the recording."""
 
 
-class _Linear(FittedEstimator):
+class _Linear(Estimator):
     """Weighted sums of the block means of a window, by the axis and the place of the window."""
 
     _by_start = True
     _by_recording = False
     """Whether the weights depend on when the window starts, and on which recording it is from."""
+    _memories: ClassVar[tuple[str, ...]] = ("_lines",)
 
-    def _fit(self, training: TrainingRecordings) -> None:
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the weights that were worked out on the way; they are worked out again."""
+        return {name: {} if name in self._memories else v for name, v in vars(self).items()}
+
+    def _fit(self, training: TrainingSet) -> None:
         self._lines: dict[_Place, LinearEstimate] = {}
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
@@ -92,10 +100,11 @@ class BestLinear(_Linear):
             it, in their order (:mod:`gyro_pipeline.physics.history`). For a bias that drifts from
             one recording to the next.
 
-    Fitting needs three training recordings at least.
     """
 
     uses_prior = True
+    fewest_recordings = FEWEST_RECORDINGS
+    _memories = ("_lines", "_priors", "_windows")
 
     def __init__(
         self, warm_up: bool | None = False, noise: str = "reml", history: bool = False
@@ -105,7 +114,7 @@ class BestLinear(_Linear):
         self.recommended = noise == "reml"  # the Allan fit knows nothing of warm-up
         self._warm_up, self._allan, self._by_recording = warm_up, noise == "allan", history
 
-    def _fit(self, training: TrainingRecordings) -> None:
+    def _fit(self, training: TrainingSet) -> None:
         super()._fit(training)
         axes = training.rates.swapaxes(0, 1)
         noise = training.noise_figures if self._allan else [None] * len(axes)
@@ -155,69 +164,87 @@ def _of_unseen(model: RecordingModel, devices: int) -> RecordingModel:
 class Ridge(_Linear):
     """Ridge regression of the target on the block means of the window.
 
-    It knows no model: one regression per axis, from all non-overlapping training windows, towards
-    the training mean. The penalty is the one with the least error on left-out training recordings.
-    The bias is learned from the mean of the samples outside the window. It has no sigma.
+    It knows no model: one regression per axis, from the training windows, towards the training
+    mean. The penalty is the one with the least error on left-out training recordings. The bias is
+    learned from the mean of the samples outside the window. It has no sigma.
 
     Args:
         same_time: One regression for each place of the window, from training windows of the same
-            time after power-on, which a sensor that warms up needs.
+            time after power-on, which a sensor that warms up needs. A window at another place gets
+            that of the nearest one.
     """
 
     uses_prior = True
+    fewest_recordings = 2  # one of them is left out to choose the penalty
 
     def __init__(self, same_time: bool = False) -> None:
         self._by_start = same_time
 
-    def _fit(self, training: TrainingRecordings) -> None:
+    def _fit(self, training: TrainingSet) -> None:
         super()._fit(training)
-        self._rates = training.rates
-        self._means = self._rates.mean(axis=-1, dtype=np.float64)
+        size, samples = training.size, training.real.sizes["sample"]
+        edges = block_edges(size, round(BLOCK_S * self._rate_hz))
+        used = zip(training.rates, training.starts, strict=True)
+        blocks = [block_means(windows_at(rates, size, starts), edges) for rates, starts in used]
+        inputs = np.concatenate(blocks, axis=1)  # (axes, windows, blocks)
+        counts = list(map(len, training.starts))
+        whole = np.repeat(training.labels[1], counts, axis=0).T  # (axes, windows)
+        rest = (whole * samples - inputs @ np.diff(edges)) / max(samples - size, 1)
+        aims = {RECORDING_MEAN: whole, BIAS: rest if size < samples else whole}
+        groups, starts = np.repeat(np.arange(len(counts)), counts), np.concatenate(training.starts)
+        self._size = size
+        self._fitted: dict[tuple[int, str, int], LinearEstimate] = {}
+        for start in np.unique(starts).tolist() if self._by_start else [0]:
+            chosen = starts == start if self._by_start else starts >= 0
+            if len(np.unique(groups[chosen])) < self.fewest_recordings:
+                continue
+            for axis, (target, aim) in product(range(len(inputs)), aims.items()):
+                given = inputs[axis, chosen], aim[axis, chosen], groups[chosen]
+                line = LinearEstimate(edges, *ridge_regression(*given), np.nan)
+                self._fitted[axis, target, start] = line
+
+    def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
+        self._demand_size(windows, self._size)
+        return super()._estimate(windows)
 
     def _line(
         self, axis: int, start: int, size: int, target: str, recording: int | None
     ) -> LinearEstimate:
-        edges = block_edges(size, round(BLOCK_S * self._rate_hz))
-        rates, samples = self._rates[:, axis], self._rates.shape[-1]
-        count = 1 if self._by_start else samples // size
-        windows = rates[:, start : start + count * size].reshape(len(rates), count, size)
-        blocks = block_means(windows, edges)
-        aims = np.repeat(self._means[:, axis, None], count, axis=1)
-        if target == BIAS:
-            aims = (aims * samples - blocks @ np.diff(edges)) / (samples - size)
-        return LinearEstimate(edges, *ridge_regression(blocks, aims), np.nan)
+        starts = [first for *of, first in self._fitted if of == [axis, target]]
+        return self._fitted[axis, target, min(starts, key=lambda first: abs(first - start))]
 
 
 def ridge_regression(
-    inputs: NDArray[np.float64], aims: NDArray[np.float64]
+    inputs: NDArray[np.float64], aims: NDArray[np.float64], groups: NDArray[np.integer]
 ) -> tuple[NDArray[np.float64], float]:
     """Ridge regression with the penalty that does best on left-out groups.
 
     Args:
-        inputs: (groups, windows, m); the windows of a group are left out together.
-        aims: (groups, windows).
+        inputs: (n, m).
+        aims: (n,).
+        groups: (n,); the windows of a group are left out together.
 
     Returns:
         Weights (m,), and the constant.
     """
-    scale = inputs.var(axis=(0, 1)).sum() * aims.size
+    scale = inputs.var(axis=0).sum() * aims.size
     penalties = scale * np.geomspace(1e-4, 1e4, _PENALTIES)
-    parts = np.arange(len(inputs)) % min(len(inputs), _FOLDS)
+    there, numbers = np.unique(groups, return_inverse=True)
+    parts = numbers % min(len(there), _FOLDS)
     errors = np.zeros(_PENALTIES)
     for part in np.unique(parts):
         left, rest = parts == part, parts != part
         weights, constants = _ridges(inputs[rest], aims[rest], penalties)
         off = inputs[left] @ weights.T + constants - aims[left][..., None]
-        errors += np.sum(off**2, axis=(0, 1))
+        errors += np.sum(off**2, axis=0)
     weights, constants = _ridges(inputs, aims, penalties[[np.argmin(errors)]])
     return weights[0], float(constants[0])
 
 
 def _ridges(
-    inputs: NDArray[np.float64], aims: NDArray[np.float64], penalties: NDArray[np.float64]
+    x: NDArray[np.float64], y: NDArray[np.float64], penalties: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Weights (penalties, m) and constants (penalties,)."""
-    x, y = inputs.reshape(-1, inputs.shape[-1]), aims.ravel()
     middle, level = x.mean(axis=0), y.mean()
     squares, axes = np.linalg.eigh((x - middle).T @ (x - middle))
     along = axes.T @ (x - middle).T @ (y - level)

@@ -5,12 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gyro_pipeline.conventions import BIAS, RECORDING_MEAN
-from gyro_pipeline.estimators.base import FittedEstimator, Windows
+from gyro_pipeline.conventions import ALL, BIAS, RECORDING_MEAN
+from gyro_pipeline.estimators.base import Estimator, Windows
 from gyro_pipeline.estimators.linear import BestLinear
-from gyro_pipeline.estimators.training import TrainingRecordings
+from gyro_pipeline.estimators.training import ImuRecordings, TrainingSet
 from gyro_pipeline.learning.perceptrons import Perceptrons, train_perceptrons
+from gyro_pipeline.physics.bias import windows_at
 from gyro_pipeline.physics.recording_model import innovations
+from gyro_pipeline.physics.reml import FEWEST_RECORDINGS
 
 _FOLDS = 5
 _FEWEST = 4 * _FOLDS  # recordings to train a network on and to judge it by
@@ -39,7 +41,7 @@ class _Correction:
         return self.share * self.networks(inputs / self.scales)[..., 0].mean(axis=0)
 
 
-class ResidualNetwork(FittedEstimator):
+class ResidualNetwork(Estimator):
     """The best linear predictor, plus what small networks find that it leaves.
 
     The linear predictor is optimal if noise is Gaussian and its model holds, so a network can add
@@ -63,28 +65,27 @@ class ResidualNetwork(FittedEstimator):
         warm_up: See :class:`BestLinear`; by default the recordings say.
     """
 
+    uses = ALL
+    fewest_recordings = FEWEST_RECORDINGS
     recommended = True
     uses_prior = True
 
     def __init__(self, warm_up: bool | None = None) -> None:
         self._linear = BestLinear(warm_up=warm_up)
 
-    def _fit(self, training: TrainingRecordings) -> None:
+    def _fit(self, training: TrainingSet) -> None:
         self._linear.fit(training)
-        self._rates, self._folds = [], []
-        if training.seen:
-            imus = [training.imu, *(one for one in training.imus if one != training.imu)]
-            self._rates = [training.of(one).rates for one in imus]
-            numbers = [training.of(one).labels[0] for one in imus]
-            # what was recorded together is left out together
-            every = np.unique(np.concatenate(numbers))
-            self._folds = [np.searchsorted(every, one) % _FOLDS for one in numbers]
-        self._corrections: dict[int, _Correction | None] = {}
+        self._size = training.size
+        self._correction: _Correction | None = None
+        partial = self._size < self._linear.models[0].samples
+        if training.seen and partial and len(training.known[0].numbers) >= _FEWEST:
+            self._correction = self._train(list(training.imus.values()))
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
         rates, place = windows.samples, (windows.start_s, windows.recording)
+        self._demand_size(windows, self._size)
         bias, sigma = self._linear.estimate(rates, windows.target, *place)
-        correction = self._correction(rates.shape[-1])
+        correction = self._correction
         if correction is None:
             return bias, sigma
         _, unit = self._linear.estimate(rates, RECORDING_MEAN, *place)
@@ -100,19 +101,17 @@ class ResidualNetwork(FittedEstimator):
         share = 1 / outside if windows.target == BIAS else 1.0
         return bias + share * added, sigma * correction.sigma
 
-    def _correction(self, size: int) -> _Correction | None:
-        """Trained once for each length of window; None where nothing is to be added."""
-        if size not in self._corrections:
-            enough = self._rates and len(self._rates[0]) >= _FEWEST
-            partial = size < self._linear.models[0].samples
-            self._corrections[size] = self._train(size) if enough and partial else None
-        return self._corrections[size]
-
-    def _train(self, size: int) -> _Correction | None:
-        starts = _starts(self._linear.models[0].samples, size)
-        examples = [self._examples(rates, starts, size) for rates in self._rates]
-        dealt = zip(self._folds, examples, strict=True)
-        folds = np.concatenate([np.repeat(one, len(y) // len(one)) for one, (_, y) in dealt])
+    def _train(self, imus: list[ImuRecordings]) -> _Correction | None:
+        """Trained on the device, which is the first, and on the others; None where it is no use."""
+        starts = _starts(self._linear.models[0].samples, self._size)
+        levels = [one.means.mean(axis=0) for one in imus]
+        shifted = zip(imus, levels, strict=True)
+        examples = [self._examples(one, levels[0] - level, starts) for one, level in shifted]
+        # what was recorded together is left out together
+        every = np.unique(np.concatenate([one.numbers for one in imus]))
+        dealt = [np.searchsorted(every, one.numbers) % _FOLDS for one in imus]
+        pairs = zip(dealt, examples, strict=True)
+        folds = np.concatenate([np.repeat(one, len(y) // len(one)) for one, (_, y) in pairs])
         inputs, aims = (np.concatenate(part) for part in zip(*examples, strict=True))
         scales = np.sqrt(np.mean(inputs**2, axis=0)) + np.finfo(float).tiny
         used = folds != np.arange(_FOLDS)[:, None]
@@ -120,7 +119,7 @@ class ResidualNetwork(FittedEstimator):
         mine = slice(len(examples[0][1]))
         left_out = folds[None, mine]
         found = np.take_along_axis(networks(inputs[mine] / scales)[..., 0], left_out, axis=0)[0]
-        by_recording = (len(self._rates[0]), -1)
+        by_recording = (len(imus[0].numbers), -1)
         share = helpful_share(found.reshape(by_recording), aims[mine].reshape(by_recording))
         if share == 0:
             return None
@@ -128,16 +127,19 @@ class ResidualNetwork(FittedEstimator):
         return _Correction(networks, scales, share, float(np.sqrt(left)))
 
     def _examples(
-        self, rates: NDArray[np.floating], starts: NDArray[np.integer], size: int
+        self, imu: ImuRecordings, shift: NDArray[np.float64], starts: NDArray[np.integer]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Inputs (n, m) and aims (n,) of one IMU's windows, recording by recording."""
-        means = rates.mean(axis=-1, dtype=np.float64)
-        shift = 0.0
-        if rates is not self._rates[0]:
-            shift = self._rates[0].mean(axis=(0, 2), dtype=np.float64) - means.mean(axis=0)
+        """Inputs (n, m) and aims (n,) of one IMU's windows, recording by recording.
+
+        Args:
+            imu: Whose.
+            shift: What moves its bias to the device's, (axes,), deg/s.
+            starts: First samples of the windows.
+        """
+        rates, means = imu.rates, imu.means
         inputs, aims = [], []
         for start in starts:
-            windows = rates[..., start : start + size] + np.asarray(shift)[..., None]
+            windows = rates[..., start : start + self._size] + shift[:, None]
             at_s = start / self._linear.models[0].rate_hz
             linear, sigma = self._linear.estimate(windows, RECORDING_MEAN, at_s)
             inputs.append(self._inputs(windows.swapaxes(0, 1), start).swapaxes(0, 1))
@@ -156,7 +158,7 @@ class ResidualNetwork(FittedEstimator):
         return np.pad(np.stack(found), ((0, 0), (0, 0), (0, 1)), constant_values=began)
 
 
-class WindowMeanNetwork(FittedEstimator):
+class WindowMeanNetwork(Estimator):
     """A small network that is fed the mean of the window alone.
 
     If it equals the paper's network, that one has learned nothing from the samples but their mean.
@@ -164,35 +166,26 @@ class WindowMeanNetwork(FittedEstimator):
 
     uses_prior = True
 
-    def _fit(self, training: TrainingRecordings) -> None:
-        self._rates = training.rates
-        self._means = self._rates.mean(axis=-1, dtype=np.float64)
-        self._centre = self._means.mean(axis=0)
-        self._networks: dict[int, tuple[Perceptrons, float]] = {}
+    def _fit(self, training: TrainingSet) -> None:
+        """A network with the mean of the recording, then that outside the window, as its aims."""
+        rates, size = training.rates, training.size
+        samples, whole = rates.shape[-1], rates.mean(axis=-1, dtype=np.float64)
+        self._size, self._centre = size, whole.mean(axis=0)
+        used = zip(rates, training.starts, strict=True)
+        cut = [windows_at(one, size, starts).mean(-1, dtype=np.float64) for one, starts in used]
+        means = np.ascontiguousarray(np.concatenate(cut, axis=1).T) - self._centre  # (n, axes)
+        whole = np.repeat(whole - self._centre, list(map(len, training.starts)), axis=0)
+        rest = (whole * samples - means * size) / max(samples - size, 1)
+        aims = np.concatenate([whole, rest if size < samples else whole], axis=1)
+        self._scale = float(np.sqrt(np.mean(means**2)))
+        every = np.ones((1, len(means)), bool)
+        self._networks = train_perceptrons(means / self._scale, aims / self._scale, every)
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
-        size = windows.samples.shape[-1]
-        if size not in self._networks:
-            self._networks[size] = self._train(size)
-        networks, scale = self._networks[size]
-        means = (windows.samples.mean(axis=-1, dtype=np.float64) - self._centre) / scale
-        outputs = np.split(networks(means)[0], 2, axis=1)[windows.target == BIAS]
-        return self._centre + scale * outputs, np.nan
-
-    def _train(self, size: int) -> tuple[Perceptrons, float]:
-        """A network with the mean of the recording, then that outside the window, as its aims."""
-        samples = self._rates.shape[-1]
-        starts = np.arange(0, samples - size + 1, size)
-        cut = [
-            self._rates[..., start : start + size].mean(-1, dtype=np.float64) for start in starts
-        ]
-        means = np.stack(cut, axis=1) - self._centre  # (recordings, windows, axes)
-        whole = np.broadcast_to((self._means - self._centre)[:, None], means.shape)
-        rest = (whole * samples - means * size) / max(samples - size, 1)
-        scale = float(np.sqrt(np.mean(means**2)))
-        inputs, aims = means, np.concatenate([whole, rest if size < samples else whole], axis=2)
-        inputs, aims = (part.reshape(-1, part.shape[-1]) / scale for part in (inputs, aims))
-        return train_perceptrons(inputs, aims, np.ones((1, len(inputs)), bool)), scale
+        self._demand_size(windows, self._size)
+        means = windows.samples.mean(axis=-1, dtype=np.float64) - self._centre
+        outputs = np.split(self._networks(means / self._scale)[0], 2, axis=1)
+        return self._centre + self._scale * outputs[windows.target == BIAS], np.nan
 
 
 def helpful_share(found: NDArray[np.float64], aims: NDArray[np.float64]) -> float:

@@ -3,13 +3,13 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gyro_pipeline.conventions import BIAS, RECORDING_MEAN
-from gyro_pipeline.estimators.base import FittedEstimator, Windows
-from gyro_pipeline.estimators.training import TrainingRecordings
+from gyro_pipeline.conventions import BIAS, REAL, RECORDING_MEAN
+from gyro_pipeline.estimators.base import Estimator, Windows
+from gyro_pipeline.estimators.training import TrainingSet, fitted_noise
 from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, guarded_spread
 
 
-class TrainingMean(FittedEstimator):
+class TrainingMean(Estimator):
     """The mean of the training recordings' means: a constant that ignores the window.
 
     For an unseen device it is the mean of the others, which is worth nothing; that is the point.
@@ -17,7 +17,7 @@ class TrainingMean(FittedEstimator):
 
     uses_prior = True
 
-    def _fit(self, training: TrainingRecordings) -> None:
+    def _fit(self, training: TrainingSet) -> None:
         self._noise = training.white_noise
         self._numbers, self._labels = training.labels
 
@@ -40,7 +40,7 @@ class LastCalibration(TrainingMean):
     training mean of the others.
     """
 
-    def _fit(self, training: TrainingRecordings) -> None:
+    def _fit(self, training: TrainingSet) -> None:
         super()._fit(training)
         if not training.seen:
             self._numbers = np.full(self._numbers.shape, np.inf)
@@ -53,7 +53,7 @@ class LastCalibration(TrainingMean):
         return self._labels[past][-1], 1.0
 
 
-class EmpiricalBayes(FittedEstimator):
+class EmpiricalBayes(Estimator):
     """The posterior mean of the bias under a prior learned from training recordings.
 
     The bias of a power-on is Normal(mu, tau^2) and the noise white. With N from the Allan fit, mu
@@ -69,59 +69,37 @@ class EmpiricalBayes(FittedEstimator):
 
     An unseen device has the mean and spread of the known devices' means as its prior. Where fewer
     than three labels are known, it is flat and the estimate is the running mean.
-
-    Args:
-        pooled: One tau for all axes and IMUs; mu is always the axis' own. Better where they are
-            alike, worse where they are not, as on the public Memsense recordings.
     """
 
+    recommended = True
     uses_prior = True
 
-    def __init__(self, pooled: bool = False) -> None:
-        self.recommended = not pooled
-        self._pooled = pooled
-
-    def _fit(self, training: TrainingRecordings) -> None:
+    def _fit(self, training: TrainingSet) -> None:
         self._noise = training.white_noise
         labels, averaging = self._labels(training)
         self._mean = labels.mean(axis=0)
         scatter = self._spread(training, labels, averaging) ** 2
         self._prior = scatter + (scatter + averaging) / len(labels)
 
-    def _labels(
-        self, training: TrainingRecordings
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _labels(self, training: TrainingSet) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Labels (n, 3) of the prior and their averaging noise (3,): recordings or devices."""
         if training.seen:
             return training.labels[1], self._noise**2 / self._recording_s
-        means = [training.of(imu).labels[1].mean(axis=0) for imu in training.known]
-        return np.stack(means), np.zeros(len(self._noise))
+        means = np.stack([one.means.mean(axis=0) for one in training.known])
+        return means, np.zeros(len(self._noise))
 
     def _spread(
         self,
-        training: TrainingRecordings,
+        training: TrainingSet,
         labels: NDArray[np.float64],
         averaging: NDArray[np.float64],
     ) -> NDArray[np.float64]:
         """The tau of each axis, (3,)."""
-        if self._pooled and averaging.any():
-            return np.full(averaging.shape, self._pooled_spread(training))
         if len(labels) < FEWEST_RECORDINGS:
             return np.full(averaging.shape, np.inf)
         scatter, freedom = labels.var(axis=0) * len(labels), len(labels) - 1
         groups = zip(scatter, averaging, strict=True)
         return np.array([guarded_spread(square, freedom, v) for square, v in groups])
-
-    def _pooled_spread(self, training: TrainingRecordings) -> float:
-        scatter, freedom, averaging = [], [], []
-        for one in map(training.of, training.imus):
-            labels = one.labels[1]
-            scatter.append(labels.var(axis=0) * len(labels))
-            freedom.append(np.full(labels.shape[1], len(labels) - 1))
-            averaging.append(one.white_noise**2 / self._recording_s)
-        if np.sum(freedom) < FEWEST_RECORDINGS - 1:
-            return np.inf
-        return guarded_spread(*map(np.concatenate, (scatter, freedom, averaging)))
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
         means = windows.samples.mean(axis=-1, dtype=np.float64)
@@ -134,3 +112,32 @@ class EmpiricalBayes(FittedEstimator):
             variance += (1 - r) * self._noise**2 / self._recording_s
         biases = r * means + (1 - r) * (self._mean + beta * (means - self._mean))
         return biases, np.sqrt(variance)
+
+
+class PooledEmpiricalBayes(EmpiricalBayes):
+    """Empirical Bayes with one tau for all axes and IMUs; mu is always the axis' own.
+
+    Better where they are alike, worse where they are not, as on the public Memsense recordings.
+    """
+
+    uses = REAL
+    recommended = False
+
+    def _spread(
+        self,
+        training: TrainingSet,
+        labels: NDArray[np.float64],
+        averaging: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        if not training.seen:
+            return super()._spread(training, labels, averaging)
+        scatter, freedom, noise = [], [], []
+        for one in training.imus.values():
+            white = np.array([figures.white for figures in fitted_noise([one])])
+            scatter.append(one.means.var(axis=0) * len(one.means))
+            freedom.append(np.full(len(white), len(one.means) - 1))
+            noise.append(white**2 / self._recording_s)
+        if np.sum(freedom) < FEWEST_RECORDINGS - 1:
+            return np.full(averaging.shape, np.inf)
+        spread = guarded_spread(*map(np.concatenate, (scatter, freedom, noise)))
+        return np.full(averaging.shape, spread)

@@ -21,9 +21,9 @@ from torch.nn import functional
 from torch.nn.utils import parameters_to_vector
 
 from gyro_pipeline.learning.examples import Examples
-from gyro_pipeline.learning.network import SLOPE, Architecture, CalibrationNetwork, as_bfloat16
+from gyro_pipeline.learning.network import SLOPE, Architecture, CalibrationNetwork
 from gyro_pipeline.learning.trainer import StateDict, Trained
-from gyro_pipeline.parameters import Precision, Training
+from gyro_pipeline.parameters import Training
 
 CHUNK = 256
 """Steps that are sent to the device together; their losses come back together."""
@@ -70,7 +70,7 @@ def train_together(
     Raises:
         FloatingPointError: If a loss is no longer finite.
     """
-    data = _Data.on(device, cells, schedule.precision)
+    data = _Data.on(device, cells)
     courses = [
         _Course(number, one, data.places[one.cell], schedule) for number, one in enumerate(learners)
     ]
@@ -99,12 +99,7 @@ class _Data:
     places: list[tuple[range, range]]
 
     @classmethod
-    def on(
-        cls,
-        device: torch.device,
-        cells: Iterable[tuple[Examples, Examples | None]],
-        precision: Precision,
-    ) -> "_Data":
+    def on(cls, device: torch.device, cells: Iterable[tuple[Examples, Examples | None]]) -> "_Data":
         inputs, targets, places, end = [], [], [], 0
         for training, validation in cells:
             n, watched = len(training.inputs), 0 if validation is None else len(validation.inputs)
@@ -112,10 +107,7 @@ class _Data:
             end += n + watched
             for part in (training, validation):
                 if part is not None:
-                    windows = torch.from_numpy(part.inputs).to(device)
-                    if precision == "bfloat16" and part is training:
-                        windows = windows.bfloat16().to(windows.dtype)
-                    inputs.append(windows)
+                    inputs.append(torch.from_numpy(part.inputs).to(device))
                     targets.append(torch.from_numpy(part.targets).to(device))
         return cls(torch.cat(inputs), torch.cat(targets), places)
 
@@ -128,9 +120,9 @@ class _Course:
     ) -> None:
         self.number, (self.rows, self.watched) = number, places
         self._network, self._shuffling = learner.network, learner.shuffling
-        self._batch_size, self._rates = schedule.batch_size, schedule.learning_rates()
+        self._batch_size, self.rates = schedule.batch_size, schedule.learning_rates(len(self.rows))
         self.per_epoch = -(-len(self.rows) // self._batch_size)
-        self.steps = self.per_epoch * len(self._rates)
+        self.steps = self.per_epoch * len(self.rates)
         self._drawn = torch.empty((0, self._batch_size), dtype=torch.int64)
         self._history: list[dict[str, Any]] = []
         self._lowest, self._best_epoch = np.inf, 0
@@ -152,7 +144,7 @@ class _Course:
         epoch, loss = len(self._history) + 1, summed / len(self.rows)
         if not np.isfinite(loss):
             raise FloatingPointError(f"the loss is {loss} in epoch {epoch}")
-        row = {"epoch": epoch, "learning_rate": self._rates[epoch - 1], "train_loss": loss}
+        row = {"epoch": epoch, "learning_rate": self.rates[epoch - 1], "train_loss": loss}
         if self.watched:
             row["val_loss"] = val_loss
             if val_loss < self._lowest:
@@ -218,7 +210,8 @@ def _chunk(courses: Sequence[_Course], steps: range, schedule: Training) -> dict
     epoch, place = np.divmod(step, per_epoch)
     ended = place == per_epoch - 1
     left = n - place * schedule.batch_size
-    rates = schedule.learning_rates()[epoch] / (1 - _BETAS[0] ** (step + 1))
+    by_network = [course.rates[own] for course, own in zip(courses, epoch.T, strict=True)]
+    rates = np.stack(by_network, axis=1) / (1 - _BETAS[0] ** (step + 1))
     return {
         "rows": torch.stack([course.batches(len(steps)) for course in courses], 1),
         "sizes": torch.from_numpy(np.minimum(left, schedule.batch_size)),
@@ -268,7 +261,7 @@ class _Stack:
         schedule: Training,
     ) -> None:
         weights, shape = state["weights"], (CHUNK, len(courses))
-        batch_size, self._precision = schedule.batch_size, schedule.precision
+        batch_size = schedule.batch_size
         self._architecture, self._data = courses[0].architecture, data
         self._places = torch.arange(batch_size, device=weights.device)
         self._watched = _watched(courses, batch_size, weights)
@@ -305,7 +298,7 @@ class _Stack:
     def _step(self) -> None:
         chunk = {name: values[self._at][0] for name, values in self._chunk.items()}
         weights = self.state["weights"].detach().requires_grad_()
-        summed = self._losses(weights, chunk["rows"], chunk["sizes"], self._precision)
+        summed = self._losses(weights, chunk["rows"], chunk["sizes"])
         (gradients,) = torch.autograd.grad((summed / chunk["sizes"]).sum(), weights)
         self.state["summed"].add_(summed.detach())
         _adam(self.state, gradients, chunk["rates"][:, None], chunk["corrections"])
@@ -317,7 +310,7 @@ class _Stack:
         state, last = self.state, self._at - 1
         ended, total = self._chunk["ended"][last][0], torch.zeros_like(state["summed"])
         for rows, sizes in self._watched:
-            total += self._losses(state["weights"], rows, sizes, "float32")
+            total += self._losses(state["weights"], rows, sizes)
         losses = total / self._watched_sizes  # 0 / 0 = NaN without validation: never the lowest
         better = ended & (losses < state["lowest"])
         state["lowest"].copy_(torch.where(better, losses, state["lowest"]))
@@ -325,9 +318,9 @@ class _Stack:
         self._log.index_copy_(0, last, torch.stack([state["summed"], losses])[None])
         state["summed"].masked_fill_(ended, 0)
 
-    def _losses(self, weights: Tensor, rows: Tensor, sizes: Tensor, precision: Precision) -> Tensor:
+    def _losses(self, weights: Tensor, rows: Tensor, sizes: Tensor) -> Tensor:
         """Mean squared errors, summed over the examples that count, shape (networks,)."""
-        outputs = _outputs(self._architecture, weights, self._data.inputs[rows], precision)
+        outputs = _outputs(self._architecture, weights, self._data.inputs[rows])
         errors = functional.mse_loss(outputs, self._data.targets[rows], reduction="none").mean(2)
         return errors.masked_fill(self._places >= sizes[:, None], 0).sum(1)
 
@@ -380,23 +373,18 @@ def _adam(state: dict[str, Tensor], gradients: Tensor, rates: Tensor, correction
     state["weights"].sub_(rates * mean / (square.sqrt() / correction + _EPSILON))
 
 
-def _outputs(
-    a: Architecture, weights: Tensor, packed: Tensor, precision: Precision = "float32"
-) -> Tensor:
+def _outputs(a: Architecture, weights: Tensor, packed: Tensor) -> Tensor:
     """What every network says to its own windows; see ``CalibrationNetwork.forward_packed``.
 
     Args:
         a: The networks' sizes.
         weights: Shape (networks, parameters), in the order of the module's.
         packed: Shape (networks, n, blocks, width).
-        precision: To which kernels are rounded.
 
     Returns:
         Shape (networks, n, gyroscopes).
     """
     kernel, kernel_bias, hidden, hidden_bias, output, output_bias = _parameters(a, weights)
-    if precision == "bfloat16":
-        kernel = as_bfloat16(kernel)
     taps, width, used = -(-a.kernel // a.stride), packed.shape[3], a.pooled * a.pool
     # (networks, channels, gyroscopes, kernel) -> (networks, 1, width, taps * channels)
     kernel = functional.pad(kernel, (0, taps * a.stride - a.kernel)).unflatten(3, (taps, a.stride))

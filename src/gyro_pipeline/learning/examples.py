@@ -10,7 +10,7 @@ import xarray as xr
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.learning.network import Architecture
 from gyro_pipeline.learning.packing import aligned_zeros, pack, packed_shape
-from gyro_pipeline.protocol.windows import cut_windows
+from gyro_pipeline.physics.bias import windows_at
 
 _READ_AT_ONCE = 16
 """Recordings: enough that finding them in the file costs little, few enough to hold."""
@@ -18,36 +18,27 @@ _READ_AT_ONCE = 16
 
 @dataclass(frozen=True)
 class Device:
-    """IMUs seen side by side as one input of the network, and their recordings to use.
+    """IMUs seen side by side as one input of the network, and their windows to use.
 
     Attributes:
         recordings: ``angular_rate`` (imu, recording, axis, sample), of one length, NaN where
             masked; may be backed by a file.
-        bias: Bias of each recording, (imu, recording, axis), deg/s.
         imus: The IMUs side by side, one for Method 2.
         numbers: Recording numbers to use.
-        starts: First samples of the windows to use of each recording, which may overlap; None for
-            all non-overlapping ones.
+        biases: Biases of these recordings, shape (recordings, gyroscopes), deg/s.
+        starts: First samples of the windows to use of each recording, which may overlap.
     """
 
     recordings: xr.DataArray
-    bias: xr.DataArray
     imus: tuple[int, ...]
     numbers: tuple[int, ...]
-    starts: tuple[np.ndarray, ...] | None = None
+    biases: np.ndarray
+    starts: tuple[np.ndarray, ...]
 
-    def windows(self, size: int) -> list[int]:
-        """How many windows of ``size`` samples each recording gives, if none is masked."""
-        if self.starts is not None:
-            return [len(starts) for starts in self.starts]
-        return [self.recordings.sizes["sample"] // size] * len(self.numbers)
-
-    def biases(self) -> np.ndarray:
-        """Biases of the recordings, shape (recordings, gyroscopes), deg/s."""
-        chosen = self.bias.sel(imu=list(self.imus), recording=list(self.numbers))
-        return (
-            chosen.transpose("recording", "imu", "axis").to_numpy().reshape(len(self.numbers), -1)
-        )
+    @property
+    def windows(self) -> int:
+        """How many windows are used."""
+        return sum(map(len, self.starts))
 
     def samples(self) -> Iterator[np.ndarray]:
         """The recordings one by one, shape (gyroscopes, samples), deg/s."""
@@ -69,11 +60,7 @@ def with_shuffled_labels(device: Device, generator: np.random.Generator) -> Devi
     that is left to learn is the device's constant. A network that does better on test recordings
     has seen something of them.
     """
-    used = {"imu": list(device.imus), "recording": list(device.numbers)}
-    bias = device.bias.copy(deep=True)
-    labels = bias.loc[used].transpose("imu", "axis", "recording")
-    bias.loc[used] = labels.copy(data=generator.permuted(labels.to_numpy(), axis=-1))
-    return replace(device, bias=bias)
+    return replace(device, biases=generator.permuted(device.biases.T, axis=-1).T)
 
 
 @dataclass(frozen=True)
@@ -96,10 +83,7 @@ class Scaling:
 
 @dataclass(frozen=True)
 class Examples:
-    """Scaled examples: inputs (n, blocks, width) and targets (n, gyroscopes), float32.
-
-    Inputs to train on may be bfloat16 (:func:`~gyro_pipeline.learning.packing.to_bfloat16`).
-    """
+    """Scaled examples: inputs (n, blocks, width) and targets (n, gyroscopes), float32."""
 
     inputs: np.ndarray
     targets: np.ndarray
@@ -115,7 +99,7 @@ def device_centres(devices: Sequence[Device], centring: str) -> list[np.ndarray]
     Returns:
         Shape (gyroscopes,) for each device, deg/s.
     """
-    means = [device.biases().mean(axis=0) for device in devices]
+    means = [device.biases.mean(axis=0) for device in devices]
     if centring == "per_device":
         return means
     weights = [len(device.numbers) for device in devices]
@@ -154,21 +138,20 @@ def scaled_examples(device: Device, architecture: Architecture, scaling: Scaling
 def _centred(
     devices: Sequence[Device], centres: Sequence[np.ndarray], architecture: Architecture
 ) -> Examples:
-    n = sum(sum(device.windows(architecture.window)) for device in devices)
+    n = sum(device.windows for device in devices)
     inputs = aligned_zeros((n, *packed_shape(architecture)))
     targets = np.empty((n, architecture.gyroscopes), np.float32)
     start = 0
     for device, centre in zip(devices, centres, strict=True):
-        starts = device.starts or [None] * len(device.numbers)
-        used = zip(device.samples(), device.biases(), starts, strict=True)
-        for samples, bias, chosen in used:
+        used = zip(device.samples(), device.biases, device.starts, strict=True)
+        for samples, bias, starts in used:
             centred = samples - centre[:, None].astype(np.float32)
-            windows = cut_windows(centred, architecture.window, chosen)
-            rows = slice(start, start + windows.shape[-2])
+            rows = slice(start, start + len(starts))
+            windows = windows_at(centred, architecture.window, starts)
             pack(windows, architecture, out=inputs[rows])
             targets[rows] = bias - centre
             start = rows.stop
-    return Examples(inputs[:start], targets[:start])
+    return Examples(inputs, targets)
 
 
 def _around(positions: np.ndarray) -> slice:

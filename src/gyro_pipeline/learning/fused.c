@@ -4,7 +4,6 @@
  *   gradient is then summed at those places alone.
  * - Examples go forward and backward in tiles, and time in chunks, that stay in the second cache.
  * - Hidden weights are updated as soon as their gradient is complete.
- * With BF16 the inputs, and the kernels as they meet them, are bfloat16; all else stays float32.
  *
  * fused.py owns all memory and pads sizes so that loops over vectors have no rest. Padding has zero
  * weights, hence zero outputs and gradients, and Adam leaves it so.
@@ -45,12 +44,6 @@ typedef vec vec_there IN_MEMORY;
 typedef ints ints_there IN_MEMORY;
 typedef uint32_t half_there VECTOR(2 * LANES) IN_MEMORY;
 
-#ifdef BF16
-typedef uint16_t sample;
-#else
-typedef float sample;
-#endif
-
 #define SLOPE 0.1f /* network.SLOPE */
 
 typedef struct {
@@ -64,9 +57,9 @@ typedef struct {
     float *output_weight, *output_bias;           /* (gyroscopes, hidden); (gyroscopes) */
     float *convolution_weight, *convolution_bias; /* (channels, span); (channels) */
     const float *seen;                  /* (span): 1 where a kernel is, 0 elsewhere */
-    const sample *inputs;               /* (n, blocks, width) */
+    const float *inputs;                /* (n, blocks, width) */
     const float *targets;               /* (n, gyroscopes) */
-    sample *kernels;                    /* (span / 2, kernel_row): see arrange */
+    float *kernels;                     /* (span / 2, kernel_row): see arrange */
     float *biases;                      /* (kernel_row) */
     float *active, *d_active;           /* (tile, hidden) */
     float *feature, *d_feature;         /* (tile, features); (tile, chunk * channels + 16) */
@@ -113,15 +106,64 @@ INLINE float total(vec value)
     return (sum[0] + sum[2]) + (sum[1] + sum[3]);
 }
 
-/* What depends on the type of a sample: begin() and end() a use of it (begin() is 0 where the system
- * has it not), arrange() the kernels for a step, convolve() them with some
- * positions, convolve_block() with POSITIONS, take half() of what they give where the channels fill
- * no more, and load samples() as floats. */
-#ifdef BF16
-#include "fused_bfloat16.h"
-#else
-#include "fused_float32.h"
-#endif
+typedef uint64_t pair_there IN_MEMORY;
+
+#define POSITIONS (2 * WIDE)
+
+/* Few channels do not fill a vector, so each has two lanes: one for even taps, one for odd ones. A
+ * pair of taps then goes to all lanes with one 64-bit load, at the price of a single tap. Where
+ * two vectors of channels are side by side, the first has the even ones and the second the odd. */
+static int64_t lane_of(const Engine *e, int64_t c)
+{
+    const int64_t first = c / LANES * LANES;
+    return e->channels - first < LANES ? 2 * c : 2 * first + c % 2 * LANES + c % LANES / 2 * 2;
+}
+
+static void arrange(const Engine *e)
+{
+    for (int64_t c = 0; c < e->channels; c++) {
+        e->biases[lane_of(e, c)] = e->convolution_bias[c];
+        for (int64_t k = 0; k < e->span; k++)
+            e->kernels[k / 2 * e->kernel_row + lane_of(e, c) + k % 2] =
+                e->convolution_weight[c * e->span + k];
+    }
+}
+
+/* The sum of each channel's two lanes: of both vectors in the order of channels, of one twice. */
+INLINE vec untangled(vec even, vec odd)
+{
+    const longs low = (longs){0} + UINT32_MAX, a = (longs)even, b = (longs)odd;
+    const longs ahead = (a & low) | (b & ~low), swapped = (a & ~low) | (b & low);
+    return (vec)ahead + (vec)(swapped << 32 | swapped >> 32);
+}
+
+INLINE half_there half(vec twice) { return __builtin_convertvector((longs)twice, half_there); }
+
+/* Outputs of `count` successive positions for a vector of channels, or half of one. */
+INLINE void convolve(const Engine *e, const float *x, int64_t channel, vec *out, int count, int full)
+{
+    const int64_t width = e->width, wide = full ? 2 : 1;
+    const float *kernels = e->kernels + 2 * channel, *biases = e->biases + 2 * channel;
+    vec sums[POSITIONS][2];
+    EACH(p, count) EACH(v, wide) sums[p][v] = load(biases + v * LANES);
+    for (int64_t k = 0; k < e->span; k += 2, kernels += e->kernel_row) {
+        vec weights[2];
+        EACH(v, wide) weights[v] = load(kernels + v * LANES);
+        EACH(p, count) {
+            const vec taps = (vec)(*(const pair_there *)(x + p * width + k) + (longs){0});
+            EACH(v, wide) sums[p][v] += weights[v] * taps;
+        }
+    }
+    EACH(p, count) out[p] = untangled(sums[p][0], sums[p][wide - 1]);
+}
+
+/* Not inlined, so that all registers are its own. */
+__attribute__((noinline)) static void convolve_block(const Engine *e, const float *x,
+                                                     int64_t channel, vec *out, int full)
+{
+    if (full) convolve(e, x, channel, out, POSITIONS, 1);
+    else convolve(e, x, channel, out, POSITIONS, 0);
+}
 
 /* Pooled times from..until and their features f..f+columns, with any padding. */
 typedef struct { int64_t from, until, f, columns; } Chunk;
@@ -140,7 +182,7 @@ INLINE void fetch(const void *from, int64_t bytes)
 
 /* Convolve, pool and activate a chunk of one window, for a vector of channels or half of one;
  * meanwhile fetch `next` into the cache. */
-INLINE void pool(const Engine *e, const sample *x, const sample *next, Chunk now, int64_t channel,
+INLINE void pool(const Engine *e, const float *x, const float *next, Chunk now, int64_t channel,
                  float *feature, int32_t *place, int full)
 {
     const int64_t width = e->width, first = now.from * e->pool, last = now.until * e->pool;
@@ -253,18 +295,18 @@ static double head(const Engine *e, const float *target, float scale, float *act
 
 /* to (2 channels of wide vectors) += d times the window at the maximum, over n times. Two channels at
  * once wait less for their last sums. */
-INLINE void weigh(const Engine *e, const sample *x, const float *d, const int32_t *place, int64_t n,
+INLINE void weigh(const Engine *e, const float *x, const float *d, const int32_t *place, int64_t n,
                   float *to, int wide)
 {
     vec sums[2][MOST];
     EACH(i, 2) EACH(v, wide) sums[i][v] = load(to + i * e->span + v * LANES);
     for (int64_t t = 0; t < n; t++, d += e->channels, place += e->channels)
-        EACH(i, 2) EACH(v, wide) sums[i][v] += d[i] * samples(x + place[i] + v * LANES);
+        EACH(i, 2) EACH(v, wide) sums[i][v] += d[i] * load(x + place[i] + v * LANES);
     EACH(i, 2) EACH(v, wide) store(to + i * e->span + v * LANES, sums[i][v]);
 }
 
 /* The convolution's gradient from n pooled times of one window; meanwhile fetch `next`. */
-static void convolution_gradient(const Engine *e, const sample *x, const sample *next,
+static void convolution_gradient(const Engine *e, const float *x, const float *next,
                                  const float *d, const int32_t *place, int64_t n)
 {
     const int64_t part = e->refetch * n * e->pool * e->width / e->channels;
@@ -308,7 +350,7 @@ static void forward(const Engine *e, const int64_t *order, int64_t n, Chunk now)
         for (int64_t c = 0; c < e->channels; c += LANES) {
             float *feature = e->feature + b * e->features + now.f + c;
             int32_t *place = e->place + b * e->features + now.f + c;
-            const sample *x = e->inputs + order[b] * window, *then = e->inputs + next;
+            const float *x = e->inputs + order[b] * window, *then = e->inputs + next;
             if (e->channels - c < LANES) pool(e, x, then, now, c, feature, place, 0);
             else pool(e, x, then, now, c, feature, place, 1);
         }
@@ -366,26 +408,16 @@ static double step(const Engine *e, const int64_t *order, int64_t n, float rate,
     return loss;
 }
 
-/* Whether it can be used on this system. */
-int fused_usable(void)
-{
-    const int usable = begin();
-    if (usable) end();
-    return usable;
-}
-
 /* Train on the n examples in this order (and read one index more), in batches; `steps` were made
  * before. Returns the sum of squared errors, each as it was before its batch's step. */
 double fused_epoch(const Engine *e, const int64_t *order, int64_t n, int64_t batch, int64_t steps,
                    double learning_rate)
 {
     double loss = 0;
-    begin();
     for (int64_t done = 0; done < n; done += batch) {
         const double first = 1 - pow(0.9, (double)++steps), second = 1 - pow(0.999, (double)steps);
         loss += step(e, order + done, smaller(batch, n - done), (float)(learning_rate / first),
                      (float)(1 / sqrt(second)));
     }
-    end();
     return loss;
 }

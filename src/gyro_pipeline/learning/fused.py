@@ -1,8 +1,7 @@
 """The training step in C, for one thread of a CPU: the packed path's results, several times faster.
 
-The source, ``fused.c``, is compiled at first use by the system's C compiler into the user's cache,
-for samples in float32 or in bfloat16. Without a compiler, or without a processor that multiplies
-bfloat16, nothing is lost but time: :func:`available` says no and training runs in PyTorch.
+The source, ``fused.c``, is compiled at first use by the system's C compiler into the user's cache.
+Without a compiler nothing is lost but time: :func:`available` says no and training runs in PyTorch.
 """
 
 import ctypes
@@ -19,37 +18,30 @@ import numpy as np
 import torch
 
 from gyro_pipeline.learning.network import Architecture, CalibrationNetwork
-from gyro_pipeline.learning.packing import CACHE_LINE, aligned_zeros, packed_shape, to_bfloat16
+from gyro_pipeline.learning.packing import CACHE_LINE, aligned_zeros, packed_shape
 from gyro_pipeline.learning.trainer import TorchEngine
-from gyro_pipeline.parameters import Precision
 
 logger = logging.getLogger(__name__)
 
-SOURCES = tuple(
-    Path(__file__).with_name(name) for name in ("fused.c", "fused_float32.h", "fused_bfloat16.h")
-)
-"""The first is compiled and includes one of the others."""
+SOURCE = Path(__file__).with_name("fused.c")
 
 _CACHE = "GYRO_PIPELINE_CACHE"
 # Without -ffast-math: gcc would link code that flushes denormals to zero in the whole process, and
 # a loss that is not a number could pass for one.
 _FLAGS = "-std=gnu11 -O3 -ffp-contract=fast -fno-math-errno -fno-trapping-math -shared -fPIC"
-_DEFINED: dict[Precision, list[str]] = {"float32": [], "bfloat16": ["-DBF16"]}
 _NATIVE = ("-march=native", "-mcpu=native", "")
 """What compilers call the processor of this machine; the last compiles for any of its kind."""
 _TIMEOUT_S = 120
-
-_SAMPLE: dict[Precision, type[np.generic]] = {"float32": np.float32, "bfloat16": np.uint16}
 
 # Floats that fit a second cache of 1 MB beside all else; measured, and not critical.
 _WINDOW_CHUNK, _WINDOWS, _WEIGHTS = 20 << 10, 64 << 10, 128 << 10
 
 
 @functools.cache
-def available(precision: Precision = "float32") -> bool:
+def available() -> bool:
     """Whether the fused step can be used here; if not, the log says why, once."""
     try:
-        _check(precision)
+        _check()
     except (OSError, RuntimeError, subprocess.SubprocessError) as reason:
         logger.info("training in PyTorch, not in the several times faster C step: %s", reason)
         return False
@@ -66,9 +58,8 @@ class FusedEngine:
 
         Args:
             network: On the CPU.
-            inputs: Packed windows, shape (n, blocks, width), scaled and finite (a maximum passes
-                over what is not a number), float32 or bfloat16 as
-                :func:`~gyro_pipeline.learning.packing.to_bfloat16` has it; used where they are.
+            inputs: Packed windows, shape (n, blocks, width), float32, scaled and finite (a
+                maximum passes over what is not a number); used where they are.
             targets: Shape (n, gyroscopes), float32, scaled; used where they are.
             batch_size: Examples per step.
 
@@ -78,10 +69,9 @@ class FusedEngine:
             RuntimeError: If the step could not be compiled; ask :func:`available` first.
         """
         a = network.architecture
-        precision: Precision = "bfloat16" if inputs.dtype == np.uint16 else "float32"
-        _demand("inputs", inputs, (len(inputs), *packed_shape(a)), _SAMPLE[precision])
-        _demand("targets", targets, (len(inputs), a.gyroscopes), np.float32)
-        self._library, self._batch_size, self._steps = _library(precision), batch_size, 0
+        _demand("inputs", inputs, (len(inputs), *packed_shape(a)))
+        _demand("targets", targets, (len(inputs), a.gyroscopes))
+        self._library, self._batch_size, self._steps = _library(), batch_size, 0
         layout = _Layout(a, min(batch_size, len(inputs)))
         self._index = layout.index
         self._arrays = {name: aligned_zeros((floats,)) for name, floats in layout.arrays.items()}
@@ -236,28 +226,26 @@ def _up(size: int, multiple: int) -> int:
     return -(-size // multiple) * multiple
 
 
-def _demand(name: str, array: np.ndarray, shape: tuple[int, ...], dtype: type) -> None:
-    if array.shape != shape or array.dtype != dtype or not array.flags.c_contiguous:
+def _demand(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
+    if array.shape != shape or array.dtype != np.float32 or not array.flags.c_contiguous:
         raise ValueError(
-            f"{name}: expected contiguous {dtype.__name__} of shape {shape}, "
+            f"{name}: expected contiguous float32 of shape {shape}, "
             f"got {array.dtype} of shape {array.shape}"
         )
 
 
 @functools.cache
-def _library(precision: Precision) -> ctypes.CDLL:
+def _library() -> ctypes.CDLL:
     """The compiled step, from the cache if it is there."""
     compiler = _compiler()
     native, described = _native(compiler)
-    command = [*compiler, *_FLAGS.split(), *native, *_DEFINED[precision]]
-    sources = [path.read_bytes() for path in SOURCES]
-    key = hashlib.sha256(b"\0".join([*sources, " ".join(command).encode(), described])).hexdigest()
+    command = [*compiler, *_FLAGS.split(), *native]
+    parts = [SOURCE.read_bytes(), " ".join(command).encode(), described]
+    key = hashlib.sha256(b"\0".join(parts)).hexdigest()
     path = _cache() / f"fused-{key[:16]}.so"
     if not path.exists():
         _compile(command, path)
     library = ctypes.CDLL(str(path))  # lets go of the interpreter lock while it runs
-    if not library.fused_usable():
-        raise RuntimeError(f"the system does not let this process multiply {precision}")
     library.fused_epoch.restype = ctypes.c_double
     library.fused_epoch.argtypes = [
         *(ctypes.POINTER(_Engine), ctypes.c_void_p),
@@ -293,7 +281,7 @@ def _compile(command: list[str], path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         made = Path(folder) / path.name
-        command = [*command, str(SOURCES[0]), "-lm", "-o", str(made)]
+        command = [*command, str(SOURCE), "-lm", "-o", str(made)]
         done = _run(command)
         if done.returncode != 0:
             raise RuntimeError(_failure(command, done))
@@ -316,7 +304,7 @@ def _cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gyro_pipeline"
 
 
-def _check(precision: Precision) -> None:
+def _check() -> None:
     """Train a small network that uses every part of the code, and compare with PyTorch."""
     a = Architecture(gyroscopes=3, window=157, channels=19, kernel=19, stride=7, pool=3, hidden=18)
     random = np.random.default_rng(0)
@@ -324,8 +312,6 @@ def _check(precision: Precision) -> None:
         torch.manual_seed(0)
         network, got = CalibrationNetwork(a), CalibrationNetwork(a)
     inputs = random.normal(size=(11, *packed_shape(a))).astype(np.float32)
-    if precision == "bfloat16":
-        inputs = to_bfloat16(inputs)
     targets = random.normal(size=(11, a.gyroscopes)).astype(np.float32)
     engine = FusedEngine(network, inputs, targets, batch_size=4)
     engine.epoch(np.arange(11), learning_rate=1e-3)

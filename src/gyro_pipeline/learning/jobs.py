@@ -2,15 +2,13 @@
 
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, ClassVar
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import torch
-from numpy.typing import ArrayLike
 
-from gyro_pipeline.conventions import BIAS
 from gyro_pipeline.learning import fused
 from gyro_pipeline.learning.examples import (
     Device,
@@ -21,7 +19,7 @@ from gyro_pipeline.learning.examples import (
 )
 from gyro_pipeline.learning.fused import FusedEngine
 from gyro_pipeline.learning.network import Architecture, CalibrationNetwork
-from gyro_pipeline.learning.packing import pack, to_bfloat16
+from gyro_pipeline.learning.packing import pack
 from gyro_pipeline.learning.trainer import TorchEngine, Trained, predict, train
 from gyro_pipeline.parameters import Training
 
@@ -40,13 +38,13 @@ class TrainingJob:
 
     Attributes:
         name: Shown while it runs.
-        devices: Training devices and recordings; the first holds the test IMU.
-        validation: The test device on the validation recordings; None without.
+        devices: Training devices and their windows; the first is the one that is estimated.
+        validation: The first device and its windows to validate on; None without.
         window: Samples.
         settings: The network's sizes and schedule.
         seed: Of the initial weights and the order of examples.
-        cell: Equal for jobs that differ in their seeds alone, so that they can share examples;
-            None where that is not known.
+        cell: Equal for jobs of the same sizes that differ in their seeds alone, so that they can
+            share examples; None where that is not known.
     """
 
     name: str
@@ -66,7 +64,7 @@ class TrainingJob:
     @property
     def windows(self) -> int:
         """Training examples."""
-        return sum(sum(device.windows(self.window)) for device in self.devices)
+        return sum(device.windows for device in self.devices)
 
     @property
     def recordings(self) -> int:
@@ -83,7 +81,7 @@ class TrainingJob:
     @property
     def work(self) -> float:
         """Estimated cost of the training, in samples of three gyroscopes."""
-        epochs = len(self.settings.learning_rates())
+        epochs = len(self.settings.learning_rates(self.windows))
         return self.recordings * RECORDING_WORK + epochs * self.epoch_work
 
 
@@ -111,9 +109,7 @@ def run_training(job: TrainingJob, report: Callable[[float], None]) -> TrainedNe
     torch.set_num_threads(1)
     torch.use_deterministic_algorithms(True)
     examples, validation, scaling = prepared(job, lambda: report(RECORDING_WORK))
-    if job.settings.precision == "bfloat16":
-        examples = replace(examples, inputs=to_bfloat16(examples.inputs))
-    compiled = fused.available(job.settings.precision)
+    compiled = fused.available()
     trained = train(
         initial_network(job.architecture, job.seed),
         examples,
@@ -193,11 +189,8 @@ def shuffling(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-class NetworkEstimator:
-    """A stored network as an estimator: windows in, biases out. It has no sigma."""
-
-    recommended: ClassVar[bool] = False
-    uses_prior: ClassVar[bool] = True  # the centres, and what it learned of the biases' spread
+class StoredNetwork:
+    """A network from its artifact: windows in, biases out."""
 
     def __init__(self, artifact: Mapping[str, Any], weights: str) -> None:
         """Restore a network.
@@ -206,34 +199,21 @@ class NetworkEstimator:
             artifact: From :class:`TrainedNetwork`.
             weights: ``last`` or ``best``.
         """
-        scaling = artifact["scaling"]
-        self._scaling = Scaling(
-            [scaling["centre"].numpy()], scaling["input_scale"], scaling["target_scale"]
-        )
+        self._scaling = artifact["scaling"]
         self._network = CalibrationNetwork(Architecture(**artifact["architecture"]))
         self._network.load_state_dict(artifact[weights])
 
-    def estimate(
-        self,
-        windows: np.ndarray,
-        target: str = BIAS,
-        start_s: ArrayLike = 0.0,
-        recording: int | None = None,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Biases of all gyroscopes the network sees, the same for every target and place.
+    def biases(self, windows: np.ndarray) -> np.ndarray:
+        """Biases of all gyroscopes the network sees.
 
         Args:
             windows: Shape (n, gyroscopes, window), deg/s.
-            target: Not used: the network was trained on means of whole recordings.
-            start_s: Not used.
-            recording: Not used.
 
         Returns:
-            Biases, shape (n, gyroscopes), deg/s, and NaN in place of their sigma.
+            Shape (n, gyroscopes), deg/s.
         """
-        centre = self._scaling.centres[0]
-        scaled = (windows - centre[:, None].astype(np.float32)) / self._scaling.input_scale
+        centre = self._scaling["centre"].numpy()
+        scaled = (windows - centre[:, None].astype(np.float32)) / self._scaling["input_scale"]
         packed = pack(scaled.transpose(1, 0, 2), self._network.architecture)
         outputs = predict(self._network, torch.from_numpy(packed)).double().numpy()
-        biases = centre + self._scaling.target_scale * outputs
-        return biases, np.full(biases.shape, np.nan)
+        return np.asarray(centre + self._scaling["target_scale"] * outputs)

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -79,23 +78,16 @@ class CalibrationNetwork(nn.Module):
     def forward_packed(self, packed: Tensor) -> Tensor:
         """Biases of windows from :func:`gyro_pipeline.learning.packing.pack`, several times faster.
 
-        Windows in bfloat16 meet kernels that are rounded to it as well. Products, sums and all
-        that follows are float32, and gradients are as if nothing had been rounded.
-
         Args:
-            packed: Shape (n, blocks, width), scaled, float32 or bfloat16.
+            packed: Shape (n, blocks, width), scaled.
 
         Returns:
             Shape (n, gyroscopes), scaled.
         """
         a = self.architecture
         taps, width = -(-a.kernel // a.stride), packed.shape[2]
-        weight = self.convolution.weight
-        if packed.dtype == torch.bfloat16:
-            packed = packed.float()
-            weight = as_bfloat16(weight)
         # (channels, gyroscopes, kernel) -> (channels, width, 1, taps): one tap is one block.
-        weight = functional.pad(weight, (0, taps * a.stride - a.kernel))
+        weight = functional.pad(self.convolution.weight, (0, taps * a.stride - a.kernel))
         weight = weight.unflatten(2, (taps, a.stride)).permute(0, 1, 3, 2).flatten(1, 2)
         weight = functional.pad(weight, (0, 0, 0, width - weight.shape[1])).unsqueeze(2)
         # Time is the image's row, since kernels work on several outputs of one row at once.
@@ -107,8 +99,3 @@ class CalibrationNetwork(nn.Module):
     def _head(self, pooled: Tensor) -> Tensor:
         features = functional.leaky_relu(pooled, SLOPE).flatten(1)  # (n, pooled * channels)
         return self.output(functional.leaky_relu(self.hidden(features), SLOPE))
-
-
-def as_bfloat16(weight: Tensor) -> Tensor:
-    """The nearest numbers of bfloat16, with the gradient of what was not rounded."""
-    return weight + (weight.bfloat16().to(weight.dtype) - weight).detach()

@@ -8,7 +8,6 @@ padded with zeros, and is faster the more the kernel overlaps itself.
 import math
 
 import numpy as np
-import torch
 
 from gyro_pipeline.learning.network import Architecture
 
@@ -58,15 +57,3 @@ def aligned_zeros(shape: tuple[int, ...]) -> np.ndarray:
     room = np.zeros(size + CACHE_LINE, np.float32)
     start = -(room.ctypes.data // room.itemsize) % CACHE_LINE
     return room[start : start + size].reshape(shape)
-
-
-def to_bfloat16(packed: np.ndarray) -> np.ndarray:
-    """Packed windows rounded to bfloat16: half the memory, for processors that multiply it.
-
-    Args:
-        packed: Float32 of any shape.
-
-    Returns:
-        Their bits, uint16 of the same shape, as NumPy has no such type.
-    """
-    return torch.from_numpy(packed).bfloat16().view(torch.uint16).numpy()

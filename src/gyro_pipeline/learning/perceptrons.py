@@ -82,7 +82,9 @@ def train_perceptrons(
         loss.backward()
         optimizer.step()
         schedule.step()
-    return networks
+    return Perceptrons(
+        [(weights.detach(), offsets.detach()) for weights, offsets in networks.layers]
+    )
 
 
 def _initial(

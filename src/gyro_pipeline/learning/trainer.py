@@ -52,8 +52,7 @@ class TorchEngine:
 
     Args:
         network: Trained in place.
-        inputs: Packed windows, shape (n, blocks, width), scaled, float32 or bfloat16; on the
-            device for good.
+        inputs: Packed windows, shape (n, blocks, width), scaled; on the device for good.
         targets: Shape (n, gyroscopes), scaled.
         batch_size: Examples per step; the last one of an epoch may be smaller.
     """
@@ -113,7 +112,8 @@ def train(
     steps = engine(network, training.inputs, training.targets, schedule.batch_size)
     watched = None if validation is None else _tensors(validation, _device(network))
     rows, best, lowest = [], None, np.inf
-    for epoch, rate in enumerate(schedule.learning_rates().tolist(), start=1):
+    rates = schedule.learning_rates(len(training.inputs)).tolist()
+    for epoch, rate in enumerate(rates, start=1):
         order = torch.randperm(len(training.inputs), generator=shuffling).numpy()
         row = {"epoch": epoch, "learning_rate": rate, "train_loss": steps.epoch(order, rate)}
         if not np.isfinite(row["train_loss"]):
@@ -144,10 +144,9 @@ def _device(network: CalibrationNetwork) -> torch.device:
 
 
 def _tensors(examples: Examples, device: torch.device) -> tuple[Tensor, Tensor]:
-    inputs = torch.from_numpy(examples.inputs)
-    if inputs.dtype == torch.uint16:
-        inputs = inputs.view(torch.bfloat16)
-    return inputs.to(device), torch.from_numpy(examples.targets).to(device)
+    arrays = examples.inputs, examples.targets
+    inputs, targets = (torch.from_numpy(array).to(device) for array in arrays)
+    return inputs, targets
 
 
 def _weights(network: CalibrationNetwork) -> StateDict:

@@ -1,4 +1,4 @@
-"""Trainings by the means there are: many at once on a GPU, or one per core."""
+"""Many trainings at once, in batches that fit the memory of a GPU."""
 
 import os
 import time
@@ -9,8 +9,8 @@ from itertools import groupby
 import psutil
 import torch
 
-from gyro_pipeline.executors import run_batches, run_jobs
-from gyro_pipeline.learning import batched, fused
+from gyro_pipeline.executors import run_batches
+from gyro_pipeline.learning import batched
 from gyro_pipeline.learning.batched import Learner, train_together
 from gyro_pipeline.learning.examples import Examples, Scaling
 from gyro_pipeline.learning.jobs import (
@@ -18,12 +18,10 @@ from gyro_pipeline.learning.jobs import (
     TrainingJob,
     initial_network,
     prepared,
-    run_training,
     shuffling,
     stored,
 )
 from gyro_pipeline.learning.packing import packed_shape
-from gyro_pipeline.parameters import Execution
 
 _SHARE = 0.8
 """Of the free memory that is planned for; the rest is for what the estimate does not know."""
@@ -31,30 +29,37 @@ _RECORDING = 10
 """What reading, scaling and packing one costs, in steps: a guess, no GPU has timed it yet."""
 
 
+def batch_device(executor: str) -> torch.device | None:
+    """Where many networks are trained at once; None where they are trained one by one.
+
+    Args:
+        executor: ``auto`` is ``batched`` where there is a GPU.
+    """
+    cuda = torch.cuda.is_available()
+    if executor == "batched" or (executor == "auto" and cuda):
+        return torch.device("cuda" if cuda else "cpu")
+    return None
+
+
 def run_trainings(
-    jobs: Sequence[TrainingJob], execution: Execution, label: str
-) -> Iterator[tuple[TrainingJob, TrainedNetwork]]:
-    """Train all networks and yield each when it is finished.
+    jobs: Sequence[TrainingJob], executor: str, label: str
+) -> Iterator[tuple[int, TrainedNetwork]]:
+    """Train all networks in batches, in this process.
 
     Args:
         jobs: Independent of each other.
-        execution: Which executor; ``auto`` is ``batched`` where there is a GPU, else
-            ``processes``.
+        executor: As for :func:`batch_device`, which must have a device for it.
         label: Names the work in progress lines.
 
     Yields:
-        A job and its result.
+        The number of a job and its result, as it is finished.
     """
-    cuda = torch.cuda.is_available()
-    if execution.executor == "batched" or (execution.executor == "auto" and cuda):
-        device = torch.device("cuda" if cuda else "cpu")
-        batches = in_batches(jobs, device, free_memory(device))
-        yield from run_batches(batches, train_batch, label, "trainings")
-        return
-    if jobs:
-        # compiled, or said why not, before the workers need it
-        fused.available(jobs[0].settings.precision)
-    yield from run_jobs(jobs, run_training, execution, label, "trainings")
+    device = batch_device(executor)
+    assert device is not None
+    numbers = {id(job): number for number, job in enumerate(jobs)}
+    batches = in_batches(jobs, device, free_memory(device))
+    for job, trained in run_batches(batches, train_batch, label, "trainings"):
+        yield numbers[id(job)], trained
 
 
 @dataclass(frozen=True)
@@ -77,9 +82,9 @@ class TrainingBatch:
     @property
     def work(self) -> float:
         """Estimated cost, in steps of all networks at once."""
-        steps = max(-(-job.windows // job.settings.batch_size) for job in self.jobs)
-        epochs = len(self.jobs[0].settings.learning_rates())
-        return steps * epochs + _RECORDING * sum(job.recordings for job in self.cells.values())
+        return max(map(_steps, self.jobs)) + _RECORDING * sum(
+            job.recordings for job in self.cells.values()
+        )
 
 
 def in_batches(
@@ -168,9 +173,14 @@ def estimated_bytes(jobs: Sequence[TrainingJob]) -> float:
     return 4.0 * (len(jobs) * network + examples)
 
 
+def _steps(job: TrainingJob) -> int:
+    epochs = len(job.settings.learning_rates(job.windows))
+    return epochs * -(-job.windows // job.settings.batch_size)
+
+
 def _examples(job: TrainingJob) -> int:
     """Training and validation windows."""
-    return job.windows + (sum(job.validation.windows(job.window)) if job.validation else 0)
+    return job.windows + (job.validation.windows if job.validation else 0)
 
 
 def _sizes(job: TrainingJob) -> str:

@@ -4,6 +4,7 @@ Samples that hold no measurement are NaN; they are in no sum and no count.
 """
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 
@@ -46,6 +47,22 @@ def fill_masked(samples: NDArray[np.floating]) -> NDArray[np.floating]:
         return samples
     means = recording_mean(samples)[..., None].astype(samples.dtype)
     return np.where(masked, means, samples)
+
+
+def windows_at(
+    samples: NDArray[np.floating], size: int, starts: NDArray[np.integer]
+) -> NDArray[np.floating]:
+    """Windows of a recording; masked samples are the mean of their window.
+
+    Args:
+        samples: (..., n), deg/s; NaN where masked.
+        size: Samples of a window.
+        starts: First samples of the windows, which may overlap, (windows,).
+
+    Returns:
+        (..., windows, size), a copy.
+    """
+    return fill_masked(sliding_window_view(samples, size, axis=-1)[..., starts, :])
 
 
 def settling_time_s(

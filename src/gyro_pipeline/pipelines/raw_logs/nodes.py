@@ -10,10 +10,9 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from gyro_pipeline import quality as checks
 from gyro_pipeline.conventions import AXES, InputError
 from gyro_pipeline.executors import run_jobs
-from gyro_pipeline.fingerprints import code_hash, fingerprint, package_hash
+from gyro_pipeline.fingerprints import code_hash, fingerprint
 from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding, Listing, Logs, Recording
 from gyro_pipeline.parameters import Execution, Quality, Splits
 from gyro_pipeline.protocol import inspection
@@ -45,9 +44,9 @@ def inspect_logs(
     Yields:
         What there is to read, then the recordings that were not read before, as they are done.
     """
-    code = package_hash(checks), code_hash([inspection])
+    code = code_hash("gyro_pipeline.quality", inspection.__name__)
     judged_by = quality.model_dump(mode="json", exclude={"needed_pct"})  # which is of all together
-    settings = [judged_by, files.rate_hz, *code]
+    settings = [judged_by, files.rate_hz, code]
     jobs = {
         (entry.imu, entry.recording): Inspection(
             entry, files.rate_hz, quality, fingerprint([entry.key, settings])

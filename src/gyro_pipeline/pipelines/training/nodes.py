@@ -18,7 +18,7 @@ from gyro_pipeline.conventions import (
     TEST,
     InputError,
 )
-from gyro_pipeline.estimators import estimator_class, estimator_path, make_estimator
+from gyro_pipeline.estimators import entry, estimator_class, make_estimator
 from gyro_pipeline.estimators.fitting import FitJob, run_fits
 from gyro_pipeline.estimators.training import TrainingSet
 from gyro_pipeline.fingerprints import code_hash, data_hash, fingerprint
@@ -149,15 +149,19 @@ def _content(spec: RunSpec, sets: TrainingSets, settings: Training) -> list[Any]
     """All that a run depends on: code, settings, data and windows, but not its study."""
     estimator = estimator_class(spec.estimator)
     return [
-        code_hash("gyro_pipeline.estimators.fitting", estimator_path(spec.estimator)),
+        code_hash("gyro_pipeline.estimators.fitting", entry(spec.estimator)),
         spec.estimator,
         [sets.recordings.attrs["data_hash"]] if spec.real_imus else [],
         [sets.virtual.attrs["data_hash"]] if spec.virtual_imus and sets.virtual else [],
-        {fold: training.windows_hash for fold, training in sets.of(spec).items()},
-        data_hash(pd.util.hash_pandas_object(_tests(sets.table_of(spec))).to_numpy(), None),
+        {fold: _hash(training.windows) for fold, training in sets.of(spec).items()},
+        _hash(_tests(sets.table_of(spec))),
         [spec.seed, settings.model_dump()] if estimator.seeded else [],
         [spec.sensor, spec.method, spec.window_s],
     ]
+
+
+def _hash(windows: pd.DataFrame) -> str:
+    return data_hash(pd.util.hash_pandas_object(windows, index=False).to_numpy(), None)
 
 
 def _tests(table: pd.DataFrame) -> pd.DataFrame:
@@ -173,10 +177,10 @@ def _problem(spec: RunSpec, folds: Mapping[str, TrainingSet], settings: Training
     """
     estimator = make_estimator(spec.estimator, settings, spec.seed)
     for fold, training in folds.items():
-        if training.recordings_of_device < estimator.fewest_recordings:
+        if training.recordings() < estimator.fewest_recordings:
             return (
                 f"{fold}: {spec.estimator} needs {estimator.fewest_recordings} training "
-                f"recordings, got {training.recordings_of_device}"
+                f"recordings, got {training.recordings()}"
             )
     estimator.work(next(iter(folds.values())))
     return ""
