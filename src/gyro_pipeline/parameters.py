@@ -461,7 +461,7 @@ class Study(Parameter):
         return self.protocol == LEAVE_ONE_DEVICE_OUT
 
     @property
-    def estimators_of(self) -> dict[str, list[str]]:
+    def estimators_of(self) -> dict[Protocol, list[str]]:
         """Estimators of each protocol."""
         return {self.protocol: self.estimators} | dict(self.also)
 

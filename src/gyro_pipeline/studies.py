@@ -78,18 +78,29 @@ def study_rows(  # noqa: PLR0917 - what a grid is made of
     rows = [
         RunSpec(
             *(study.experiment, sensor, source, protocol, estimator),
-            *(grid.method, real, virtual, float(window_s), float(stride_s or window_s), seed),
+            method=grid.method,
+            real_gyros=real,
+            virtual_gyros=virtual,
+            window_s=float(window_s),
+            window_stride_s=float(stride_s or window_s),
+            seed=seed,
         )
-        for window_s, stride_s in product(study.windows_s or windows_s, study.strides_s or [None])
+        for window_s, stride_s in product(study.windows_s or windows_s, study.strides_s or [0])
         for protocol, estimators in study.estimators_of.items()
         for estimator, real, virtual, seed in product(
             estimators, grid.real_gyros, grid.virtual_gyros, seeds
         )
     ]
     rows = [row for row in rows if all(getattr(row, key) == v for key, v in wanted.items())]
-    least = {"real_gyros": min(grid.real_gyros), "virtual_gyros": 0, "seed": 0}
     means = [
-        replace(row, protocol=study.protocol, estimator=MEAN, method=grid.method, **least)
+        replace(
+            row,
+            protocol=study.protocol,
+            estimator=MEAN,
+            real_gyros=min(grid.real_gyros),
+            virtual_gyros=0,
+            seed=0,
+        )
         for row in rows
     ]
     return [*dict.fromkeys(means), *(row for row in rows if row.estimator != MEAN)]

@@ -29,6 +29,7 @@ EVALUATED_WITH = "evaluated_with"
 """Tag: hash of how the run was evaluated. Another hash evaluates again, without training."""
 
 HISTORY, SCORES, ERRORS = "history.csv", "scores.csv", "errors.parquet"
+CURVE = "running_mean_curve.parquet"
 """Artifacts of a run."""
 
 MODEL = "model"

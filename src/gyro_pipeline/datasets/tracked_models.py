@@ -71,7 +71,8 @@ def model_fit_uri(client: MlflowClient, run: Run) -> str:
 
 def model_of(run: Run) -> str | None:
     """Id of the model of a run, if it has one."""
-    return next((output.model_id for output in run.outputs.model_outputs), None)
+    outputs = run.outputs.model_outputs if run.outputs else []
+    return next((output.model_id for output in outputs), None)
 
 
 def _new_model(client: MlflowClient, run: Run, estimator: Estimator) -> str:

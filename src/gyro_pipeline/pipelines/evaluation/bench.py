@@ -104,16 +104,17 @@ class Bench:
     def tested(self) -> list[TestRecording]:
         """The recordings that test, with what is needed to judge an estimate."""
         drawn, tested = "true_bias" in self.recordings, []
-        for (imu, number), rows in self.tests.groupby(["imu", "recording"]):
+        for place, rows in self.tests.groupby(["imu", "recording"]):
+            imu, number = map(int, map(str, place))
             recording = self.recordings.sel(imu=imu, recording=number)
             tested.append(
                 TestRecording(
-                    number=int(number),
+                    number=number,
                     samples=recording.angular_rate.to_numpy(),
                     rate_hz=self.recordings.attrs["rate_hz"],
-                    noise=self.device.figures[self._axes(int(imu))],
+                    noise=self.device.figures[self._axes(imu)],
                     true_bias=recording.true_bias.to_numpy() if drawn else None,
-                    imu=int(imu),
+                    imu=imu,
                     tested=np.unique(rows.start.to_numpy()),
                 )
             )

@@ -16,7 +16,8 @@ from gyro_pipeline.conventions import (
     PAPER,
     TEST,
 )
-from gyro_pipeline.estimators.base import ORIENTATION_NOTE, Estimator
+from gyro_pipeline.estimators import ORIENTATION_NOTE
+from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.fingerprints import code_hash, fingerprint
 from gyro_pipeline.parameters import Evaluation
 from gyro_pipeline.pipelines.evaluation.bench import Bench

@@ -134,9 +134,9 @@ def label_recordings(
     lengths = (used["stop"] - used["start"]).unstack(fill_value=0)
     samples = lengths.reindex(index=imus, columns=numbers, fill_value=0).to_numpy(np.int64)
     coordinates: dict[str, Any] = {"imu": imus, "recording": numbers, "axis": list(AXES)}
-    given = {entry.recording: entry.split for entry in files.entries}
+    given = {entry.recording: entry.split for entry in files.entries if entry.split}
     of_tested = used.loc[[used.index[0][0]]].index.get_level_values("recording").tolist()
-    split = split_recordings(numbers, of_tested, splits, given if any(given.values()) else None)
+    split = split_recordings(numbers, of_tested, splits, given or None)
     if split is not None:
         coordinates["split"] = ("recording", [split[number] for number in numbers])
     measured = used.rate_hz.dropna()

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
-from gyro_pipeline.conventions import AXES, MDPS, TEST_IMU
+from gyro_pipeline.conventions import AXES, MDPS
 from gyro_pipeline.parameters import GroundTruth, Published
 from gyro_pipeline.physics.allan import FLICKER_FLOOR, SHORTEST_FIT_SAMPLES
 from gyro_pipeline.physics.bias import fill_masked, settling_time_s
@@ -210,9 +210,8 @@ def _draw_allan(ax: Axes, allan: xr.Dataset, noise: pd.DataFrame) -> None:
 
 
 def _first(bias: pd.DataFrame) -> pd.Series:
-    """The first axis of IMU 1, or of the first one there is, in its first recording."""
-    imu = TEST_IMU if (bias.imu == TEST_IMU).any() else bias.imu.min()
-    return bias[(bias.imu == imu) & (bias.axis == AXES[0])].sort_values("recording").iloc[0]
+    """The first axis of the first IMU, in its first recording."""
+    return bias[(bias.imu == bias.imu.min()) & (bias.axis == AXES[0])].sort_values("recording").iloc[0]
 
 
 def _samples(recordings: xr.Dataset, one: pd.Series) -> NDArray[np.float64]:

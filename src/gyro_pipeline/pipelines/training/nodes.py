@@ -281,7 +281,7 @@ def _fitted(  # noqa: PLR0917 - what a fit is stored with
         started_ms=int(1000 * began),
         ended_ms=int(1000 * ended),
         is_model=is_model,
-        example=_example(spec, training, sets.recordings) if is_model else None,
+        example=_example(spec, training, sets.recordings),
         dataset={
             "name": f"{spec.sensor} recordings",
             "digest": attributes["data_hash"],

@@ -153,7 +153,8 @@ def split_windows(  # noqa: PLR0917 - a node's arguments are its datasets
     """
     sensor, source = recordings.attrs["sensor"], recordings.attrs["source"]
     rows = study_rows(study, sensor, source, windows_s, [0], only)
-    hashes = contents.set_index(_PLACE).content.to_dict()
+    places = zip(contents.imu.tolist(), contents.recording.tolist(), strict=True)
+    hashes = dict(zip(places, contents.content.tolist(), strict=True))
     drawn_from = [] if virtual is None else np.atleast_1d(virtual.attrs["drawn_from"]).tolist()
     splits = splits.model_copy(update={"folds": study.folds or splits.folds})
     tables = []
@@ -167,8 +168,8 @@ def split_windows(  # noqa: PLR0917 - a node's arguments are its datasets
             table = pd.concat([table, drawn.merge(table[["fold"]].drop_duplicates(), how="cross")])
         if protocol in APART:
             check_table(table, APART[protocol], hashes, drawn_from)
-        place = {"protocol": protocol, "window_s": window_s, "window_stride_s": stride_s}
-        tables.append(table.assign(**place))
+        place = table.assign(protocol=protocol, window_s=window_s, window_stride_s=stride_s)
+        tables.append(place)
     return pd.concat(tables, ignore_index=True)[WINDOWS_TABLE].astype(_COMPACT)
 
 
@@ -235,7 +236,7 @@ def _first_recordings(
     """The first recordings of the tested IMU that have a window, as many as the study uses."""
     own = contents[contents.imu == tested]
     usable = usable_windows(own, samples, size, size).recording.unique()
-    return own[own.recording.isin(usable)].head(study.recordings)
+    return own[own.recording.isin(usable)].iloc[: study.recordings]
 
 
 def _virtual_windows(virtual: xr.Dataset, size: int, splits: Splits) -> pd.DataFrame:
