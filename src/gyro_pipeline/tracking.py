@@ -31,6 +31,9 @@ EVALUATED_WITH = "evaluated_with"
 HISTORY, SCORES, ERRORS = "history.csv", "scores.csv", "errors.parquet"
 """Artifacts of a run."""
 
+DESCRIPTION = "mlflow.note.content"
+"""Tag: the description of a run, a model or an experiment in MLflow's user interface."""
+
 MODEL = "model"
 """Name of the model of a run: ``mlflow.pyfunc.load_model("runs:/RUN/model")``."""
 
