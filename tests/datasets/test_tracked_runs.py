@@ -19,7 +19,7 @@ from kedro.io import DatasetError
 from mlflow import MlflowClient
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.datasets import tracked_runs
+from gyro_pipeline.datasets import run_store
 from gyro_pipeline.datasets.tracked_runs import TrackedRuns, run_link
 from gyro_pipeline.store import relocate
 from gyro_pipeline.tracking import EvaluatedRun, FittedRun, RunIdentity
@@ -629,7 +629,7 @@ def test_a_store_is_there_complete_or_not_at_all(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(tracked_runs, "MlflowClient", interrupted)
+        patch.setattr(run_store, "MlflowClient", interrupted)
         with pytest.raises(KeyboardInterrupt):
             tracked(tmp_path / "mlflow.db").load()
     assert list(tmp_path.iterdir()) == []

@@ -5,11 +5,10 @@ import logging
 import os
 import platform
 import re
-import sqlite3
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -32,10 +31,10 @@ from mlflow.entities import (
     RunTag,
 )
 from mlflow.exceptions import MlflowException
-from mlflow.utils.file_utils import local_file_uri_to_path
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.datasets.atomic import check_writable, replacing
+from gyro_pipeline.datasets.atomic import check_writable
+from gyro_pipeline.datasets.run_store import check_not_moved, check_store, make_store
 from gyro_pipeline.datasets.tracked_models import log_model, model_fit_uri, model_of
 from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.tracking import (
@@ -73,11 +72,6 @@ rest."""
 
 # One bar for each small artifact would bury everything else on a terminal.
 os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
-
-_BUSY_S = 20
-"""How long to wait for another process that writes to the store."""
-
-_MOVED = "type `python -m gyro_pipeline.store --artifacts-in mlruns`"
 
 USER_INTERFACE = "http://127.0.0.1:5000"
 """Where ``mlflow ui`` listens unless told otherwise."""
@@ -184,8 +178,8 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
     def _client(self) -> MlflowClient:
         if self._is_own_file:
             if not self._path.exists():
-                _make_store(self._path)
-            _check_store(self._path)
+                make_store(self._path)
+            check_store(self._path)
             check_writable(self._path.parent / "mlruns" / "artifacts")
         try:
             client = MlflowClient(tracking_uri=self._uri)
@@ -196,7 +190,7 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
             ) from error
         if self._is_own_file:
             for experiment in _pages(client.search_experiments):
-                _check_not_moved(experiment, self._path)
+                check_not_moved(experiment, self._path)
         return client
 
     def _experiments(self) -> list[Experiment]:
@@ -395,46 +389,6 @@ def run_link(runs: Sequence[TrackedRuns]) -> str | None:
     server = first._uri.rstrip("/") if first._uri.startswith("http") else USER_INTERFACE
     query = urlencode({"workflowType": "machine_learning", "viewStateShareKey": name})
     return f"{server}/#/experiments/{experiment.experiment_id}/runs?{query}"
-
-
-def _make_store(path: Path) -> None:
-    """MLflow takes seconds for it, and cannot use one that was left half made."""
-    with replacing(path) as temporary:
-        MlflowClient(f"sqlite:///{temporary}")
-
-
-def _check_store(path: Path) -> None:
-    """Refuse a file that is no MLflow store before MLflow would write into it."""
-    advice = "move it away to start a new store"
-    try:
-        # Writable, so that SQLite can roll back what a killed process left half written.
-        uri = f"{path.resolve().as_uri()}?mode=rw"
-        with closing(sqlite3.connect(uri, uri=True, timeout=_BUSY_S)) as connection:
-            tables = {name for (name,) in connection.execute("select name from sqlite_master")}
-            sound = [row[0] for row in connection.execute("pragma quick_check(1)")]
-    except sqlite3.DatabaseError as error:
-        raise InputError(f"{path}: not a readable SQLite file ({error}); {advice}") from error
-    if sound != ["ok"]:
-        raise InputError(f"{path}: a damaged SQLite file ({sound[0]}); {advice}")
-    if tables and not {"experiments", "alembic_version"} <= tables:
-        raise InputError(
-            f"{path}: expected an MLflow store, got an SQLite file with tables "
-            f"{', '.join(sorted(tables)[:5])}; {advice}"
-        )
-
-
-def _check_not_moved(experiment: Experiment, store: Path) -> None:
-    """Refuse to write artifacts where the store used to be, or where the original of a copy is."""
-    location = experiment.artifact_location
-    if not location.startswith("file:"):
-        return
-    folder, own = Path(local_file_uri_to_path(location)), store.parent.resolve()
-    is_ours = folder.name == experiment.name  # MLflow itself takes the experiment's number
-    if is_ours and own not in {parent.resolve() for parent in folder.parents}:
-        raise InputError(
-            f"{store}: the artifacts of {experiment.name} are to be in {folder.parent}, which is "
-            f"not beside this store; if the project was copied or moved, {_MOVED}"
-        )
 
 
 def _dataset(described: Mapping[str, str]) -> DatasetInput:
