@@ -32,6 +32,9 @@ HISTORY, SCORES, ERRORS = "history.csv", "scores.csv", "errors.parquet"
 CURVE = "running_mean_curve.parquet"
 """Artifacts of a run."""
 
+DESCRIPTION = "mlflow.note.content"
+"""Tag: the description of a run, a model or an experiment in MLflow's user interface."""
+
 MODEL = "model"
 """Name of the model of a run: ``mlflow.pyfunc.load_model("runs:/RUN/model")``."""
 

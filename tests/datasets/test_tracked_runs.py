@@ -1,3 +1,4 @@
+import json
 import logging
 import os
 import shutil
@@ -8,7 +9,6 @@ import sys
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from urllib.parse import parse_qs
 
 import mlflow
 import numpy as np
@@ -19,7 +19,7 @@ from kedro.io import DatasetError
 from mlflow import MlflowClient
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.datasets import tracked_runs
+from gyro_pipeline.datasets import run_store
 from gyro_pipeline.datasets.tracked_runs import TrackedRuns, run_link
 from gyro_pipeline.store import relocate
 from gyro_pipeline.tracking import EvaluatedRun, FittedRun, RunIdentity
@@ -467,6 +467,12 @@ def test_a_run_that_is_not_described_yet_is_described_when_it_is_continued(store
     assert run.params["sensor"] == "dot"
 
 
+def test_a_fold_whose_name_was_cut_off_is_fitted_again(store):
+    run_id = unfinished(store)
+    MlflowClient(f"sqlite:///{store}").set_tag(run_id, "fits", "fold 0; fold 66")
+    assert [run.fits for run in tracked(store).load()] == [{"fold 0"}]
+
+
 def test_a_fit_that_cannot_be_written_is_not_taken_for_stored(store):
     with pytest.raises(DatasetError, match="not to be written"):
         tracked(store).save(fitted(estimator=Unwritable()))
@@ -490,17 +496,19 @@ def test_runs_of_an_older_layout_are_counted_once_and_never_read(store, caplog):
     assert caplog.messages == ["3 runs of an older layout are not read"]
 
 
-def test_a_link_opens_the_runs_of_a_study_best_first(store, monkeypatch):
+def test_a_link_opens_the_runs_of_a_study_best_first(store):
     everywhere = TrackedRuns(str(store), study="real2real")
     assert run_link([everywhere]) is None
     tracked(store).save(fitted())
     sensors = [tracked(store, study="real2real", sensor=sensor) for sensor in ("dot", "ng")]
-    address, _, query = run_link([everywhere, *sensors]).partition("?")
-    assert address == "http://127.0.0.1:5000/#/experiments/1/runs"
-    asked = {key: value for key, (value,) in parse_qs(query).items()}
-    assert asked["searchFilter"] == "tags.layout = '2' and params.source = 'simulated'"
-    assert asked["orderByKey"] == "metrics.`accuracy_gain_pct`"
-    assert "and+params.sensor+%3D+%27dot%27&" in run_link([everywhere, sensors[0]])
+    address = "http://127.0.0.1:5000/#/experiments/1/runs?workflowType=machine_learning"
+    assert run_link([everywhere, *sensors]) == f"{address}&viewStateShareKey=runs_simulated"
+    assert run_link(sensors[:1]) == f"{address}&viewStateShareKey=runs_simulated_dot"
+    tags = MlflowClient(f"sqlite:///{store}").get_experiment("1").tags
+    view = json.loads(tags["mlflow.sharedViewState.runs_simulated_dot"])
+    wanted = "tags.layout = '2' and params.source = 'simulated' and params.sensor = 'dot'"
+    assert view["searchFilter"] == wanted
+    assert view["orderByKey"] == "metrics.`accuracy_gain_pct`"
 
 
 def test_artifacts_are_never_written_to_where_a_copy_is_from(store, tmp_path):
@@ -621,7 +629,7 @@ def test_a_store_is_there_complete_or_not_at_all(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(tracked_runs, "MlflowClient", interrupted)
+        patch.setattr(run_store, "MlflowClient", interrupted)
         with pytest.raises(KeyboardInterrupt):
             tracked(tmp_path / "mlflow.db").load()
     assert list(tmp_path.iterdir()) == []

@@ -17,7 +17,7 @@ from mlflow.types import ParamSchema, ParamSpec, Schema, TensorSpec
 
 from gyro_pipeline.conventions import BIAS
 from gyro_pipeline.estimators.base import Estimator
-from gyro_pipeline.tracking import MODEL
+from gyro_pipeline.tracking import DESCRIPTION, MODEL
 
 # It tells of every model that its example is valid.
 logging.getLogger("mlflow.pyfunc").setLevel(logging.WARNING)
@@ -72,7 +72,7 @@ def model_fit_uri(client: MlflowClient, run: Run) -> str:
 def model_of(run: Run) -> str | None:
     """Id of the model of a run, if it has one."""
     outputs = run.outputs.model_outputs if run.outputs else []
-    return next((output.model_id for output in outputs), None)
+    return outputs[0].model_id if outputs else None
 
 
 def _new_model(client: MlflowClient, run: Run, estimator: Estimator) -> str:
@@ -80,6 +80,7 @@ def _new_model(client: MlflowClient, run: Run, estimator: Estimator) -> str:
         run.info.experiment_id,
         name=MODEL,
         source_run_id=run.info.run_id,
+        tags={DESCRIPTION: run.data.tags[DESCRIPTION]},
         params=run.data.params,
         model_type=type(estimator).__name__,
     )

@@ -5,11 +5,10 @@ import logging
 import os
 import platform
 import re
-import sqlite3
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -30,16 +29,16 @@ from mlflow.entities import (
     Run,
     RunStatus,
     RunTag,
-    ViewType,
 )
 from mlflow.exceptions import MlflowException
-from mlflow.utils.file_utils import local_file_uri_to_path
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.datasets.atomic import check_writable, replacing
+from gyro_pipeline.datasets.atomic import check_writable
+from gyro_pipeline.datasets.run_store import check_not_moved, check_store, make_store
 from gyro_pipeline.datasets.tracked_models import log_model, model_fit_uri, model_of
 from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.tracking import (
+    DESCRIPTION,
     FINGERPRINT,
     HISTORY,
     LAYOUT,
@@ -54,16 +53,14 @@ logger = logging.getLogger(__name__)
 _TRAINED = "trained"
 """Tag, set last: when the last fit ended. A run without it lacks fits."""
 
-_FITS, _BETWEEN = "fits", "; "
-"""Tag, and folder of artifacts: the folds whose fits are stored."""
+_FITS, _END = "fits", "; "
+"""Tag, and folder of artifacts: the folds whose fits are stored. MLflow cuts very long tags."""
 
 _MODEL_FOLD = "model_fold"
 """Tag: the fold whose fit is the model of the run, and is stored nowhere else."""
 
 _OWNER = "process"
 """Tag: the process that writes a run, as ``host pid started``."""
-
-_DESCRIPTION = "mlflow.note.content"
 
 _ABOUT = """Study `{study}` of gyro_pipeline. One run is one row of the study: an estimator, its
 training set, a window length and a seed.
@@ -76,13 +73,25 @@ rest."""
 # One bar for each small artifact would bury everything else on a terminal.
 os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
 
-_BUSY_S = 20
-"""How long to wait for another process that writes to the store."""
-
-_MOVED = "type `python -m gyro_pipeline.store --artifacts-in mlruns`"
-
 USER_INTERFACE = "http://127.0.0.1:5000"
 """Where ``mlflow ui`` listens unless told otherwise."""
+
+_SHARED_VIEW = "mlflow.sharedViewState."
+"""Start of a tag of an experiment: a view of its runs, which the user interface opens by name."""
+
+_COLUMNS = {
+    "params": ("estimator", "real_gyros", "virtual_gyros", "window_s", "seed"),
+    "metrics": ("rmse_mdps", "accuracy_gain_pct", "time_saving_pct", "coverage_95_pct"),
+}
+_VIEW = {
+    "orderByKey": "metrics.`accuracy_gain_pct`",
+    "orderByAsc": False,
+    "startTime": "ALL",
+    "lifecycleFilter": "Active",
+    "datasetsFilter": [],
+    "modelVersionFilter": "All Runs",
+    "selectedColumns": [f"{kind}.`{name}`" for kind in _COLUMNS for name in _COLUMNS[kind]],
+}
 
 _CURVE_POINTS = 50
 
@@ -122,8 +131,8 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
         self.metadata = metadata
         self.provenance: dict[str, str] = {}
         """Tags that every new run gets; set once per ``kedro run``."""
-        self._begun: dict[tuple[str, str], str] = {}
-        """Ids of the runs that fits are added to, by study and fingerprint."""
+        self._begun: dict[tuple[str, str], tuple[str, set[str]]] = {}
+        """Runs that fits are added to, by study and fingerprint: the id, and the folds so far."""
 
     def load(self) -> list[StoredRun]:
         """Runs, newest first.
@@ -140,7 +149,7 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
         for run in list(_pages(partial(search, "attributes.status = 'RUNNING'"))):
             if _is_dead(run.data.tags.get(_OWNER, "")):
                 self._client.set_terminated(run.info.run_id, "KILLED")
-        self._tell_of_older_runs(search)
+        self._tell_of_older_runs()
         wanted = [f"tags.{LAYOUT_TAG} = '{LAYOUT}'"]
         wanted += [f"params.{key} = '{value}'" for key, value in self.only.items()]
         stored = [
@@ -169,8 +178,8 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
     def _client(self) -> MlflowClient:
         if self._is_own_file:
             if not self._path.exists():
-                _make_store(self._path)
-            _check_store(self._path)
+                make_store(self._path)
+            check_store(self._path)
             check_writable(self._path.parent / "mlruns" / "artifacts")
         try:
             client = MlflowClient(tracking_uri=self._uri)
@@ -180,21 +189,24 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
                 "or run `mlflow db upgrade` on it"
             ) from error
         if self._is_own_file:
-            for experiment in _pages(partial(client.search_experiments, ViewType.ACTIVE_ONLY)):
-                _check_not_moved(experiment, self._path)
+            for experiment in _pages(client.search_experiments):
+                check_not_moved(experiment, self._path)
         return client
 
     def _experiments(self) -> list[Experiment]:
-        experiments = _pages(partial(self._client.search_experiments, ViewType.ACTIVE_ONLY))
+        experiments = _pages(self._client.search_experiments)
         return [e for e in experiments if self.study in (None, e.name)]
 
-    def _tell_of_older_runs(self, search: Callable[..., Any]) -> None:
-        """Count the runs that are not read, once for each store."""
+    def _tell_of_older_runs(self) -> None:
+        """Count the runs of all studies that are not read, once for each store."""
         if self._uri in _told_of_older_runs:
             return
         _told_of_older_runs.add(self._uri)
-        earlier = _pages(partial(search, f"tags.{LAYOUT_TAG} IS NULL"))
-        if count := sum(FINGERPRINT in run.data.tags for run in earlier):
+        client = self._client
+        everywhere = [e.experiment_id for e in _pages(client.search_experiments)]
+        wanted = f"tags.{LAYOUT_TAG} IS NULL"
+        runs = _pages(partial(client.search_runs, everywhere, wanted))
+        if count := sum(FINGERPRINT in run.data.tags for run in runs):
             logger.warning("%d runs of an older layout are not read", count)
 
     def _stored(self, run: Run, study: str) -> StoredRun:
@@ -241,9 +253,9 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
         key = (fitted.run.study, fitted.run.fingerprint)
         if key not in self._begun:
             self._begun[key] = self._begin(fitted)
-        run = self._client.get_run(self._begun[key])
-        run_id, tags = run.info.run_id, {}
+        (run_id, fits), tags = self._begun[key], {}
         if fitted.is_model:
+            run = self._client.get_run(run_id)
             log_model(self._client, run, fitted.estimator, fitted.example)
             self._log_history(run_id, fitted)
             tags[_MODEL_FOLD] = fitted.fold
@@ -251,15 +263,15 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
             with tempfile.TemporaryDirectory() as folder:
                 fitted.estimator.save(Path(folder))
                 self._client.log_artifacts(run_id, folder, _fit_folder(fitted.fold))
-        fits = _fits(run) | {fitted.fold}
-        tags[_FITS] = _BETWEEN.join(sorted(fits))
+        fits.add(fitted.fold)
+        tags[_FITS] = "".join(f"{fold}{_END}" for fold in sorted(fits))
         if fits >= set(fitted.run.folds):
             tags[_TRAINED] = str(fitted.ended_ms)
             del self._begun[key]
         self._client.log_batch(run_id, tags=_tags(tags))
 
-    def _begin(self, fitted: FittedRun) -> str:
-        """Id of the run that a fit is added to: one that was left unfinished, or a new one."""
+    def _begin(self, fitted: FittedRun) -> tuple[str, set[str]]:
+        """The run that a fit is added to: one that was left unfinished, or a new one."""
         experiment_id, wanted = self._experiment_id(fitted.run.study), fitted.run
         left = _pages(
             partial(
@@ -279,7 +291,7 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
             params = [Param(key, str(value)) for key, value in wanted.params.items()]
             self._client.log_batch(run.info.run_id, params=params)
             self._client.log_inputs(run.info.run_id, [_dataset(fitted.dataset)])
-        return str(run.info.run_id)
+        return str(run.info.run_id), set(_fits(run))
 
     def _tags_of(self, fitted: FittedRun) -> dict[str, str]:
         run = fitted.run
@@ -293,7 +305,7 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
             FINGERPRINT: run.fingerprint,
             LAYOUT_TAG: LAYOUT,
             _OWNER: _this_process(),
-            _DESCRIPTION: run.note,
+            DESCRIPTION: run.note,
         }
 
     def _log_history(self, run_id: str, fitted: FittedRun) -> None:
@@ -329,9 +341,9 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
             own = self._path.parent / "mlruns" / study
             location = own.as_uri() if self._is_own_file else None
             experiment_id = self._client.create_experiment(study, location)
-        if existing is None or _DESCRIPTION not in existing.tags:
+        if existing is None or DESCRIPTION not in existing.tags:
             about = _ABOUT.format(study=study)
-            self._client.set_experiment_tag(experiment_id, _DESCRIPTION, about)
+            self._client.set_experiment_tag(experiment_id, DESCRIPTION, about)
         return str(experiment_id)
 
     def _log_artifacts(self, run_id: str, artifacts: Mapping[str, Any]) -> None:
@@ -351,8 +363,10 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
 def run_link(runs: Sequence[TrackedRuns]) -> str | None:
     """Address at which MLflow's user interface shows the runs of a study, the best first.
 
+    A tag of the experiment holds the filter and the columns of that view.
+
     Args:
-        runs: Datasets of one study; the link is narrowed to their source and sensor if all that
+        runs: Datasets of one study; the view is narrowed to their source and sensor if all that
             name one agree.
 
     Returns:
@@ -362,58 +376,19 @@ def run_link(runs: Sequence[TrackedRuns]) -> str | None:
     experiment = next(iter(first._experiments()), None)
     if experiment is None:
         return None
-    wanted = [f"tags.{LAYOUT_TAG} = '{LAYOUT}'"]
+    wanted, name = [f"tags.{LAYOUT_TAG} = '{LAYOUT}'"], "runs"
     for key in ("source", "sensor"):
         values = {dataset.only[key] for dataset in runs if key in dataset.only}
-        wanted += [f"params.{key} = '{value}'" for value in values if len(values) == 1]
-    query = {
-        "workflowType": "machine_learning",
-        "searchFilter": " and ".join(wanted),
-        "orderByKey": "metrics.`accuracy_gain_pct`",
-        "orderByAsc": "false",
-    }
+        if len(values) == 1:
+            (value,) = values
+            wanted.append(f"params.{key} = '{value}'")
+            name += f"_{value}"
+    view = json.dumps(_VIEW | {"searchFilter": " and ".join(wanted)})
+    if experiment.tags.get(_SHARED_VIEW + name) != view:
+        first._client.set_experiment_tag(experiment.experiment_id, _SHARED_VIEW + name, view)
     server = first._uri.rstrip("/") if first._uri.startswith("http") else USER_INTERFACE
-    return f"{server}/#/experiments/{experiment.experiment_id}/runs?{urlencode(query)}"
-
-
-def _make_store(path: Path) -> None:
-    """MLflow takes seconds for it, and cannot use one that was left half made."""
-    with replacing(path) as temporary:
-        MlflowClient(f"sqlite:///{temporary}")
-
-
-def _check_store(path: Path) -> None:
-    """Refuse a file that is no MLflow store before MLflow would write into it."""
-    advice = "move it away to start a new store"
-    try:
-        # Writable, so that SQLite can roll back what a killed process left half written.
-        uri = f"{path.resolve().as_uri()}?mode=rw"
-        with closing(sqlite3.connect(uri, uri=True, timeout=_BUSY_S)) as connection:
-            tables = {name for (name,) in connection.execute("select name from sqlite_master")}
-            sound = [row[0] for row in connection.execute("pragma quick_check(1)")]
-    except sqlite3.DatabaseError as error:
-        raise InputError(f"{path}: not a readable SQLite file ({error}); {advice}") from error
-    if sound != ["ok"]:
-        raise InputError(f"{path}: a damaged SQLite file ({sound[0]}); {advice}")
-    if tables and not {"experiments", "alembic_version"} <= tables:
-        raise InputError(
-            f"{path}: expected an MLflow store, got an SQLite file with tables "
-            f"{', '.join(sorted(tables)[:5])}; {advice}"
-        )
-
-
-def _check_not_moved(experiment: Experiment, store: Path) -> None:
-    """Refuse to write artifacts where the store used to be, or where the original of a copy is."""
-    location = experiment.artifact_location
-    if not location.startswith("file:"):
-        return
-    folder = Path(local_file_uri_to_path(location))
-    is_ours = (folder.parent.name, folder.name) == ("mlruns", experiment.name)
-    if is_ours and folder.parents[1].resolve() != store.parent.resolve():
-        raise InputError(
-            f"{store}: the artifacts of {experiment.name} are to be in {folder.parent}, which is "
-            f"not beside this store; if the project was copied or moved, {_MOVED}"
-        )
+    query = urlencode({"workflowType": "machine_learning", "viewStateShareKey": name})
+    return f"{server}/#/experiments/{experiment.experiment_id}/runs?{query}"
 
 
 def _dataset(described: Mapping[str, str]) -> DatasetInput:
@@ -430,7 +405,8 @@ def _dataset(described: Mapping[str, str]) -> DatasetInput:
 
 
 def _fits(run: Run) -> frozenset[str]:
-    return frozenset(filter(None, run.data.tags.get(_FITS, "").split(_BETWEEN)))
+    *whole, _ = run.data.tags.get(_FITS, "").split(_END)
+    return frozenset(whole)
 
 
 def _fit_folder(fold: str) -> str:
@@ -448,10 +424,11 @@ def _this_process() -> str:
 
 def _is_left(run: Run) -> bool:
     """Whether a run lacks fits that nobody else is about to add."""
+    if _TRAINED in run.data.tags:
+        return False
     owner = run.data.tags.get(_OWNER, "")
     running = run.info.status == RunStatus.to_string(RunStatus.RUNNING)
-    nobody_else = not running or owner == _this_process() or _is_dead(owner)
-    return _TRAINED not in run.data.tags and nobody_else
+    return not running or owner == _this_process() or _is_dead(owner)
 
 
 def _pages(search: Callable[..., Any]) -> Iterable[Any]:
