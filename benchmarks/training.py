@@ -55,7 +55,7 @@ from gyro_pipeline.learning.jobs import (
     sized,
 )
 from gyro_pipeline.learning.network import Architecture, CalibrationNetwork
-from gyro_pipeline.learning.packing import pack, to_bfloat16
+from gyro_pipeline.learning.packing import pack
 from gyro_pipeline.learning.trainer import Engine, TorchEngine, predict, train
 from gyro_pipeline.parameters import Execution, Parameters
 from gyro_pipeline.pipelines.training.nodes import Devices
@@ -110,8 +110,7 @@ def main() -> None:
     parameters = Parameters(**loader["parameters"])
     torch.set_num_threads(1)
     print(machine())
-    for precision in ("float32", "bfloat16"):
-        fused.available(precision)  # compiled now, not while the clock runs
+    fused.available()  # compiled now, not while the clock runs
     with tempfile.TemporaryDirectory() as folder:
         if options.scaling:
             scaling(parameters, Path(folder), options.repetitions)
@@ -330,17 +329,10 @@ def prepared(a: Architecture) -> tuple[dict[str, Run], dict[str, Callable[[], fl
     add("DataLoader", lambda network: loop_way(network, batches(x, y)))
     add("tensors", lambda network: loop_way(network, TensorBatches(x, y)))
     add("packed", lambda network: engine_way(network, TorchEngine, packed, targets))
-    for precision, name, inputs in (
-        ("float32", "fused", packed),
-        ("bfloat16", "fused bf16", to_bfloat16(packed)),
-    ):
-        if fused.available(precision):
-            add(
-                name,
-                lambda network, inputs=inputs: engine_way(network, FusedEngine, inputs, targets),
-            )
-        else:
-            print(f"{name} is left out, as there is no C compiler or no processor for it")
+    if fused.available():
+        add("fused", lambda network: engine_way(network, FusedEngine, packed, targets))
+    else:
+        print("fused is left out, as there is no C compiler")
     return ways, losses
 
 
@@ -701,8 +693,12 @@ def _memory_job(
     numbers = tuple(range(1, MEMORY_RECORDINGS + 1))
     all_imus = tuple(range(1, imus + 1))
     inputs = [all_imus] if method == 1 else [(imu,) for imu in all_imus]
-    bias = data.recording_mean.load()
-    devices = [Device(data.angular_rate, bias, some, numbers) for some in inputs]
+    starts = (np.arange(0, MEMORY_WINDOWS * samples, samples),) * len(numbers)
+    devices = []
+    for some in inputs:
+        bias = data.recording_mean.sel(imu=list(some), recording=list(numbers))
+        biases = bias.transpose("recording", "imu", "axis").to_numpy().reshape(len(numbers), -1)
+        devices.append(Device(data.angular_rate, some, numbers, biases, starts))
     return TrainingJob(f"{method} {imus}", devices, None, samples, parameters.training, seed=0)
 
 
@@ -735,20 +731,18 @@ def _status(key: str) -> float:
 def agreement(parameters: Parameters) -> None:
     """Train to the last epoch by each path, seed by seed; RMSE on windows that did not train."""
     architecture = sized(parameters.training, 3, 1494)
-    ways: dict[str, tuple[type[Engine], bool]] = {"packed": (TorchEngine, False)}
-    for precision, name in (("float32", "fused"), ("bfloat16", "fused bf16")):
-        if fused.available(precision):
-            ways[name] = (FusedEngine, precision == "bfloat16")
+    ways: dict[str, type[Engine]] = {"packed": TorchEngine}
+    if fused.available():
+        ways["fused"] = FusedEngine
     rows = []
     for seed in range(AGREEMENT_SEEDS):
         training, judging = (_learnable(architecture, seed, part) for part in range(2))
         row = {}
-        for name, (engine, half) in ways.items():
-            given = replace(training, inputs=to_bfloat16(training.inputs)) if half else training
+        for name, engine in ways.items():
             network = initial_network(architecture, seed)
             shuffling = torch.Generator().manual_seed(seed)
             nothing = lambda: None  # noqa: E731
-            train(network, given, None, parameters.training, shuffling, nothing, engine)
+            train(network, training, None, parameters.training, shuffling, nothing, engine)
             missed = predict(network, torch.from_numpy(judging.inputs)).numpy() - judging.targets
             row[name] = float(np.sqrt(np.mean(missed**2)))
         rows.append(row)

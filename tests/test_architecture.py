@@ -24,10 +24,10 @@ ALLOWED = {
     "readers": {"conventions", "logs", "parameters", "units"},
     "tracking": {"conventions", "estimators"},
     "physics": {"conventions"},
-    "estimators": {"conventions", "learning", "physics"},
+    "estimators": {"conventions", "executors", "learning", "parameters", "physics"},
     "quality": {"conventions", "logs", "parameters", "physics"},
     "protocol": {"conventions", "fingerprints", "logs", "parameters", "physics", "quality"},
-    "learning": {"conventions", "executors", "parameters", "protocol"},
+    "learning": {"conventions", "executors", "parameters", "physics"},
     "datasets": {
         "conventions",
         "estimators",

@@ -23,7 +23,7 @@ CELL = ["sensor", "real_gyros", "virtual_gyros", "window_s"]
 PARAMS = {*CELL, "study", "method", "source", "seed", "fold", "estimator"}
 HYPER_PARAMETERS = {
     "centring", "channels", "kernel", "stride", "pool", "hidden", "epochs", "batch_size",
-    "learning_rate", "decay", "decay_every", "stop_below", "precision",
+    "learning_rate", "decay", "decay_every", "stop_below", "steps",
     "validation_recordings", "split_seed",
 }  # fmt: skip
 BASES = {

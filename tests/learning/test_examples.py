@@ -1,5 +1,4 @@
 import tracemalloc
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from gyro_pipeline.learning.examples import (
     with_shuffled_labels,
 )
 from gyro_pipeline.learning.network import Architecture
-from gyro_pipeline.protocol.windows import cut_windows
+from gyro_pipeline.physics.bias import windows_at
 
 WINDOW, STRIDE = 20, 5
 ONE_IMU = Architecture(3, WINDOW, 2, 5, STRIDE, 2, 4)
@@ -45,8 +44,12 @@ def drawn(imus=2, recordings=6, samples=50, seed=3):
     return noise_on(bias, samples, seed), bias
 
 
-def device(rates, bias, imus=(1,), numbers=(1, 2, 3)):
-    return Device(labelled(rates), labelled(bias, "imu recording axis"), imus, numbers)
+def device(rates, bias, imus=(1,), numbers=(1, 2, 3), starts=None, size=WINDOW):
+    """All non-overlapping windows of each recording, unless some are named."""
+    labels = labelled(bias, "imu recording axis").sel(imu=list(imus), recording=list(numbers))
+    biases = labels.transpose("recording", "imu", "axis").to_numpy().reshape(len(numbers), -1)
+    starts = starts or (np.arange(0, rates.shape[-1] - size + 1, size),) * len(numbers)
+    return Device(labelled(rates), imus, numbers, biases, starts)
 
 
 def unpacked(examples, gyroscopes):
@@ -68,7 +71,7 @@ def test_imus_side_by_side_are_in_order_of_imu_then_axis():
     rates = np.repeat(bias[..., None], 7, axis=-1).astype(np.float32)
     both = device(rates, bias, imus=(1, 3), numbers=(4, 2))
     expected = [[141, 142, 143, 341, 342, 343], [121, 122, 123, 321, 322, 323]]
-    np.testing.assert_array_equal(both.biases(), expected)
+    np.testing.assert_array_equal(both.biases, expected)
     for samples, wanted in zip(both.samples(), expected, strict=True):
         assert samples.shape == (6, 7)
         np.testing.assert_array_equal(samples, np.repeat(np.array(wanted)[:, None], 7, axis=1))
@@ -79,11 +82,11 @@ def test_the_order_of_stored_dimensions_does_not_matter():
     usual = device(rates, bias, imus=(1, 2))
     turned = Device(
         usual.recordings.transpose("sample", "axis", "recording", "imu"),
-        usual.bias.transpose("axis", "recording", "imu"),
         usual.imus,
         usual.numbers,
+        usual.biases,
+        usual.starts,
     )
-    np.testing.assert_array_equal(turned.biases(), usual.biases())
     for one, other in zip(turned.samples(), usual.samples(), strict=True):
         np.testing.assert_array_equal(one, other)
 
@@ -138,7 +141,8 @@ def test_examples_are_the_windows_of_each_recording_in_turn_scaled_by_hand(centr
 def test_training_inputs_and_targets_have_a_root_mean_square_of_one():
     rates, bias = drawn(samples=53)
     for unseen in (Architecture(3, 23, 2, 8, 5, 1, 4), Architecture(3, 22, 2, 3, 5, 1, 4)):
-        examples, _ = training_examples([device(rates, bias)], unseen, "per_device")
+        used = device(rates, bias, size=unseen.window)
+        examples, _ = training_examples([used], unseen, "per_device")
         seen = examples.inputs[examples.inputs != 0]  # padding is zero; noise never is
         assert np.sqrt(np.mean(np.square(seen))) == pytest.approx(1, rel=1e-5)
         assert np.sqrt(np.mean(np.square(examples.targets))) == pytest.approx(1, rel=1e-5)
@@ -154,14 +158,10 @@ def test_side_by_side_every_recording_counts_once():
     np.testing.assert_allclose(last, recorded, atol=1e-4)
 
 
-def test_masked_samples_are_their_windows_mean_and_windows_that_lost_many_are_no_examples():
+def test_masked_samples_are_their_windows_mean():
     rates, bias = drawn()
-    whole, _ = training_examples([device(rates, bias)], ONE_IMU, "per_device")
     rates[0, 1, :, [3]] = np.nan  # of the first window of recording 2
-    rates[0, 2, :, 20:24] = np.nan  # a fifth of the second window of recording 3
     examples, scaling = training_examples([device(rates, bias)], ONE_IMU, "per_device")
-    assert len(whole.inputs) == 6
-    assert len(examples.inputs) == len(examples.targets) == 5
     window = unpacked(examples, 3)[2] * scaling.input_scale + scaling.centres[0][:, None]
     recorded = rates[0, 1, :, :WINDOW]
     expected = np.where(np.isnan(recorded), np.nanmean(recorded, axis=1)[:, None], recorded)
@@ -197,7 +197,7 @@ def test_other_recordings_are_scaled_as_the_test_device_in_training(centring):
     np.testing.assert_array_equal(again.targets, examples.targets[:6])
     other = scaled_examples(device(rates, bias, (1,), (5,)), ONE_IMU, scaling)
     wanted = (rates[0, 4] - scaling.centres[0][:, None]) / scaling.input_scale
-    wanted = cut_windows(wanted, WINDOW).transpose(1, 0, 2)
+    wanted = windows_at(wanted, WINDOW, np.array([0, 20])).transpose(1, 0, 2)
     np.testing.assert_allclose(unpacked(other, 3), wanted, atol=1e-4)
     wanted = (bias[0, 4] - scaling.centres[0]) / scaling.target_scale
     np.testing.assert_allclose(other.targets, [wanted] * 2, rtol=1e-5)
@@ -207,7 +207,7 @@ def test_making_examples_changes_no_recording_and_needs_one_packed_copy_of_them(
     rates, bias = drawn(imus=2, recordings=20, samples=13_000)
     original = rates.copy()
     numbers = tuple(range(1, 21))
-    devices = [device(rates, bias, (imu,), numbers) for imu in (1, 2)]
+    devices = [device(rates, bias, (imu,), numbers, size=1083) for imu in (1, 2)]
     papers = Architecture(3, 1083, 8, 10, 10, 8, 32)
     tracemalloc.start()
     training_examples(devices, papers, "per_device")
@@ -219,10 +219,9 @@ def test_making_examples_changes_no_recording_and_needs_one_packed_copy_of_them(
 
 def test_windows_to_use_may_be_named_by_their_starts():
     rates, bias = drawn(samples=50)
-    usual = device(rates, bias)
     starts = (np.array([0, 3, 30]), np.array([7]), np.array([5, 5]))
-    chosen = replace(usual, starts=starts)
-    assert (usual.windows(WINDOW), chosen.windows(WINDOW)) == ([2, 2, 2], [3, 1, 2])
+    chosen = device(rates, bias, starts=starts)
+    assert (device(rates, bias).windows, chosen.windows) == (6, 6)
     examples, scaling = training_examples([chosen], ONE_IMU, "per_device")
     places = [(number, start) for number in range(3) for start in starts[number]]
     windows = np.array([rates[0, number, :, start : start + WINDOW] for number, start in places])
@@ -232,23 +231,11 @@ def test_windows_to_use_may_be_named_by_their_starts():
     np.testing.assert_allclose(targets, [bias[0, number] for number, _ in places], atol=2e-6 * 10)
 
 
-def test_starts_a_window_apart_give_the_usual_examples():
-    rates, bias = drawn(samples=50)
-    usual = device(rates, bias)
-    named = replace(usual, starts=(np.array([0, 20]),) * 3)
-    (one, scaling), (other, same) = (
-        training_examples([d], ONE_IMU, "per_device") for d in (usual, named)
-    )
-    np.testing.assert_array_equal(one.inputs, other.inputs)
-    np.testing.assert_array_equal(one.targets, other.targets)
-    assert scaling.input_scale == same.input_scale
-
-
 def test_overlapping_windows_need_one_packed_copy_of_them():
     """A copy of one recording's windows at a time, never of all of them."""
     rates, bias = drawn(imus=1, recordings=20, samples=2_000)
     starts = (np.arange(0, 1_500, 5),) * 20
-    dense = replace(device(rates, bias, (1,), tuple(range(1, 21))), starts=starts)
+    dense = device(rates, bias, (1,), tuple(range(1, 21)), starts)
     sizes = Architecture(3, 500, 8, 10, 10, 8, 32)
     tracemalloc.start()
     examples, _ = training_examples([dense], sizes, "per_device")
@@ -262,10 +249,8 @@ def test_shuffled_labels_are_permuted_for_each_gyroscope_on_its_own():
     numbers = (1, 2, 3, 5, 6, 7, 8, 9)
     both = device(rates, bias, (2, 1), numbers)
     shuffled = with_shuffled_labels(both, np.random.default_rng(0))
-    before, after = both.biases(), shuffled.biases()
+    before, after = both.biases, shuffled.biases
     np.testing.assert_array_equal(np.sort(before, axis=0), np.sort(after, axis=0))
     orders = [tuple(np.argsort(np.argsort(column))) for column in after.T]
     assert len(set(orders)) == 6
-    # neither the recording that is not used, nor what was given, is changed
-    np.testing.assert_array_equal(shuffled.bias.sel(recording=4), bias[:, 3])
-    np.testing.assert_array_equal(both.bias, bias)
+    assert both.biases is before  # what was given is not changed

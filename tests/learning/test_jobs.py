@@ -9,16 +9,17 @@ from gyro_pipeline.conventions import InputError
 from gyro_pipeline.learning import jobs
 from gyro_pipeline.learning.examples import Device, training_examples
 from gyro_pipeline.learning.jobs import (
-    NetworkEstimator,
+    StoredNetwork,
     TrainingJob,
     initial_network,
     run_training,
 )
 from gyro_pipeline.learning.network import Architecture
 from gyro_pipeline.parameters import Training
-from gyro_pipeline.protocol.windows import cut_windows
+from gyro_pipeline.physics.bias import windows_at
 
 WINDOW = 40
+STARTS = np.array([0, WINDOW])
 
 
 @pytest.fixture(autouse=True)
@@ -65,10 +66,16 @@ def recorded(imus=2, recordings=12, spread=1.0, noise=0.3, seed=0):
     )
 
 
+def device(rates, bias, imus, numbers):
+    labels = bias.sel(imu=list(imus), recording=list(numbers))
+    biases = labels.transpose("recording", "imu", "axis").to_numpy().reshape(len(numbers), -1)
+    return Device(rates, imus, tuple(numbers), biases, (STARTS,) * len(numbers))
+
+
 def job(data=None, imus=((1,), (2,)), train=range(1, 9), validate=(9, 10), seed=0, **changes):
     rates, bias = data or recorded()
-    devices = [Device(rates, bias, one, tuple(train)) for one in imus]
-    validation = Device(rates, bias, imus[0], tuple(validate)) if validate else None
+    devices = [device(rates, bias, one, train) for one in imus]
+    validation = device(rates, bias, imus[0], validate) if validate else None
     return TrainingJob("a job", devices, validation, WINDOW, settings(**changes), seed)
 
 
@@ -79,7 +86,7 @@ def run(a_job):
 def windows_of(rates, imus, number):
     """Windows (n, gyroscopes, samples), as an estimator sees them."""
     chosen = rates.sel(imu=list(imus), recording=number).to_numpy()
-    return cut_windows(chosen.reshape(-1, chosen.shape[-1]), WINDOW).transpose(1, 0, 2)
+    return windows_at(chosen.reshape(-1, chosen.shape[-1]), WINDOW, STARTS).transpose(1, 0, 2)
 
 
 def differing(one, other):
@@ -153,9 +160,7 @@ def test_a_stored_network_estimates_its_outputs_scaled_back(tmp_path, imus, cent
     stored = torch.load(tmp_path / "weights.pt", weights_only=True)
     assert stored["best_epoch"] < 40
     windows = windows_of(rates, imus[0], 11)
-    estimates, sigma = NetworkEstimator(stored, which).estimate(windows)
-    assert np.isnan(sigma).all()
-    assert sigma.shape == estimates.shape
+    estimates = StoredNetwork(stored, which).biases(windows)
 
     _, scaling = training_examples(a_job.devices, a_job.architecture, centring)
     network = initial_network(a_job.architecture, seed=99)
@@ -176,13 +181,13 @@ def test_a_network_learns_what_is_easy_to_learn(imus):
     rates, bias = recorded(recordings=110, spread=1.0, noise=0.3)
     easy = {"channels": 16, "hidden": 32, "epochs": 60, "learning_rate": 1e-2, "decay_every": 40}
     a_job = job((rates, bias), imus, train=range(1, 81), validate=(), **easy)
-    estimator = NetworkEstimator(run(a_job).artifact, "last")
+    estimator = StoredNetwork(run(a_job).artifact, "last")
     truth = bias.sel(imu=list(imus[0])).to_numpy()  # (imus, recordings, axes)
     tested = range(81, 111)
     constant = truth[:, :80].mean(axis=1)
     errors = []
     for number in tested:
-        estimates, _ = estimator.estimate(windows_of(rates, imus[0], number))
+        estimates = estimator.biases(windows_of(rates, imus[0], number))
         errors.append(estimates - truth[:, number - 1].ravel())
     rmse = np.sqrt(np.mean(np.square(errors)))
     constants_rmse = np.sqrt(np.mean((truth[:, 80:] - constant[:, None]) ** 2))

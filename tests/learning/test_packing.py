@@ -3,7 +3,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gyro_pipeline.learning.network import Architecture
-from gyro_pipeline.learning.packing import pack, packed_shape, to_bfloat16
+from gyro_pipeline.learning.packing import pack, packed_shape
 
 
 @st.composite
@@ -67,10 +67,3 @@ def test_windows_may_be_views_of_any_layout():
 def test_rows_start_with_a_cache_line():
     a = Architecture(3, 23, 4, 8, 5, 1, 8)
     assert all(pack(numbered(a, n), a).ctypes.data % 64 == 0 for n in (1, 4, 300))
-
-
-def test_bfloat16_keeps_the_upper_half_of_the_nearest_number():
-    exact, between = np.float32(1.5), np.float32(1 + 2**-8)  # ... of two as near the even one
-    assert to_bfloat16(np.array([[exact, -exact], [between, 0]])).tolist() == [
-        *([0x3FC0, 0xBFC0], [0x3F80, 0])
-    ]

@@ -11,14 +11,14 @@ import xarray as xr
 from gyro_pipeline.learning import jobs as jobs_module
 from gyro_pipeline.learning import trainings
 from gyro_pipeline.learning.examples import Device
-from gyro_pipeline.learning.jobs import NetworkEstimator, TrainingJob, run_training
+from gyro_pipeline.learning.jobs import StoredNetwork, TrainingJob, run_training
 from gyro_pipeline.learning.trainings import (
+    batch_device,
     estimated_bytes,
     in_batches,
-    run_trainings,
     train_batch,
 )
-from gyro_pipeline.parameters import Execution, Training
+from gyro_pipeline.parameters import Training
 
 CPU = torch.device("cpu")
 SETTINGS = Training(
@@ -37,10 +37,6 @@ def torch_settings_restored():
     torch.use_deterministic_algorithms(False)
 
 
-def execution(executor):
-    return Execution(executor=executor, workers=1)
-
-
 def recordings():
     generator = np.random.default_rng(0)
     bias = generator.normal(size=(3, 12, 3))
@@ -53,6 +49,12 @@ def recordings():
     )
 
 
+def device(rates, bias, imu, numbers, size):
+    starts = np.arange(0, rates.sizes["sample"] - size + 1, size)
+    biases = bias.sel(imu=imu, recording=list(numbers)).to_numpy()
+    return Device(rates, (imu,), numbers, biases, (starts,) * len(numbers))
+
+
 def grid(windows=(40, 60), imus=(1, 2, 3), seeds=(0, 1)):
     """Every window with so many IMUs and every seed."""
     rates, bias = recordings()
@@ -60,8 +62,8 @@ def grid(windows=(40, 60), imus=(1, 2, 3), seeds=(0, 1)):
     return [
         TrainingJob(
             name=f"{window} {count} {seed}",
-            devices=[Device(rates, bias, (imu,), train) for imu in range(1, count + 1)],
-            validation=Device(rates, bias, (1,), watch),
+            devices=[device(rates, bias, imu, train, window) for imu in range(1, count + 1)],
+            validation=device(rates, bias, 1, watch, window),
             window=window,
             settings=SETTINGS,
             seed=seed,
@@ -73,8 +75,14 @@ def grid(windows=(40, 60), imus=(1, 2, 3), seeds=(0, 1)):
     ]
 
 
-def results_of(jobs, executor="batched"):
-    return {job.name: trained for job, trained in run_trainings(jobs, execution(executor), "all")}
+def results_of(jobs):
+    """Trained in batches."""
+    found = trainings.run_trainings(jobs, "batched", "all")
+    return {jobs[number].name: trained for number, trained in found}
+
+
+def one_by_one(jobs):
+    return {job.name: run_training(job, lambda work: None) for job in jobs}
 
 
 def assert_same(one, other):
@@ -86,17 +94,17 @@ def assert_same(one, other):
         pd.testing.assert_frame_equal(trained.history, other[name].history, rtol=1e-5)
         for which in ("last", "best"):
             seen = windows[..., : a["architecture"]["window"]]
-            given = (NetworkEstimator(artifact, which).estimate(seen)[0] for artifact in (a, b))
+            given = (StoredNetwork(artifact, which).biases(seen) for artifact in (a, b))
             np.testing.assert_allclose(*given, rtol=0, atol=1e-5)
 
 
 def test_networks_trained_at_once_are_those_trained_one_by_one():
-    together, one_by_one = results_of(grid()), results_of(grid(), "serial")
-    assert_same(together, one_by_one)
+    together, alone = results_of(grid()), one_by_one(grid())
+    assert_same(together, alone)
     assert {trained.engine for trained in together.values()} == {"batched cpu"} or (
         torch.cuda.is_available()
     )
-    assert {trained.engine for trained in one_by_one.values()} <= {"fused", "cpu"}
+    assert {trained.engine for trained in alone.values()} <= {"fused", "cpu"}
 
 
 def test_equal_sizes_are_a_batch_and_others_are_not():
@@ -180,30 +188,23 @@ def test_a_loss_that_is_no_longer_finite_ends_the_run():
     ("executor", "cuda", "chosen"),
     [
         ("auto", True, "cuda"),
-        ("auto", False, "jobs"),
+        ("auto", False, None),
         ("batched", True, "cuda"),
         ("batched", False, "cpu"),
-        ("processes", True, "jobs"),
-        ("serial", True, "jobs"),
+        ("processes", True, None),
+        ("serial", True, None),
     ],
 )
 def test_the_gpu_is_used_where_there_is_one_and_asked_for_nowhere_else(
     monkeypatch, executor, cuda, chosen
 ):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
-    monkeypatch.setattr(trainings, "free_memory", lambda device: np.inf)
-    used = []
-    monkeypatch.setattr(
-        trainings, "run_batches", lambda batches, *_: used.append(batches[0].device.type) or []
-    )
-    monkeypatch.setattr(trainings, "run_jobs", lambda jobs, function, *_: used.append("jobs") or [])
-    assert list(run_trainings(grid(), execution(executor), "all")) == []
-    assert used == [chosen]
+    device = batch_device(executor)
+    assert (device and device.type) == chosen
 
 
-@pytest.mark.parametrize("executor", ["batched", "serial"])
-def test_nothing_to_train_is_nothing_to_do(executor):
-    assert results_of([], executor) == {}
+def test_nothing_to_train_is_nothing_to_do():
+    assert results_of([]) == {}
 
 
 def test_one_training_stays_on_the_processor(monkeypatch):
@@ -217,6 +218,6 @@ def test_free_memory_is_less_than_all():
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU here")
 def test_on_a_gpu_networks_are_those_of_the_processor():
-    together, one_by_one = results_of(grid(), "auto"), results_of(grid(), "serial")
+    together = results_of(grid())
     assert {trained.engine for trained in together.values()} == {"batched cuda"}
-    assert_same(together, one_by_one)
+    assert_same(together, one_by_one(grid()))

@@ -1,0 +1,145 @@
+"""The paper's network as an estimator: which windows train and validate it, and as what."""
+
+import numpy as np
+import pytest
+import torch
+
+from gyro_pipeline.conventions import BEST, BIAS, LAST, MDPS, RECORDING_MEAN, TRAIN, InputError
+from gyro_pipeline.conventions import VALIDATION as VALIDATE
+from gyro_pipeline.estimators import make_estimator
+from gyro_pipeline.estimators.base import Estimator
+from gyro_pipeline.estimators.paper_network import PaperNetwork
+from gyro_pipeline.estimators.training import TrainingSet
+from gyro_pipeline.parameters import Training
+from gyro_pipeline.physics.allan import NoiseFigures
+from gyro_pipeline.physics.recording_model import constant_bias
+
+RATE, SAMPLES, SIZE = 20.0, 650, 200
+MODEL = constant_bias(SAMPLES, RATE, NoiseFigures(5 * MDPS, 0, 0), 0.0, 20 * MDPS)
+SETTINGS = Training(
+    **{"centring": "per_device", "channels": 4, "kernel": 6, "stride": 5, "pool": 2, "hidden": 8},
+    **{"epochs": 6, "batch_size": 8, "learning_rate": 1e-3, "decay": 0.1, "decay_every": 4},
+)
+ROLES = {9: VALIDATE, 10: VALIDATE}
+
+
+@pytest.fixture(autouse=True)
+def torch_settings_restored():
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+    torch.use_deterministic_algorithms(False)
+
+
+@pytest.fixture(scope="module")
+def recordings(simulate):
+    return simulate(MODEL, 10, imus=3)
+
+
+@pytest.fixture(scope="module")
+def training(training_set, recordings):
+    return training_set(recordings, roles=ROLES)
+
+
+def network(**changes):
+    return PaperNetwork(SETTINGS.model_copy(update=changes), seed=0)
+
+
+def side_by_side(training, windows=None, imus=(1, 2, 3)):
+    windows = training.windows if windows is None else windows
+    return TrainingSet(training.real, None, windows, SIZE, 1, imus)
+
+
+def test_every_imu_is_a_device_and_the_first_alone_validates(training):
+    job = network().job(training)
+    assert [device.imus for device in job.devices] == [(1,), (2,), (3,)]
+    assert all(device.numbers == tuple(range(1, 9)) for device in job.devices)
+    assert all(starts.tolist() == [0, 200, 400] for starts in job.devices[0].starts)
+    assert (job.validation.imus, job.validation.numbers) == ((1,), (9, 10))
+    np.testing.assert_array_equal(
+        job.devices[1].biases, training.real.recording_mean.to_numpy()[1, :8]
+    )
+
+
+def test_side_by_side_a_window_is_used_if_all_have_it(training):
+    lacking = training.windows
+    gone = (lacking.imu == 2) & (lacking.recording == 4) & (lacking.start == 200)
+    job = network().job(side_by_side(training, lacking[~gone]))
+    (device,) = job.devices
+    assert device.imus == (1, 2, 3)
+    assert [len(starts) for starts in device.starts] == [3, 3, 3, 2, 3, 3, 3, 3]
+    assert job.architecture.gyroscopes == 9
+    assert device.biases.shape == (8, 9)
+
+
+def test_it_learns_and_says_what_it_learned(recordings, training):
+    fitted = network(epochs=60, learning_rate=3e-3, decay_every=60).fit(training)
+    assert fitted.history.columns.tolist() == ["epoch", "learning_rate", "train_loss", "val_loss"]
+    assert fitted.best_epoch == fitted.history.val_loss.idxmin() + 1
+    assert fitted.engine in {"fused", "cpu"}
+    windows = recordings.angular_rate.to_numpy()[0, :8, :, :SIZE]
+    bias, sigma = fitted.estimate(windows)
+    np.testing.assert_array_equal(bias, fitted.estimate(windows, RECORDING_MEAN, 3.0, 7)[0])
+    assert np.isnan(sigma).all()
+    truth = recordings.true_bias.to_numpy()[0, :8]
+    assert np.std(bias - truth) < 0.7 * np.std(truth - truth.mean(axis=0))
+
+
+def test_a_saved_one_has_the_weights_of_both_epochs(training, recordings, tmp_path):
+    fitted = network(epochs=40, learning_rate=1e-2).fit(training)
+    fitted.save(tmp_path / "fit")
+    loaded = Estimator.load(tmp_path / "fit")
+    windows = recordings.angular_rate.to_numpy()[0, :, :, :SIZE]
+    assert list(fitted.variants()) == list(loaded.variants()) == [LAST, BEST]
+    estimates = {}
+    for which, one in fitted.variants().items():
+        estimates[which] = one.estimate(windows, BIAS)[0]
+        same = loaded.variants()[which].estimate(windows, BIAS)[0]
+        np.testing.assert_array_equal(same, estimates[which])
+    assert not np.array_equal(estimates[LAST], estimates[BEST])
+    assert loaded.history is None
+    assert fitted.history is not None
+
+
+def test_without_validation_there_is_one_variant(training_set, recordings):
+    fitted = network().fit(training_set(recordings))
+    assert list(fitted.variants()) == [LAST]
+    assert fitted.best_epoch is None
+
+
+def test_asked_for_steps_it_makes_at_least_so_many(training):
+    fitted = network(steps=100).fit(training)  # 72 windows are 9 batches
+    assert len(fitted.history) == 12
+
+
+def test_shuffled_labels_are_those_of_the_recordings(training):
+    plain = network().job(training)
+    shuffled = PaperNetwork(SETTINGS, seed=0, shuffled=True).job(training)
+    other = PaperNetwork(SETTINGS, seed=1, shuffled=True).job(training)
+    for one, two in zip(plain.devices, shuffled.devices, strict=True):
+        assert not np.array_equal(one.biases, two.biases)
+        np.testing.assert_array_equal(np.sort(one.biases, axis=0), np.sort(two.biases, axis=0))
+    np.testing.assert_array_equal(plain.validation.biases, shuffled.validation.biases)
+    assert len({plain.cell, shuffled.cell, other.cell}) == 3
+    assert plain.cell == PaperNetwork(SETTINGS, seed=5).job(training).cell
+
+
+def test_what_it_cannot_be_fitted_to_is_refused_before(training, training_set, recordings):
+    own = training.windows
+    few = own[(own.recording == 1) | (own.role != TRAIN)]
+    with pytest.raises(InputError, match="at least two training recordings, got one"):
+        network().check(TrainingSet(training.real, None, few, SIZE, 1))
+    with pytest.raises(InputError, match="windows of the device to train on, got none"):
+        network().check(TrainingSet(training.real, None, own[own.imu != 1], SIZE, 1))
+    network(centring="global").check(TrainingSet(training.real, None, few, SIZE, 1))
+
+
+def test_windows_of_another_length_are_refused(training, recordings):
+    fitted = network().fit(training)
+    with pytest.raises(InputError, match="expected 200 samples, as it was fitted to, got 150"):
+        fitted.estimate(recordings.angular_rate.to_numpy()[0, :, :, :150])
+
+
+def test_the_names_of_both_are_those_of_the_list():
+    assert isinstance(make_estimator("cnn", SETTINGS, 0), PaperNetwork)
+    assert make_estimator("cnn_shuffled", SETTINGS, 0)._shuffled

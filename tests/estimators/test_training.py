@@ -1,0 +1,167 @@
+"""What a training set holds for an estimator, in which order, and what is read for it."""
+
+import pickle
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+from gyro_pipeline.conventions import (
+    ALL,
+    AXES,
+    DIMENSIONS,
+    NOTHING,
+    ORIGIN_REAL,
+    ORIGIN_VIRTUAL,
+    OWN,
+    REAL,
+    TRAIN,
+    VALIDATION,
+    InputError,
+)
+from gyro_pipeline.estimators import training as module
+from gyro_pipeline.estimators.training import TrainingSet
+
+SIZE, SAMPLES, RATE = 20, 100, 10.0
+
+
+def drawn(imus=3, recordings=6, seed=0):
+    rates = np.random.default_rng(seed).normal(size=(imus, recordings, 3, SAMPLES))
+    coords = {"imu": range(1, 1 + imus), "recording": range(1, 1 + recordings), "axis": list(AXES)}
+    data = {
+        "angular_rate": (DIMENSIONS, rates.astype(np.float32)),
+        "samples": (DIMENSIONS[:2], np.full((imus, recordings), SAMPLES)),
+        "recording_mean": (DIMENSIONS[:-1], rates.mean(axis=-1)),
+    }
+    return xr.Dataset(data, coords, {"rate_hz": RATE, "data_hash": str(seed)})
+
+
+def table(*rows):
+    """Rows of role, origin, IMU, recordings and starts."""
+    return pd.DataFrame(
+        [
+            (role, origin, imu, number, start)
+            for role, origin, imu, numbers, starts in rows
+            for number in numbers
+            for start in starts
+        ],
+        columns=["role", "origin", "imu", "recording", "start"],
+    )
+
+
+WINDOWS = table(
+    (TRAIN, ORIGIN_VIRTUAL, 1, [1, 2], [0]),
+    (TRAIN, ORIGIN_REAL, 3, [5, 4], [20, 0]),
+    (VALIDATION, ORIGIN_REAL, 2, [3], [0]),
+    (TRAIN, ORIGIN_REAL, 2, [6, 1], [40]),
+    (TRAIN, ORIGIN_REAL, 1, [2], [0]),
+)
+
+
+@pytest.fixture
+def training():
+    return TrainingSet(drawn(), drawn(2, 2, seed=1), WINDOWS, SIZE, device=2)
+
+
+def places(training):
+    return [(origin, imu, one.numbers.tolist()) for (origin, imu), one in training.imus.items()]
+
+
+def test_real_imus_come_before_virtual_ones_and_the_device_first(training):
+    assert places(training) == [
+        *(("real", 2, [1, 3, 6]), ("real", 1, [2]), ("real", 3, [4, 5])),
+        ("virtual", 1, [1, 2]),
+    ]
+    assert [s.tolist() for s in training.imus["real", 3].starts] == [[0, 20], [0, 20]]
+
+
+@pytest.mark.parametrize(
+    ("device", "uses", "imus"),
+    [
+        (2, NOTHING, []),
+        (2, OWN, [2]),
+        (2, REAL, [2, 1, 3]),
+        (9, OWN, [1, 2, 3]),
+        (9, REAL, [1, 2, 3]),
+    ],
+)
+def test_a_part_is_what_an_estimator_says_that_it_uses(device, uses, imus):
+    training = TrainingSet(drawn(), drawn(2, 2, seed=1), WINDOWS, SIZE, device)
+    part = training.part(uses)
+    assert [imu for _, imu, _ in places(part)] == imus
+    assert {origin for origin, *_ in places(part)} <= {ORIGIN_REAL}
+    assert part.part(uses) is part
+    assert training.part(ALL) is training
+
+
+def test_an_unknown_part_is_refused(training):
+    with pytest.raises(InputError, match="expected nothing, own, real or all, got 'some'"):
+        training.part("some")
+
+
+def test_of_a_device_its_own_recordings_tell_and_of_an_unseen_one_all_real_ones(training):
+    real = training.real.angular_rate.to_numpy()
+    np.testing.assert_array_equal(training.rates, real[1, [0, 2, 5]])
+    numbers, means = training.labels
+    assert numbers.tolist() == [1, 3, 6]
+    np.testing.assert_allclose(means, real[1, [0, 2, 5]].mean(axis=-1), atol=1e-6)
+    assert (training.recordings(), training.recordings(TRAIN)) == (3, 2)
+
+    unseen = TrainingSet(training.real, training.virtual, WINDOWS, SIZE, device=9)
+    assert (training.seen, unseen.seen) == (True, False)
+    assert unseen.labels[0].tolist() == [2, 1, 3, 6, 4, 5]
+    assert (unseen.recordings(), unseen.recordings(TRAIN)) == (6, 5)
+
+
+def test_windows_of_virtual_gyroscopes_need_some():
+    with pytest.raises(InputError, match="virtual gyroscopes, but there are none"):
+        TrainingSet(drawn(), None, WINDOWS, SIZE, device=2)
+
+
+def test_keys_tell_training_sets_and_recordings_apart(training):
+    def other(windows=WINDOWS, size=SIZE, device=2):
+        return TrainingSet(training.real, training.virtual, windows, size, device)
+
+    assert other(WINDOWS.sample(frac=1, random_state=0)).key == training.key
+    keys = {training.key, other(WINDOWS[1:]).key, other(size=10).key, other(device=1).key}
+    assert len(keys) == 4
+    moved = WINDOWS.assign(start=WINDOWS.start + 1)
+    assert other(moved).key != training.key
+    assert other(moved).recordings_key == training.recordings_key
+
+
+@pytest.fixture
+def filed(tmp_path, monkeypatch):
+    """Recordings in a file, and nothing remembered of any."""
+    monkeypatch.setattr(module, "_OF_FILES", module._Memory())
+    drawn().to_netcdf(tmp_path / "recordings.nc", engine="h5netcdf")
+    return xr.open_dataset(tmp_path / "recordings.nc", engine="h5netcdf")
+
+
+def test_folds_share_what_is_read_and_worked_out(filed, monkeypatch):
+    windows = table((TRAIN, ORIGIN_REAL, 1, range(1, 7), [0]))
+    first = TrainingSet(filed, None, windows, SIZE, 1)
+    noise = first.white_noise, first.labels[1]
+    monkeypatch.setattr(module, "allan_variance", lambda *_: pytest.fail("once is enough"))
+    again = TrainingSet(filed, None, windows[1:], SIZE, 1)
+    np.testing.assert_allclose(again.labels[1], noise[1][1:])
+    assert np.isfinite(again.white_noise).all()
+    np.testing.assert_array_equal(again.rates, drawn().angular_rate.to_numpy()[0, 1:])
+
+
+def test_what_is_remembered_is_bounded(filed, monkeypatch):
+    one = drawn().angular_rate[0, 0].nbytes
+    monkeypatch.setattr(module, "_REMEMBERED_BYTES", 3 * one)
+    windows = table((TRAIN, ORIGIN_REAL, 1, range(1, 7), [0]))
+    rates = TrainingSet(filed, None, windows, SIZE, 1).rates
+    np.testing.assert_array_equal(rates, drawn().angular_rate.to_numpy()[0])
+    assert module._OF_FILES._bytes <= 3 * one
+
+
+def test_recordings_of_a_file_go_to_a_worker_as_references(filed):
+    training = TrainingSet(filed, None, table((TRAIN, ORIGIN_REAL, 1, [1, 2], [0])), SIZE, 1)
+    assert training.rates.any()  # read, but not kept
+    pickled = pickle.dumps(training)
+    assert len(pickled) < filed.angular_rate.nbytes
+    np.testing.assert_array_equal(pickle.loads(pickled).rates, training.rates)
