@@ -29,7 +29,6 @@ _AXIS_WORDS = [
 _BRACKETS = re.compile(r"\s*[(\[]((?:[^()\[\]]|[(\[][^()\[\]]*[)\]])*)[)\]]")
 _BEHIND_UNIT = re.compile(r"(?i)[\W_]*([xyz]|[xyz][\W_]?axis|cal|raw|since .*)?[\W_]*")
 INDEX = re.compile(r"[\[.](\d+)\]?$")
-_CLOCK_UNITS_S = (1.0, 1e-3, 1e-6, 1e-9, 60.0, 3600.0)
 _LONGEST = 200  # characters of a name that is looked into
 
 
@@ -97,18 +96,15 @@ def _in_brackets(text: str, match: re.Match[str]) -> Header:
     before, behind = text[: match.start()], text[match.end() :]
     is_all = _BEHIND_UNIT.fullmatch(_BRACKETS.sub("", behind))  # not gx (deg/s)*100
     unit_text = match[1].strip() if is_all else text[match.start() :].strip()
-    if re.search("temp", before, re.IGNORECASE) and unit_text in ("C", "F"):
-        unit_text = f"deg{unit_text}"  # and no coulomb or farad
     return Header((before + behind).strip(), unit_text, read_unit(unit_text))
 
 
 def _stands_without_brackets(unit: Unit, text: str, alone: bool) -> bool:
-    """Whether it is a unit rather than a word that pint knows, such as ``a``, ``fs``, ``cal``."""
-    if unit.quantity == "time":
-        return unit.factor in _CLOCK_UNITS_S and (len(text) > 1 or text in "sS")
-    if unit.quantity == "temperature":
-        return len(text) > 1
-    return unit.quantity == "rate" or (not alone and unit.quantity != "other")
+    """Whether a text without brackets is a unit rather than a word or the letter of an axis."""
+    if len(text) == 1 and text not in "sSgG":
+        return False
+    certain = unit.quantity in ("rate", "time", "temperature")
+    return certain or (not alone and unit.quantity != "other")
 
 
 @lru_cache(64)
