@@ -13,7 +13,6 @@ as fast as they come, the rate counts them all.
 """
 
 from dataclasses import dataclass, field
-from math import isclose
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,14 +45,10 @@ def from_stamps(stamps: Floats, unit_s: float | None, numbers: Rows | None = Non
         between them; a finding is REJECTED where it changes along the recording.
     """
     numbers = np.arange(len(stamps)) if numbers is None else numbers
-    stamps, strays = _without_strays(stamps)
-    rows = np.flatnonzero(np.isfinite(stamps))
+    rows, strays = _without_strays(stamps)
     steps = np.diff(stamps[rows])
-    if len(stamps) == len(rows) > 1 and 5 * np.ptp(steps) + 1e-80 < steps.mean():  # as most are
-        findings = _regularity(stamps, numbers, np.ones(len(stamps), bool))
-        return Timing(
-            None if unit_s is None else 1 / (steps.mean() * unit_s), findings=(*findings,)
-        )
+    if len(rows) == len(stamps) > 1 and 5 * np.ptp(steps) + 1e-80 < steps.mean():  # as most are
+        return Timing(unit_s and 1 / (steps.mean() * unit_s), findings=_change(stamps, rows))
     times, wraps, back = _increasing(stamps[rows], unit_s)
     findings = [
         *_at("timestamps", numbers[strays], "a timestamp is far from those beside it, and ignored"),
@@ -74,22 +69,19 @@ def from_stamps(stamps: Floats, unit_s: float | None, numbers: Rows | None = Non
     findings += [
         *_at("gaps", numbers[gaps], missing, REPAIRED, "before"),
         *_at("timestamps", numbers[rows[~first]], text),
-        *_regularity(even, rows[last], losses == 0),
+        *_jitter(np.diff(even)[(np.diff(rows[last]) == 1) & (losses[1:] == 0)], len(even)),
+        *_change(even, rows[last]),
     ]
-    rate_hz = None if unit_s is None else 1 / (step * unit_s)
-    return Timing(rate_hz, np.union1d(gaps, rows[back]), tuple(findings))
+    return Timing(unit_s and 1 / (step * unit_s), np.union1d(gaps, rows[back]), (*findings,))
 
 
-def _fit(
-    times: Floats, rows: Rows, stamps: Floats, pause: int = 100
-) -> tuple[float, Floats, Floats]:
+def _fit(times: Floats, rows: Rows, stamps: Floats) -> tuple[float, Floats, Floats]:
     """The step from sample to sample, samples missing before each stamp, and times without gaps.
 
     Args:
         times: (k,), increasing, of the stamps that differ.
         rows: (k,), the last row with each.
         stamps: (n,), as written.
-        pause: A gap of so many samples need not last a whole number of steps.
     """
     step = _usual_step(times, rows)
     resolution = _resolution(stamps, np.diff(times), np.diff(rows), step)
@@ -98,29 +90,21 @@ def _fit(
         delays = times - step * rows
         scatter = np.ptp(np.quantile(np.diff(delays), [0.15, 0.85]))
         least = max(step / 2, 1.25 * resolution, 2 * scatter)
-        losses = _rises(delays, least, step) / step
-        losses = np.where(losses < pause, np.rint(losses), losses)
+        losses = np.rint(_rises(delays, least, step) / step)
         repeats = doubled * np.rint(_rises(-delays, least, step) / step)
         even = times - step * np.cumsum(losses - repeats)
-        earlier, step = step, _slope(even, rows, 9 * len(rows) // 10) or step
-        if isclose(step, earlier, rel_tol=1e-4):
-            break
+        step = _slope(even, rows, 9 * len(rows) // 10) or step
     return step, losses, even
 
 
 def _rises(delays: Floats, least: float, step: float, near: int = 50, few: int = 5) -> Floats:
-    """How far the lower envelope of delays rises before each stamp, (k,).
+    """How far the lower envelope of delays (k,) rises before each stamp; 0 where by less than least.
 
-    Args:
-        delays: (k,).
-        least: Smaller rises are 0.
-        step: A delay of so long may end within ten stamps more.
-        near: The envelope is the least delay of so many stamps, if later ones are not even less.
-        few: It is compared with the median of so many before; so many must follow.
+    Before a stamp, the envelope is the median of a few delays; behind it, the least of those near
+    it, unless a later one is even less: what is late by a step has ten stamps to be in time again.
     """
     excess = np.diff(delays, prepend=delays[0])
-    rows = np.flatnonzero(excess > least)
-    rows = rows[rows < len(delays) - few]
+    rows = np.flatnonzero(excess[: len(delays) - few] > least)
     rises = np.zeros(len(delays))
     if len(rows):
         ends = np.minimum(rows + near + 10 * excess[rows] / step, len(delays)).astype(np.intp)
@@ -147,6 +131,14 @@ def _usual_step(times: Floats, rows: Rows) -> float:
         lag *= 2
 
 
+def _slope(times: Floats, rows: Rows, lag: int) -> float:
+    """Median of the step from row to row over a lag, which few gaps do not change."""
+    lag = min(max(lag, 1), len(rows) - 1)
+    if lag < 1:
+        return 0.0
+    return float(np.median((times[lag:] - times[:-lag]) / (rows[lag:] - rows[:-lag])))
+
+
 def _resolution(stamps: Floats, steps: Floats, counts: Rows, step: float, few: int = 5) -> float:
     """What the stamps (n,) are rounded to; 0 if that is less than a hundredth of a step.
 
@@ -166,37 +158,27 @@ def _resolution(stamps: Floats, steps: Floats, counts: Rows, step: float, few: i
     return max(decimal, step * (change.mean() < 1 / 4))
 
 
-def _slope(times: Floats, rows: Rows, lag: int) -> float:
-    """Median of the step from row to row over a lag, which few gaps do not change."""
-    lag = min(max(lag, 1), len(rows) - 1)
-    if lag < 1:
-        return 0.0
-    return float(np.median((times[lag:] - times[:-lag]) / (rows[lag:] - rows[:-lag])))
+def _jitter(steps: Floats, count: int, most: float = 0.1) -> tuple[Finding, ...]:
+    """Whether steps between samples, if most of a count are left, scatter by more than a share."""
+    scatter = np.std(steps) / np.mean(steps) if len(steps) > count / 2 else 0.0
+    text = f"steps scatter by {scatter:.0%} of their mean"
+    return (Finding("jitter", KEPT, text),) if scatter > most else ()
 
 
-def _regularity(
-    times: Floats, rows: Rows, whole: NDArray[np.bool_], jitter: float = 0.1, least: float = 0.02
-) -> list[Finding]:
-    """Whether the steps of times without gaps scatter, or change along the recording.
+def _change(times: Floats, rows: Rows, least: float = 0.02) -> tuple[Finding, ...]:
+    """Whether the step changes along times without gaps: between the means of five parts.
 
-    A change is one of the mean steps of five parts, by `least` of them and by more than the ten
-    blocks in each differ.
+    A change is more than a share ``least`` of the step, and than the ten blocks of a part differ.
     """
-    findings = []
-    steps = np.diff(times)[(np.diff(rows) == 1) & whole[1:]]
-    scatter = np.std(steps) / np.mean(steps) if len(steps) > len(rows) / 2 else 0.0
-    if scatter > jitter:
-        text = f"steps scatter by {scatter:.0%} of their mean"
-        findings.append(Finding("jitter", KEPT, text))
     ends = np.linspace(0, len(rows) - 1, 51).astype(np.intp)
-    if len(rows) >= len(ends):
-        blocks = (np.diff(times[ends]) / np.diff(rows[ends])).reshape(5, 10)
-        change = np.ptp(blocks.mean(axis=1)) / blocks.mean()
-        error = np.sqrt(blocks.var(axis=1, ddof=1).mean() / 10) / blocks.mean()
-        if change > max(least, 6 * error):
-            text = f"the step between timestamps changes by {change:.0%} along the recording"
-            findings.append(Finding("sample rate", REJECTED, f"{text}: split the file"))
-    return findings
+    if len(rows) < len(ends):
+        return ()
+    blocks = (np.diff(times[ends]) / np.diff(rows[ends])).reshape(5, 10)
+    change = np.ptp(blocks.mean(axis=1)) / blocks.mean()
+    error = np.sqrt(blocks.var(axis=1, ddof=1).mean() / 10) / blocks.mean()
+    text = f"the step between timestamps changes by {change:.0%} along the recording"
+    rejected = Finding("sample rate", REJECTED, f"{text}: split the file")
+    return (rejected,) if change > max(least, 6 * error) else ()
 
 
 def _increasing(stamps: Floats, unit_s: float | None) -> tuple[Floats, Rows, Rows]:
@@ -207,34 +189,30 @@ def _increasing(stamps: Floats, unit_s: float | None) -> tuple[Floats, Rows, Row
     steps = np.diff(stamps, prepend=stamps[:1])
     steps[np.abs(steps) <= 4 * np.spacing(np.abs(stamps).max(initial=1e-90))] = 0.0
     back = np.flatnonzero(steps < 0)
-    if not len(back):
-        return np.cumsum(steps), back, back
     usual = np.median(steps[steps > 0]) if (steps > 0).any() else 0.0
     periods = np.array([2.0**16, 2.0**24, 2.0**32, 86_400 / (unit_s or np.inf)])
     unwrapped = steps[back, None] + periods[periods > 10 * usual]
     ends = np.abs(unwrapped - usual) <= usual
     wraps = ends.any(axis=1)
-    steps[back] = np.where(wraps, np.max(unwrapped * ends, axis=1), usual)
+    steps[back] = np.where(wraps, np.max(unwrapped * ends, axis=1, initial=0.0), usual)
     return np.cumsum(steps), back[wraps], back[~wraps]
 
 
 def _without_strays(
     stamps: Floats, far: float = 10.0, largest: float = 1e100
-) -> tuple[Floats, Rows]:
-    """Stamps, NaN where one is so many steps from those beside it, which are near; and where.
+) -> tuple[Rows, Rows]:
+    """Rows with a stamp, and those whose stamp is so many steps from its neighbours, which are near.
 
     Of these the time is not known, but the samples may be whole.
     """
-    stamps = np.where(np.abs(stamps) < largest, stamps, np.nan)
-    rows = np.flatnonzero(np.isfinite(stamps))
+    rows = np.flatnonzero(np.abs(stamps) < largest)
+    if len(rows) < 3 or (np.diff(stamps[rows]) >= 0).all():  # noqa: PLR2004
+        return rows, rows[:0]
     before, here, after = (stamps[rows[n : len(rows) - 2 + n]] for n in range(3))
     away = np.maximum(before - here, here - after)
-    if not (away > 0).any():  # as most are
-        return stamps, rows[:0]
     near = np.maximum(after - before, np.median(after - before) / 2)
     strays = rows[1:-1][(after >= before) & (away > far * near)]
-    stamps[strays] = np.nan
-    return stamps, strays
+    return np.setdiff1d(rows, strays), strays
 
 
 def from_counter(counts: Floats, bits: int) -> Timing:
@@ -247,23 +225,18 @@ def from_counter(counts: Floats, bits: int) -> Timing:
     Returns:
         Rows at which it does not go on by one are gaps; there is no rate.
     """
-    counts, strays = _without_strays(counts)
-    numbered = np.flatnonzero(np.isfinite(counts))
-    rows, steps = numbered[1:], np.diff(counts[numbered])
-    skips = np.mod(steps - np.diff(numbered), 2.0**bits) != 0
-    text = "the packet counter does not go on by one"
-    return Timing(
-        gap_rows=rows[skips],
-        findings=(
-            *_at("packet counter", strays, "a number is far from those beside it, and ignored"),
-            *_at(
-                "wrap-around",
-                rows[~skips & (steps < 0)],
-                f"the {bits}-bit packet counter starts anew",
-            ),
-            *_at("packet counter", rows[skips], text, REPAIRED),
-        ),
+    rows, strays = _without_strays(counts)
+    jumps = np.diff(counts[rows] - rows)
+    changes = np.flatnonzero(jumps)
+    wraps = np.mod(jumps[changes], 2.0**bits) == 0
+    wraps, skips = rows[1:][changes[wraps]], rows[1:][changes[~wraps]]
+    far = "a number is far from those beside it, and ignored"
+    findings = (
+        *_at("packet counter", strays, far),
+        *_at("wrap-around", wraps, f"the {bits}-bit packet counter starts anew"),
+        *_at("packet counter", skips, "the packet counter does not go on by one", REPAIRED),
     )
+    return Timing(gap_rows=skips, findings=findings)
 
 
 def check_rate(rate_hz: float, expected_hz: float, tolerance_pct: float) -> tuple[Finding, ...]:
