@@ -239,19 +239,6 @@ def from_counter(counts: Floats, bits: int) -> Timing:
     return Timing(gap_rows=skips, findings=findings)
 
 
-def check_rate(rate_hz: float, expected_hz: float, tolerance_pct: float) -> tuple[Finding, ...]:
-    """Compare a measured sample rate with the expected one; beyond the tolerance: REJECTED."""
-    ratio = rate_hz / expected_hz
-    powers = [n for n in (0, -6, -3, 3, 6) if abs(ratio / 10.0**n - 1) <= tolerance_pct / 100]
-    if 0 in powers:
-        return ()
-    advice = "check the file's time, and samples and recording_s of the sensor"
-    if powers:
-        advice = f"it is off by 10^{powers[0]}: check time_units"
-    text = f"expected {expected_hz:g} Hz within {tolerance_pct:g} %, got {rate_hz:.6g} Hz; {advice}"
-    return (Finding("sample rate", REJECTED, text),)
-
-
 def _at(check: str, rows: Rows, text: str, outcome: str = KEPT, place: str = "at") -> list[Finding]:
     """How often something is so, and where first; no finding if it never is."""
     if not len(rows):
