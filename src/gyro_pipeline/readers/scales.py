@@ -151,11 +151,12 @@ def _stated_factors(file: File, rates: Sequence[int]) -> Iterator[tuple[str, Rea
 
 def _readings(line: str, factor: float) -> Readings:
     """What a factor may be, by a unit in its line; a gyroscope's count is less than 1 deg/s."""
-    match = re.search(r"(?i)(m(?:illi)?)?(?:deg|°|dps)", line)
-    in_rad = not match and re.search("(?i)rad", line)
-    unit, size = ("rad/s", _DPS_PER_RAD) if in_rad else ("deg/s", 1e-3 if match and match[1] else 1)
+    factor *= 1e-3 if re.search(r"(?i)mdps|m(?:illi)?(?:deg|°)", line) else 1
+    in_deg = re.search(r"(?i)dps|deg|°", line)
+    in_rad = not in_deg and re.search("(?i)rad", line)
+    unit, size = ("rad/s", _DPS_PER_RAD) if in_rad else ("deg/s", 1)
     readings = {f"{unit} a count": factor * size, f"counts per {unit}": size / factor}
-    if not (match or in_rad):
+    if not (in_deg or in_rad):
         readings["rad/s a count"] = factor * _DPS_PER_RAD
     return {what: dps for what, dps in readings.items() if dps < 1} or readings
 
