@@ -96,7 +96,7 @@ def _stacked(file: File, columns: Sequence[int]) -> Floats:
         lengths = [len(column) for column in values]
         names = file.listed(columns)
         raise file.refusal(f"expected columns of one length, got {lengths} of {names}; correct it")
-    return np.stack(values, axis=1)
+    return np.array(values).T
 
 
 def _in_dps(file: File, raw: Floats, scale: float, rate_hz: float | None) -> Floats:
