@@ -91,7 +91,7 @@ def lost_decimal_points(values: Floats, digits: tuple[int, int] = (6, 9), most: 
 
 def implausible_level(rates: Floats, most_dps: float = 100.0) -> str:
     """A level that no MEMS gyroscope at rest has; of rates in deg/s."""
-    if (np.abs(rates) > most_dps).mean() < 1 / 6:  # most recordings, at a glance
+    if np.count_nonzero(np.abs(rates) > most_dps) < rates.size / 6:  # most recordings, at a glance
         return ""
     levels = np.median(_finite(rates), axis=0)
     axis = int(np.abs(levels).argmax())

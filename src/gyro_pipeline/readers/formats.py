@@ -6,6 +6,7 @@ open. Loggers whose headers name all units need no row: NGIMU, x-IMU3, phyphox, 
 
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.readers.table import IN_READER, Table
@@ -47,8 +48,12 @@ class Format:
 
 def find_all(table: Table, *names: str) -> list[int]:
     """Columns of these names, also within a message: ``field.angular_velocity.x``."""
-    headers = [f".{header}" for header in table.names]
-    return [n for name in names for n, text in enumerate(headers) if text.endswith(f".{name}")]
+    return [number for name in names for number in _named(table.names, name)]
+
+
+@lru_cache(1 << 10)  # a folder's files have the same headers
+def _named(headers: tuple[str, ...], name: str) -> list[int]:
+    return [n for n, header in enumerate(headers) if f".{header}".endswith(f".{name}")]
 
 
 FORMATS: dict[str, Format] = {

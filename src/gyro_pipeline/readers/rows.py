@@ -18,7 +18,6 @@ from scipy.ndimage import uniform_filter1d
 from gyro_pipeline.conventions import AXES
 from gyro_pipeline.readers.file import File
 from gyro_pipeline.readers.names import OTHER, RATE, Header, triples
-from gyro_pipeline.readers.stamps import names_time
 
 Codes = NDArray[np.intp]
 Floats = NDArray[np.float64]
@@ -85,7 +84,7 @@ def blank_at_regular_shares(
             at random, lengths scatter.
     """
     none = np.zeros(len(rates), bool)
-    if np.isnan(rates[:, 0]).mean() < least_share:
+    if np.count_nonzero(np.isnan(rates[:, 0])) < least_share * len(rates):
         return none
     blank = np.isnan(rates).all(axis=1)
     lengths = np.diff(np.flatnonzero(np.diff(blank)))
@@ -117,7 +116,7 @@ def contradict_turns(file: File, used: Collection[int], keep: Mask, rates: Float
     """
     of_axes = {number for triple in triples(file.headers) for number in triple}
     for number, (header, column) in enumerate(zip(file.headers, file.table.columns, strict=True)):
-        measures = header.has_unit or names_time(header) or (number in of_axes and header.quantity)
+        measures = header.has_unit or header.names_time or (number in of_axes and header.quantity)
         if number in used or (measures and column.dtype.kind == "f") or len(column) != len(keep):
             continue
         cells = column[:: len(column) // 100 + 1].tolist()

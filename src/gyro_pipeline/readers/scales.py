@@ -7,7 +7,9 @@ factor that the file states beside them must be that unit in one of its readings
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from math import isclose
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from numpy.typing import NDArray
 
 from gyro_pipeline.readers.file import File
 from gyro_pipeline.readers.formats import find_all
@@ -135,7 +137,7 @@ def _stated_factors(file: File, rates: Sequence[int]) -> Iterator[tuple[str, Rea
     above = [line[:200].strip() for line in file.table.preamble.splitlines()]
     texts = {f"a line above the header says {line!r}": line for line in above}
     for number, (name, column) in enumerate(zip(file.table.names, file.table.columns, strict=True)):
-        if number not in rates and len(column) and (column == column[0]).all():
+        if number not in rates and _is_constant(column):
             texts[f"column {name!r} is {column[0]}"] = f"{name}: {column[0]}"
     for where, text in texts.items():
         line = _RANGE.sub("", text)
@@ -147,6 +149,10 @@ def _stated_factors(file: File, rates: Sequence[int]) -> Iterator[tuple[str, Rea
                 readings = _readings(part, factor)
                 if not isclose(readings.get("deg/s a count", 0), 1, rel_tol=1e-3):
                     yield where, readings
+
+
+def _is_constant(column: NDArray[Any]) -> bool:
+    return len(column) > 0 and column[0] == column[-1] and bool((column == column[0]).all())
 
 
 def _readings(line: str, factor: float) -> Readings:

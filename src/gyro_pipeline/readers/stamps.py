@@ -14,7 +14,6 @@ from gyro_pipeline.logs import KEPT, REJECTED, Finding
 from gyro_pipeline.readers.clock import Timing, from_counter, from_stamps
 from gyro_pipeline.readers.file import File
 from gyro_pipeline.readers.formats import find_all
-from gyro_pipeline.readers.names import Header
 from gyro_pipeline.readers.table import IN_READER
 from gyro_pipeline.readers.times import are_steps, seconds
 from gyro_pipeline.units import Unit, read_unit
@@ -23,25 +22,12 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Rows = NDArray[np.intp]
 
-_TIME = re.compile(
-    r"time|stamp|elapsed|epoch?|clock|date|utc|unix|tick|second|milli|micro|nano|^d?ts?$|^$"
-)
-_DURATION = re.compile(
-    r"loop|exposure|response|integration|latency|duration|lag|age\b|offset|valid|zone|out\b|temp"
-)
 _STATED_RATE = re.compile(
     r"(?i)\b(?:(?:sampl\w*|output|update|data)[ _-]?(?:rate|freq\w*)|odr|fs)\b"
     r"[^\w\n]{0,20}(?:hz)?[^\w\n.]{0,20}(\d+(?:\.\d+)?)[ ]{0,3}(k?)(?:hz|\s|$|[,;\"])"
 )
 _UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _TIME_SCALE = re.compile(r"(?im)^\W*t(?:ime)?[ _]?scale\W+([\d.]+(?:e[-+]?\d+)?)\s*$")
-
-
-def names_time(header: Header) -> bool:
-    """Whether a column is one of times by its name."""
-    name = header.name.lower()
-    allowed = _TIME.search(name) and not _DURATION.search(name)
-    return bool(allowed and (name or header.measures("time")))
 
 
 def timing_of(file: File, keep: Mask) -> Timing:
@@ -77,7 +63,7 @@ def _increase(times: Floats, share: float) -> bool:
     finite = times[np.isfinite(times)]
     if len(finite) < max(len(times) / 2, 2) or finite[-1] <= finite[0]:
         return False
-    return share == 0 or bool((np.diff(finite) >= 0).mean() > share)
+    return share == 0 or bool(np.count_nonzero(np.diff(finite) >= 0) > share * (len(finite) - 1))
 
 
 def _candidates(file: File) -> list[tuple[int, float | None, bool]]:
@@ -94,9 +80,9 @@ def _candidates(file: File) -> list[tuple[int, float | None, bool]]:
         header, unit = file.headers[number], file.headers[number].unit
         unit_s = unit.factor if unit and header.measures("time") else by_format.get(number)
         is_text = file.table.columns[number].dtype.kind != "f"
-        by_name = is_text or column is not None or number in by_format or names_time(header)
+        by_name = is_text or column is not None or number in by_format or header.names_time
         certain = is_text or len({unit_s, options_s} - {None}) == 1
-        if by_name or (unit_s and not _DURATION.search(header.name.lower())):
+        if by_name or (unit_s and not header.names_duration):
             candidates.append(((not by_name, not certain), (number, unit_s, by_name)))
     return [candidate for _, candidate in sorted(candidates, key=lambda pair: pair[0])]
 
