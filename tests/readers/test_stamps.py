@@ -61,7 +61,12 @@ def test_what_is_not_known_of_the_time_is_one_short_finding(header, column, word
     ("header", "column", "options", "words"),
     [
         ("t (ms)", S, {"time_units": "s"}, "0.001 s, which makes 100000 Hz, but.* 1 s.* 100 Hz"),
-        ("t", S, {"time_units": "s", "preamble": "tscale,0.001"}, "line above.* 0.001 s.*read in 1 s, which"),
+        (
+            "t",
+            S,
+            {"time_units": "s", "preamble": "tscale,0.001"},
+            "line above.* 0.001 s.*read in 1 s, which",
+        ),
         ("k", S, {"time_column": "k"}, "'k' has no unit"),
         ("k", S * 0, {"time_column": "k", "time_units": "s"}, "'k' holds"),
         ("k", STEPS, {"time_column": "k", "time_units": "ms"}, "give time_is: steps"),

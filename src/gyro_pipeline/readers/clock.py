@@ -47,15 +47,15 @@ def from_stamps(stamps: Floats, unit_s: float | None, numbers: Rows | None = Non
     numbers = np.arange(len(stamps)) if numbers is None else numbers
     rows, strays = _without_strays(stamps)
     steps = np.diff(stamps[rows])
-    if len(rows) == len(stamps) > 1 and 5 * np.ptp(steps) + 1e-80 < steps.mean():  # as most are
-        return Timing(unit_s and 1 / (steps.mean() * unit_s), findings=_change(stamps, rows))
+    if len(rows) == len(stamps) > 1 and 5 * np.ptp(steps) + 1e-80 < (step := steps.mean()):
+        return Timing(unit_s and 1 / (step * unit_s), findings=_change(stamps, rows))  # as most
     times, wraps, back = _increasing(stamps[rows], unit_s)
     findings = [
         *_at("timestamps", numbers[strays], "a timestamp is far from those beside it, and ignored"),
         *_at("wrap-around", numbers[rows[wraps]], "the counter of the timestamps starts anew"),
         *_at("time order", numbers[rows[back]], "time goes back", REPAIRED),
     ]
-    usual = _slope(times, rows, len(rows) // 20)
+    usual = np.median(_slopes(times, rows, max(len(rows) // 20, 1))) if len(rows) > 1 else 0.0
     if not usual > 0:
         text = "timestamps do not advance: the rate is not measured"
         return Timing(None, rows[back], (*findings, Finding("timestamps", KEPT, text)))
@@ -93,15 +93,15 @@ def _fit(times: Floats, rows: Rows, stamps: Floats) -> tuple[float, Floats, Floa
         losses = np.rint(_rises(delays, least, step) / step)
         repeats = doubled * np.rint(_rises(-delays, least, step) / step)
         even = times - step * np.cumsum(losses - repeats)
-        step = _slope(even, rows, 9 * len(rows) // 10) or step
+        step = float(np.median(_slopes(even, rows, 9 * len(rows) // 10))) or step
     return step, losses, even
 
 
 def _rises(delays: Floats, least: float, step: float, near: int = 50, few: int = 5) -> Floats:
-    """How far the lower envelope of delays (k,) rises before each stamp; 0 where by less than least.
+    """How far the lower envelope of delays (k,) rises before each stamp; 0 if by less than least.
 
-    Before a stamp, the envelope is the median of a few delays; behind it, the least of those near
-    it, unless a later one is even less: what is late by a step has ten stamps to be in time again.
+    Before a stamp, the envelope is the median of a few delays. Behind it, it is the least delay of
+    near stamps, if none of later ones is even less: ten stamps may follow for each step of delay.
     """
     excess = np.diff(delays, prepend=delays[0])
     rows = np.flatnonzero(excess[: len(delays) - few] > least)
@@ -116,27 +116,23 @@ def _rises(delays: Floats, least: float, step: float, near: int = 50, few: int =
     return rises
 
 
+def _slopes(times: Floats, rows: Rows, lag: int) -> Floats:
+    """Mean step from row to row over each stretch of ``lag`` stamps."""
+    return (times[lag:] - times[:-lag]) / (rows[lag:] - rows[:-lag])
+
+
 def _usual_step(times: Floats, rows: Rows) -> float:
     """Mean step from row to row, without far longer ones.
 
     It is measured over as few stamps as let it scatter by less than a quarter: one, but for bursts,
     rounded stamps and steps at random.
     """
-    lag = 1
-    while True:
-        slopes = (times[lag:] - times[:-lag]) / (rows[lag:] - rows[:-lag])
+    for lag in (2**power for power in range(len(times).bit_length())):
+        slopes = _slopes(times, rows, lag)
         low, step, high = np.quantile(slopes, [0.2, 0.5, 0.8], method="lower")
         if high - low <= step / 4 or 4 * lag > len(times):
-            return float(slopes[np.abs(slopes - step) < step / 3].mean())
-        lag *= 2
-
-
-def _slope(times: Floats, rows: Rows, lag: int) -> float:
-    """Median of the step from row to row over a lag, which few gaps do not change."""
-    lag = min(max(lag, 1), len(rows) - 1)
-    if lag < 1:
-        return 0.0
-    return float(np.median((times[lag:] - times[:-lag]) / (rows[lag:] - rows[:-lag])))
+            break
+    return float(slopes[np.abs(slopes - step) < step / 3].mean())
 
 
 def _resolution(stamps: Floats, steps: Floats, counts: Rows, step: float, few: int = 5) -> float:
@@ -175,10 +171,15 @@ def _change(times: Floats, rows: Rows, least: float = 0.02) -> tuple[Finding, ..
         return ()
     blocks = (np.diff(times[ends]) / np.diff(rows[ends])).reshape(5, 10)
     change = np.ptp(blocks.mean(axis=1)) / blocks.mean()
-    error = np.sqrt(blocks.var(axis=1, ddof=1).mean() / 10) / blocks.mean()
-    text = f"the step between timestamps changes by {change:.0%} along the recording"
-    rejected = Finding("sample rate", REJECTED, f"{text}: split the file")
-    return (rejected,) if change > max(least, 6 * error) else ()
+    if (
+        change < least
+        or change < 6 * np.sqrt(blocks.var(axis=1, ddof=1).mean() / 10) / blocks.mean()
+    ):
+        return ()
+    text = (
+        f"the step between timestamps changes by {change:.0%} along the recording: split the file"
+    )
+    return (Finding("sample rate", REJECTED, text),)
 
 
 def _increasing(stamps: Floats, unit_s: float | None) -> tuple[Floats, Rows, Rows]:
@@ -198,12 +199,10 @@ def _increasing(stamps: Floats, unit_s: float | None) -> tuple[Floats, Rows, Row
     return np.cumsum(steps), back[wraps], back[~wraps]
 
 
-def _without_strays(
-    stamps: Floats, far: float = 10.0, largest: float = 1e100
-) -> tuple[Rows, Rows]:
-    """Rows with a stamp, and those whose stamp is so many steps from its neighbours, which are near.
+def _without_strays(stamps: Floats, far: float = 10.0, largest: float = 1e100) -> tuple[Rows, Rows]:
+    """Rows with a stamp in time, and rows with a stamp far from both neighbours, which are near.
 
-    Of these the time is not known, but the samples may be whole.
+    The time of the latter is not known, but their samples may be whole. Infinity is no stamp.
     """
     rows = np.flatnonzero(np.abs(stamps) < largest)
     if len(rows) < 3 or (np.diff(stamps[rows]) >= 0).all():  # noqa: PLR2004

@@ -6,7 +6,7 @@ options or where the rows themselves say so. What could be either is refused.
 """
 
 import re
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,7 @@ def sample_rows(file: File, rates: Floats) -> Mask:
     keep = np.ones(len(rates), bool)
     for name, value in file.options.rows.items():
         keep &= _with_value(file, file.find(name), value, len(rates))
+    checks: dict[str, Callable[[Floats], Mask]]
     checks = {"are blank, at a regular share": blank_at_regular_shares}
     if file.options.repeats:
         checks["repeat the one before"] = repeated
@@ -120,14 +121,15 @@ def contradict_turns(file: File, used: Collection[int], keep: Mask, rates: Float
         if number in used or (measures and column.dtype.kind == "f") or len(column) != len(keep):
             continue
         cells = column[:: len(column) // 100 + 1].tolist()
-        if len({cell for cell in cells if cell == cell}) > MOST_VALUES:  # NaN is no value
+        if len({cell for cell in cells if cell == cell}) > MOST_VALUES:  # noqa: PLR0124 - not NaN
             continue
         codes, texts = _coded(column[keep])
         if evidence := _evidence(header.name, codes, texts, rates):
             name, value = file.table.names[number] or number, _suggested(texts, np.bincount(codes))
             file.contradictions.append(
                 f"{file.listed([number])} takes turns among {_counted(codes, texts)}, {evidence}, "
-                f"but a recording is of one device; pick its rows, such as rows: {{{name}: {value}}}"
+                "but a recording is of one device; pick its rows, such as rows: "
+                f"{{{name}: {value}}}"
             )
 
 

@@ -66,8 +66,9 @@ def scale_of(file: File, rates: Sequence[int]) -> tuple[float, bool]:
         raise file.refusal(file.contradictions[0] if file.contradictions else text)
     if not (by_options or by_file):
         file.note("unit", f"{by_format[0].text}; the file does not say")
-    first, *others = *by_options, *by_file, *by_format
-    for other in others:
+    statements = [*by_options, *by_file, *by_format]
+    first = statements[0]
+    for other in statements[1:]:
         if not other.agrees(first):
             text = f"{first.text}, but {other.text}, of {names}"
             if not by_options:

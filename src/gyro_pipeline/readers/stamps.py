@@ -158,8 +158,10 @@ def compare_rates(
     if rate_hz and expected_hz and abs(rate_hz / expected_hz - 1) > tolerance:
         text = f"expected {expected_hz:g} Hz within {100 * tolerance:g} %, got {rate_hz:.6g} Hz; "
         powers = [n for n in (-6, -3, 3, 6) if abs(rate_hz / expected_hz / 10.0**n - 1) < tolerance]
-        text += f"it is off by 10^{powers[0]}: check time_units" if powers else (
-            "check the file's time, and samples and recording_s of the sensor"
+        text += (
+            f"it is off by 10^{powers[0]}: check time_units"
+            if powers
+            else ("check the file's time, and samples and recording_s of the sensor")
         )
         findings.append(Finding("sample rate", REJECTED, text))
     # it is stated of the file's rows, not of those that are left of them
