@@ -55,7 +55,7 @@ def from_stamps(stamps: Floats, unit_s: float | None, numbers: Rows | None = Non
         *_at("wrap-around", numbers[rows[wraps]], "the counter of the timestamps starts anew"),
         *_at("time order", numbers[rows[back]], "time goes back", REPAIRED),
     ]
-    usual = np.median(_slopes(times, rows, max(len(rows) // 20, 1))) if len(rows) > 1 else 0.0
+    usual = _step_over(times, rows, len(rows) / 20) if len(rows) > 1 else 0.0
     if not usual > 0:
         text = "timestamps do not advance: the rate is not measured"
         return Timing(None, rows[back], (*findings, Finding("timestamps", KEPT, text)))
@@ -83,7 +83,10 @@ def _fit(times: Floats, rows: Rows, stamps: Floats) -> tuple[float, Floats, Floa
         rows: (k,), the last row with each.
         stamps: (n,), as written.
     """
-    step = _usual_step(times, rows)
+    step, slopes = _step_over(times, rows, len(rows) / 20), np.diff(times) / np.diff(rows)
+    for _ in range(5):  # losses make some of them longer, and doubled rows shorter
+        near = np.abs(slopes - step) < 0.45 * step
+        step = slopes[near].mean() if near.any() else step
     resolution = _resolution(stamps, np.diff(times), np.diff(rows), step)
     doubled = np.diff(rows, prepend=rows[0]) > 1
     for _ in range(4):  # the step shows the gaps, and these the step
@@ -93,7 +96,7 @@ def _fit(times: Floats, rows: Rows, stamps: Floats) -> tuple[float, Floats, Floa
         losses = np.rint(_rises(delays, least, step) / step)
         repeats = doubled * np.rint(_rises(-delays, least, step) / step)
         even = times - step * np.cumsum(losses - repeats)
-        step = float(np.median(_slopes(even, rows, 9 * len(rows) // 10))) or step
+        step = _step_over(even, rows, 0.9 * len(rows)) or step
     return step, losses, even
 
 
@@ -116,23 +119,10 @@ def _rises(delays: Floats, least: float, step: float, near: int = 50, few: int =
     return rises
 
 
-def _slopes(times: Floats, rows: Rows, lag: int) -> Floats:
-    """Mean step from row to row over each stretch of ``lag`` stamps."""
-    return (times[lag:] - times[:-lag]) / (rows[lag:] - rows[:-lag])
-
-
-def _usual_step(times: Floats, rows: Rows) -> float:
-    """Mean step from row to row, without far longer ones.
-
-    It is measured over as few stamps as let it scatter by less than a quarter: one, but for bursts,
-    rounded stamps and steps at random.
-    """
-    for lag in (2**power for power in range(len(times).bit_length())):
-        slopes = _slopes(times, rows, lag)
-        low, step, high = np.quantile(slopes, [0.2, 0.5, 0.8], method="lower")
-        if high - low <= step / 4 or 4 * lag > len(times):
-            break
-    return float(slopes[np.abs(slopes - step) < step / 3].mean())
+def _step_over(times: Floats, rows: Rows, stamps: float) -> float:
+    """Median of the steps from row to row over so many stamps, which few gaps do not change."""
+    lag = max(int(stamps), 1)
+    return float(np.median((times[lag:] - times[:-lag]) / (rows[lag:] - rows[:-lag])))
 
 
 def _resolution(stamps: Floats, steps: Floats, counts: Rows, step: float, few: int = 5) -> float:
