@@ -61,11 +61,8 @@ def test_clocks_that_lose_nothing_have_their_rate_and_no_gap_and_are_kept(kind, 
         assert {finding.outcome for finding in timing.findings} <= {"kept"}
 
 
-@pytest.mark.parametrize(
-    ("rate", "tick"),
-    [(100, 1 / 64), (50, 1 / 64), (63.9, 1 / 64), (48, 0.01), (249.7, 0.004), (240, 0.004)],
-)
-def test_longer_steps_at_regular_intervals_are_the_ticks_of_a_clock(rate, tick):
+@pytest.mark.parametrize(("rate", "tick"), [(100, 1 / 64), (50, 1 / 64), (48, 0.01)])
+def test_a_clock_that_ticks_at_another_rate_than_the_samples_makes_no_gaps(rate, tick):
     timing = from_stamps(np.floor(np.arange(2 * N) / rate / tick) * tick, 1.0)
     assert not len(timing.gap_rows)
     assert timing.rate_hz == pytest.approx(rate, rel=1e-3)

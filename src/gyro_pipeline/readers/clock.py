@@ -9,7 +9,8 @@ Not seen are losses within the resolution of the stamps or their scatter: single
 that ticks as fast as samples come, a sample beside jitter of a third of a step, some of a burst.
 Nor are a sample in whose place a row is repeated, losses so regular that they look like a slower
 clock, and those beside the last five stamps. Where samples are written twice on a clock that ticks
-as fast as they come, the rate counts them all.
+as fast as they come, the rate counts them all. A clock whose ticks are no decimal unit and just
+shorter than a step skips one now and then, which looks like a missing sample.
 """
 
 from dataclasses import dataclass, field
@@ -87,7 +88,7 @@ def _fit(times: Floats, rows: Rows, stamps: Floats) -> tuple[float, Floats, Floa
     for _ in range(5):  # losses make some of them longer, and doubled rows shorter
         near = np.abs(slopes - step) < 0.45 * step
         step = slopes[near].mean() if near.any() else step
-    resolution = _resolution(stamps, np.diff(times), np.diff(rows), step)
+    resolution = _resolution(stamps, np.median(np.diff(times)))
     doubled = np.diff(rows, prepend=rows[0]) > 1
     for _ in range(4):  # the step shows the gaps, and these the step
         delays = times - step * rows
@@ -125,23 +126,11 @@ def _step_over(times: Floats, rows: Rows, stamps: float) -> float:
     return float(np.median((times[lag:] - times[:-lag]) / (rows[lag:] - rows[:-lag])))
 
 
-def _resolution(stamps: Floats, steps: Floats, counts: Rows, step: float, few: int = 5) -> float:
-    """What the stamps (n,) are rounded to; 0 if that is less than a hundredth of a step.
-
-    It is a decimal unit that all stamps are multiples of, or the usual step, if all k steps are
-    multiples of it and those that do not last as many as they count rows come at regular intervals.
-    """
-    units = 10.0 ** (np.ceil(np.log10(np.median(steps)) - 1e-6) - np.arange(3))[:, None]
+def _resolution(stamps: Floats, step: np.floating) -> float:
+    """The decimal unit that all stamps (n,) are rounded to; 0 if below a hundredth of a step."""
+    units = 10.0 ** (np.ceil(np.log10(step) - 1e-6) - np.arange(3))[:, None]
     errors = np.abs(stamps - units * np.rint(stamps / units)).max(axis=1)
-    noise = 4 * np.spacing(np.abs(stamps).max())
-    decimal = max(units[errors <= noise, 0], default=0.0)
-    multiples = np.rint(steps / step)
-    intervals = np.diff(np.flatnonzero(multiples != counts))
-    if len(intervals) < few or np.abs(steps - step * multiples).max() > noise:
-        return decimal
-    # from one interval to the next, those of losses at random change by half of their mean
-    change = np.abs(np.diff(intervals)) / (intervals[1:] + intervals[:-1])
-    return max(decimal, step * (change.mean() < 1 / 4))
+    return max(units[errors <= 4 * np.spacing(np.abs(stamps).max()), 0], default=0.0)
 
 
 def _jitter(steps: Floats, count: int, most: float = 0.1) -> tuple[Finding, ...]:
