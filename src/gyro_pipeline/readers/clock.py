@@ -84,10 +84,11 @@ def _fit(times: Floats, rows: Rows, stamps: Floats) -> tuple[float, Floats, Floa
         rows: (k,), the last row with each.
         stamps: (n,), as written.
     """
-    step, slopes = _step_over(times, rows, len(rows) / 20), np.diff(times) / np.diff(rows)
-    for _ in range(5):  # losses make some of them longer, and doubled rows shorter
-        near = np.abs(slopes - step) < 0.45 * step
-        step = slopes[near].mean() if near.any() else step
+    # the mean of steps near a middle one: losses make others longer, and doubled rows shorter
+    slopes = np.diff(times) / np.diff(rows)
+    middle = _step_over(times, rows, len(rows) / 20), np.quantile(slopes, 0.5, method="lower")
+    near = max((np.abs(slopes - step) < 0.45 * step for step in middle), key=np.count_nonzero)
+    step = float(slopes[near].mean())
     resolution = _resolution(stamps, np.median(np.diff(times)))
     doubled = np.diff(rows, prepend=rows[0]) > 1
     for _ in range(4):  # the step shows the gaps, and these the step

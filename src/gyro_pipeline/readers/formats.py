@@ -47,7 +47,7 @@ class Format:
 
 
 def find_all(table: Table, *names: str) -> list[int]:
-    """Columns of these names, also within a message: ``field.angular_velocity.x``."""
+    """Numbers of the columns of these names, also within a message: ``field.accel.x``."""
     return [number for name in names for number in _named(table.names, name)]
 
 
@@ -112,10 +112,10 @@ FORMATS: dict[str, Format] = {
 
 
 def check_format(name: str, where: str) -> None:
-    """Refuse a name that no format has.
+    """Check that there is a format of this name.
 
     Raises:
-        InputError: So it is.
+        InputError: There is none; lists those that there are.
     """
     names = (AUTO, *FORMATS, GENERAL)
     if name not in names:

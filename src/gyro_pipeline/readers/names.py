@@ -141,15 +141,15 @@ def triples(headers: tuple[Header, ...]) -> list[tuple[int, ...]]:
 
 @lru_cache(64)
 def numbered(headers: tuple[Header, ...]) -> list[tuple[int, ...]]:
-    """The same of columns without axes that end in 1, 2, 3 or 0, 1, 2: ``w0``, ``gyro 3``."""
+    """Numbers of columns without axes that end in 1, 2, 3 or 0, 1, 2: ``w0``, ``gyro 3``."""
     with_axes = {number for triple in triples(headers) for number in triple}
     groups: dict[str, dict[int, int]] = {}
     for number, header in enumerate(headers):
         match = re.fullmatch(r"(.*\D)(\d)", header.name[:_LONGEST])
         if match and number not in with_axes:
             groups.setdefault(match[1], {})[int(match[2])] = number
-    wanted = ([0, 1, 2], [1, 2, 3])
-    return [tuple(g[k] for k in sorted(g)) for g in groups.values() if sorted(g) in wanted]
+    complete = [group for group in groups.values() if {*group} in ({0, 1, 2}, {1, 2, 3})]
+    return [tuple(group[digit] for digit in sorted(group)) for group in complete]
 
 
 def is_quaternion(headers: tuple[Header, ...], triple: Sequence[int]) -> bool:
