@@ -76,13 +76,16 @@ def from_stamps(stamps: Floats, unit_s: float | None, numbers: Rows | None = Non
     return Timing(unit_s and 1 / (step * unit_s), np.union1d(gaps, rows[back]), (*findings,))
 
 
-def _fit(times: Floats, rows: Rows, stamps: Floats) -> tuple[float, Floats, Floats]:
+def _fit(
+    times: Floats, rows: Rows, stamps: Floats, pause: int = 100
+) -> tuple[float, Floats, Floats]:
     """The step from sample to sample, samples missing before each stamp, and times without gaps.
 
     Args:
         times: (k,), increasing, of the stamps that differ.
         rows: (k,), the last row with each.
         stamps: (n,), as written.
+        pause: A gap of so many samples need not last a whole number of steps.
     """
     # the mean of steps near a middle one: losses make others longer, and doubled rows shorter
     slopes = np.diff(times) / np.diff(rows)
@@ -95,7 +98,8 @@ def _fit(times: Floats, rows: Rows, stamps: Floats) -> tuple[float, Floats, Floa
         delays = times - step * rows
         scatter = np.ptp(np.quantile(np.diff(delays), [0.15, 0.85]))
         least = max(step / 2, 1.25 * resolution, 2 * scatter)
-        losses = np.rint(_rises(delays, least, step) / step)
+        losses = _rises(delays, least, step) / step
+        losses = np.where(losses < pause, np.rint(losses), losses)
         repeats = doubled * np.rint(_rises(-delays, least, step) / step)
         even = times - step * np.cumsum(losses - repeats)
         step = _step_over(even, rows, 0.9 * len(rows)) or step
