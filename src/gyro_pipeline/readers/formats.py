@@ -128,10 +128,11 @@ def format_of(table: Table, name: str) -> Format | None:
     Raises:
         InputError: There is no format of that name, or the table lacks its columns.
     """
+    if name == AUTO:
+        return next((form for form in FORMATS.values() if form.claims(table)), None)
     check_format(name, f"{table.where}: format {IN_READER}")
-    if name in (AUTO, GENERAL):
-        claiming = (form for form in FORMATS.values() if name == AUTO and form.claims(table))
-        return next(claiming, None)
+    if name == GENERAL:
+        return None
     for column in FORMATS[name].rates.split():
         if len(find_all(table, column)) != 1:
             raise InputError(

@@ -91,9 +91,9 @@ def blank_at_regular_shares(
     lengths = np.diff(np.flatnonzero(np.diff(blank)))
     if blank.mean() < least_share or len(lengths) < 2 * least_runs:
         return none
-    for some in (lengths[0::2], lengths[1::2]):
-        median = np.median(some)
-        if (np.abs(some - median) <= max(1, median / 4)).mean() < alike:
+    for runs in (lengths[0::2], lengths[1::2]):
+        median = np.median(runs)
+        if (np.abs(runs - median) <= max(1, median / 4)).mean() < alike:
             return none
     return np.asarray(blank)
 
@@ -168,17 +168,17 @@ def _change(rates: Floats, codes: Codes, least: float = 0.3, chance: float = 1e-
     runs, lengths = codes[finite][starts[1:-1]], np.diff(starts, append=finite.sum())[:, None]
     level = _without_spikes(rates[finite])
     noise = _without_spikes(np.abs(level - uniform_filter1d(level, 51, axis=0)))
-    for what, values in (("rate", level), ("noise", noise)):
+    for quantity, values in (("rate", level), ("noise", noise)):
         means = np.add.reduceat(values, starts) / lengths
-        apart = means[1:-1] - (means[:-2] + means[2:]) / 2
+        differences = means[1:-1] - (means[:-2] + means[2:]) / 2
         for code in np.flatnonzero(np.bincount(runs) > 2):  # noqa: PLR2004
-            some = apart[runs == code]
-            sizes, errors = np.abs(some.mean(axis=0)), some.std(axis=0) / np.sqrt(len(some))
-            limits = -special.stdtrit(len(some) - 1, chance / 2) * errors
+            of_code = differences[runs == code]
+            sizes, errors = np.abs(of_code.mean(axis=0)), of_code.std(axis=0) / len(of_code) ** 0.5
+            limits = -special.stdtrit(len(of_code) - 1, chance / 2) * errors
             excess = sizes - np.maximum(limits, least * noise.mean(axis=0))
             if excess.max() > 0:
                 size = f"{AXES[excess.argmax()]} changes by {sizes[excess.argmax()]:.3g} deg/s"
-                return f"with which {what} about {size}"
+                return f"with which {quantity} about {size}"
     return ""
 
 

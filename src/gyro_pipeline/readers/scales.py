@@ -7,9 +7,6 @@ factor that the file states beside them must be that unit in one of its readings
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from math import isclose
-from typing import Any, NamedTuple
-
-from numpy.typing import NDArray
 
 from gyro_pipeline.readers.file import File
 from gyro_pipeline.readers.formats import find_all
@@ -18,6 +15,7 @@ from gyro_pipeline.units import Unit, read_unit
 
 RATE_UNITS = "deg/s, rad/s, mdps, deg/h, … or raw (with scale_dps)"
 
+# no part of a name, a date, a time of day or a count of bits
 _NUMBER = (
     r"(?<![\w.])(?<!\d[-:])([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(?![\w.]*\d|[-:/]\d|\s*-?bit)"
 )
@@ -36,19 +34,8 @@ _DPS_PER_RAD = 57.29577951308232
 Readings = Mapping[str, float]
 """deg/s a count, by what a stated factor may be."""
 
-
-class Statement(NamedTuple):
-    """Who says what the unit is, and the unit."""
-
-    text: str
-    unit: Unit
-
-    def agrees(self, other: "Statement") -> bool:
-        """Whether units are the same; one of counts may say nothing of their size."""
-        sizes = self.unit.factor, other.unit.factor
-        of_any_size = self.unit.quantity == "count" and 1 in sizes
-        alike = of_any_size or isclose(*sizes, rel_tol=1e-6)
-        return self.unit.quantity == other.unit.quantity and alike
+Statement = tuple[str, Unit]
+"""Who says what the unit is, for a message, and the unit."""
 
 
 def scale_of(file: File, rates: Sequence[int]) -> tuple[float, bool]:
@@ -65,16 +52,16 @@ def scale_of(file: File, rates: Sequence[int]) -> tuple[float, bool]:
         text = f"expected a unit of the rates, got {names}; give units: {RATE_UNITS}{to_type}"
         raise file.refusal(file.contradictions[0] if file.contradictions else text)
     if not (by_options or by_file):
-        file.note("unit", f"{by_format[0].text}; the file does not say")
+        file.note("unit", f"{by_format[0][0]}; the file does not say")
     statements = [*by_options, *by_file, *by_format]
-    first = statements[0]
-    for other in statements[1:]:
-        if not other.agrees(first):
-            text = f"{first.text}, but {other.text}, of {names}"
+    first, unit = statements[0]
+    for other, other_unit in statements:
+        if not _agree(unit, other_unit):
+            text = f"{first}, but {other}, of {names}"
             if not by_options:
                 raise file.refusal(f"{text}; give units and trust: options")
             file.contradictions.append(f"{text}; correct units")
-    scale, are_counts = first.unit.factor, first.unit.quantity == "count"
+    scale, are_counts = unit.factor, unit.quantity == "count"
     if are_counts and not by_options and scale == 1:
         text = f"{names} are raw counts: give units: raw and scale_dps, deg/s a count{to_type},"
         raise file.refusal(text)
@@ -82,18 +69,25 @@ def scale_of(file: File, rates: Sequence[int]) -> tuple[float, bool]:
     return scale, are_counts
 
 
+def _agree(first: Unit, second: Unit) -> bool:
+    """Whether units are the same; one of counts may say nothing of their size."""
+    of_any_size = first.quantity == "count" and 1 in (first.factor, second.factor)
+    alike = of_any_size or isclose(first.factor, second.factor, rel_tol=1e-6)
+    return first.quantity == second.quantity and alike
+
+
 def _of_options(file: File) -> Iterator[Statement]:
     units, scale_dps = file.options.units, file.options.scale_dps
     if scale_dps is not None:
-        yield Statement(f"the options say raw, of {scale_dps:g} deg/s", Unit("count", scale_dps))
+        yield f"the options say raw, of {scale_dps:g} deg/s", Unit("count", scale_dps)
     elif units and (unit := read_unit(units)):
-        yield Statement(f"units of the options are {units}", unit)
+        yield f"units of the options are {units}", unit
 
 
 def _of_format(file: File, rates: Sequence[int]) -> Iterator[Statement]:
     form = file.form
     if form and {*rates} == {*find_all(file.table, *form.rates.split())}:
-        yield Statement(f"the format has {form.units}", read_unit(form.units) or Unit("rate"))
+        yield f"the format has {form.units}", read_unit(form.units) or Unit("rate")
 
 
 def _of_headers(file: File, rates: Sequence[int]) -> Iterator[Statement]:
@@ -113,7 +107,7 @@ def _of_headers(file: File, rates: Sequence[int]) -> Iterator[Statement]:
         text = f"the remark {headers[0].unit_text!r} in the header is no unit that is known"
         file.note("unit", text)
     units = {h.unit: h.unit_text for h in headers if h.unit and h not in others}
-    yield from (Statement(f"the header says {text}", unit) for unit, text in units.items())
+    yield from ((f"the header says {text}", unit) for unit, text in units.items())
 
 
 def _of_lines(file: File) -> Iterator[Statement]:
@@ -130,7 +124,7 @@ def _of_lines(file: File) -> Iterator[Statement]:
                 units.setdefault(unit, text)
                 break
     if len(units) == 1:
-        yield from (Statement(f"lines above the header say {t}", u) for u, t in units.items())
+        yield from ((f"lines above the header say {text}", unit) for unit, text in units.items())
 
 
 def _stated_factors(file: File, rates: Sequence[int]) -> Iterator[tuple[str, Readings]]:
@@ -138,7 +132,8 @@ def _stated_factors(file: File, rates: Sequence[int]) -> Iterator[tuple[str, Rea
     above = [line[:200].strip() for line in file.table.preamble.splitlines()]
     texts = {f"a line above the header says {line!r}": line for line in above}
     for number, (name, column) in enumerate(zip(file.table.names, file.table.columns, strict=True)):
-        if number not in rates and _is_constant(column):
+        ends_equal = len(column) > 0 and column[0] == column[-1]  # at a glance
+        if number not in rates and ends_equal and (column == column[0]).all():
             texts[f"column {name!r} is {column[0]}"] = f"{name}: {column[0]}"
     for where, text in texts.items():
         line = _RANGE.sub("", text)
@@ -150,10 +145,6 @@ def _stated_factors(file: File, rates: Sequence[int]) -> Iterator[tuple[str, Rea
                 readings = _readings(part, factor)
                 if not isclose(readings.get("deg/s a count", 0), 1, rel_tol=1e-3):
                     yield where, readings
-
-
-def _is_constant(column: NDArray[Any]) -> bool:
-    return len(column) > 0 and column[0] == column[-1] and bool((column == column[0]).all())
 
 
 def _readings(line: str, factor: float) -> Readings:
