@@ -185,10 +185,10 @@ def test_texts_are_columns_and_what_is_no_number_says_where(table):
 
 def test_names_that_are_not_utf_8_come_with_the_option(table):
     text = "时间,角速度x,角速度y,角速度z\n" + "1,2,3,4\n" * 9
-    assert "not UTF-8: if names look odd, give `encoding`" in table(text.encode("gbk")).listed()
+    assert "not UTF-8: if names look odd, give `encoding`" in table(text.encode("gbk")).where
     assert table(text.encode("utf-16-le"), encoding="utf-16-le").names[1] == "角速度x"
-    assert "encoding" not in table(text).listed()
-    with pytest.raises(InputError, match="as the rows, 4, got 5.*not UTF-8.*give `encoding`"):
+    assert "encoding" not in table(text).where
+    with pytest.raises(InputError, match="not UTF-8.*give `encoding`.*as the rows, 4, got 5"):
         table(f"号,{text}".encode("gbk"))
     with pytest.raises(InputError, match="`encoding` in `reader:`.*unknown encoding: gkb"):
         table(text, encoding="gkb")
