@@ -19,36 +19,22 @@ from numpy.typing import NDArray
 _HEADER, _ORDERS = 128, {b"IM": "<", b"MI": ">"}
 _TAG, _SHORT = 8, 4  # bytes of a tag, and of one that holds its data itself
 _ARRAY, _COMPRESSED = 14, 15
-_TYPES = {
-    1: "i1",
-    2: "u1",
-    3: "i2",
-    4: "u2",
-    5: "i4",
-    6: "u4",
-    7: "f4",
-    9: "f8",
-    12: "i8",
-    13: "u8",
-}
-_TYPES |= {16: "u1", 17: "u2", 18: "u4"}  # of characters
-_STRUCTURE, _CHARACTERS, _NUMBERS, _COMPLEX = 2, 4, range(6, 16), 1 << 11
+_TYPES = "- i1 u1 i2 u2 i4 u4 f4 - f8 - - i8 u8".split()  # NumPy's, by their numbers in a file
+_STRUCTURE, _NUMBERS, _COMPLEX = 2, range(6, 16), 1 << 11
 
 Named = Iterator[tuple[str, NDArray[Any]]]
 
 
 def arrays(data: bytes) -> Named:
-    """Names and arrays of numbers and texts in a file; ``log.gyro`` is field gyro of a structure.
+    """Names and arrays of numbers in a file; ``log.gyro`` is field gyro of a structure log.
 
-    Cells, objects, sparse and complex arrays are left out.
+    Texts, cells, objects, sparse and complex arrays are left out.
 
     Raises:
-        ValueError, KeyError, struct.error, zlib.error: The file is damaged.
+        Exception: The file is damaged; NumPy, struct and zlib say so in many ways.
     """
     order = _ORDERS[data[_HEADER - 2 : _HEADER]]
     for kind, content in _elements(memoryview(data)[_HEADER:], order):
-        if kind == _COMPRESSED:
-            ((kind, content),) = _elements(memoryview(zlib.decompress(content)), order)  # noqa: PLW2901
         if kind == _ARRAY:
             yield from _named(content, order, "")
 
@@ -58,26 +44,20 @@ def _named(content: memoryview, order: str, name: str) -> Named:
     if not content:
         return
     (_, flags), (_, size), (_, label), *parts = _elements(content, order)
-    kind, name = (
-        int.from_bytes(flags[:4], "little" if order == "<" else "big"),
-        name or str(label, "utf-8"),
-    )
-    if kind & 0xFF == _STRUCTURE and not np.any(np.frombuffer(size, f"{order}i4") - 1):
+    flag, name = np.frombuffer(flags, f"{order}u4")[0], name or str(label, "utf-8")
+    if flag & 0xFF == _STRUCTURE and np.prod(np.frombuffer(size, f"{order}i4")) == 1:
         (_, width), (_, labels), *fields = parts
-        names = np.frombuffer(labels, f"S{int(np.frombuffer(width, f'{order}i4')[0])}").tolist()
+        names = np.frombuffer(labels, f"S{np.frombuffer(width, f'{order}i4')[0]}").tolist()
         for field, (_, inner) in zip(names, fields, strict=True):
             yield from _named(inner, order, f"{name}.{field.decode()}")
-    elif name and kind & 0xFF in (*_NUMBERS, _CHARACTERS) and not kind & _COMPLEX:
-        number, values = parts[0]
-        shape = np.frombuffer(size, f"{order}i4")
-        array = np.frombuffer(values, order + _TYPES[number]).reshape(shape, order="F")
-        if kind & 0xFF == _CHARACTERS and array.size:
-            array = array.astype("<u4", "C").view(f"<U{shape[-1]}")
-        yield name, array
+    elif flag & 0xFF in _NUMBERS and not flag & _COMPLEX and name:
+        kind, values = parts[0]
+        array = np.frombuffer(values, order + _TYPES[kind])
+        yield name, array.reshape(np.frombuffer(size, f"{order}i4"), order="F")
 
 
 def _elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
-    """Types and contents."""
+    """Types and contents, also of what is compressed."""
     at = 0
     while at < len(data):
         kind, size = struct.unpack_from(f"{order}II", data, at)
@@ -86,5 +66,9 @@ def _elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
             kind, size, start, length = kind & 0xFFFF, kind >> 16, at + _SHORT, _TAG
         if start + size > min(at + length, len(data)):
             raise ValueError(f"data of type {kind} and {size} bytes")
-        yield kind, data[start : start + size]
+        content = data[start : start + size]
+        if kind == _COMPRESSED:
+            yield from _elements(memoryview(zlib.decompress(content)), order)
+        else:
+            yield kind, content
         at += length if kind == _COMPRESSED else -(-length // _TAG) * _TAG

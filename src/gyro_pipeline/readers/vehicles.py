@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gyro_pipeline.conventions import AXES, InputError
 from gyro_pipeline.logs import KEPT, Finding
 from gyro_pipeline.parameters import ReaderOptions
-from gyro_pipeline.readers.table import Reader, Table
+from gyro_pipeline.readers.table import IN_READER, Reader, Table
 
 Columns = dict[str, NDArray]
 Stream = tuple[str, int | None]
@@ -23,19 +23,17 @@ Stream = tuple[str, int | None]
 
 PX4 = ("sensor_gyro", "sensor_combined", "vehicle_angular_velocity")
 """Topics with rates (https://docs.px4.io/main/en/msg_docs): the first one that is there is read."""
-RATES = [f"gyro.{axis} [rad/s]" for axis in AXES]
-ACCELERATIONS = [f"accel.{axis} [m/s^2]" for axis in AXES]
-NAMES = {  # the later of two that are there counts
-    **dict.fromkeys(["timestamp", "timestamp_sample", "TimeUS", "SampleUS"], "time [us]"),
-    **dict(zip(["x", "y", "z"], RATES, strict=True)),
-    **dict(zip(["gyro_rad[0]", "gyro_rad[1]", "gyro_rad[2]"], RATES, strict=True)),
-    **dict(zip(["xyz[0]", "xyz[1]", "xyz[2]"], RATES, strict=True)),
-    **dict(zip(["GyrX", "GyrY", "GyrZ"], RATES, strict=True)),
-    **{f"accelerometer_m_s2[{n}]": name for n, name in enumerate(ACCELERATIONS)},
-    **dict(zip(["AccX", "AccY", "AccZ"], ACCELERATIONS, strict=True)),
-    **dict.fromkeys(["temperature", "T"], "temperature [degC]"),
+NAMES = {
+    "time [us]": "timestamp timestamp_sample TimeUS SampleUS",
+    "gyro.x [rad/s]": "x gyro_rad[0] xyz[0] GyrX",
+    "gyro.y [rad/s]": "y gyro_rad[1] xyz[1] GyrY",
+    "gyro.z [rad/s]": "z gyro_rad[2] xyz[2] GyrZ",
+    "accel.x [m/s^2]": "accelerometer_m_s2[0] AccX",
+    "accel.y [m/s^2]": "accelerometer_m_s2[1] AccY",
+    "accel.z [m/s^2]": "accelerometer_m_s2[2] AccZ",
+    "temperature [degC]": "temperature T",
 }
-"""Columns of a table, by the names of fields."""
+"""Columns of a table, and the fields that hold them, of which the last that is there counts."""
 
 
 def read_px4(path: Path, options: ReaderOptions) -> Table:
@@ -109,7 +107,7 @@ def read_ros(path: Path, options: ReaderOptions) -> Table:
             stamps_ns.append(stamp.sec * 10**9 + stamp.nanosec or received_ns)
             vectors = message.angular_velocity, message.linear_acceleration
             rows.append([getattr(vector, axis) for vector in vectors for axis in AXES])
-    names, times = [*RATES, *ACCELERATIONS], np.array(stamps_ns, np.int64)
+    names, times = list(NAMES)[1:7], np.array(stamps_ns, np.int64)
     values = np.array(rows, float).reshape(len(rows), len(names))
     since_s = (times - times[:1]) / 1e9  # from the first: float64 would round nanoseconds of today
     return Table(str(path), ("time [s]", *names), (since_s, *values.T))
@@ -125,8 +123,13 @@ READERS: dict[bytes, Reader] = {
 """By the first bytes of a file."""
 
 
-def _table(path: Path, rows: Columns, findings: Iterable[Finding]) -> Table:
-    columns = {name: rows[key].astype(np.float64) for key, name in NAMES.items() if key in rows}
+def _table(path: Path, rows: Columns, findings: list[Finding]) -> Table:
+    columns = {
+        name: np.asarray(rows[field], np.float64)
+        for name, fields in NAMES.items()
+        for field in fields.split()
+        if field in rows
+    }
     return Table(str(path), tuple(columns), tuple(columns.values()), findings=tuple(findings))
 
 
@@ -151,6 +154,6 @@ def _pick(path: Path, options: ReaderOptions, streams: Iterable[Stream]) -> Stre
         raise InputError(f"{path}: expected messages with angular rates, got none")
     got = "" if allowed else f", got topic: {options.topic}, instance: {options.instance}"
     raise InputError(
-        f"{path}: expected one device's angular rates{got}; the log has {listed}; give these in "
-        "`reader:` of the catalog entry in catalog.yml"
+        f"{path}: expected one device's angular rates{got}; the log has {listed}; give these "
+        f"{IN_READER}"
     )
