@@ -88,19 +88,9 @@ def column(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def columns_of(
-    names: Sequence[str],
-    texts: Sequence[Any],
-    place: Callable[[int], str],
-    decimal_point: str = ".",
+    names: Sequence[str], texts: Sequence[Any], place: Callable[[int], str], decimal_point: str
 ) -> tuple[tuple[NDArray[Any], ...], tuple[Finding, ...], set[int]]:
-    """Columns of a text; what is unreadable in those of numbers, and in which rows.
-
-    Args:
-        names: Of the columns, for the findings.
-        texts: Arrow strings, or numbers, of each column, (n,).
-        place: Where a row is.
-        decimal_point: A point or a comma.
-    """
+    """Columns of Arrow strings or numbers; what is unreadable in those of numbers; and its rows."""
     cells = [_of_texts(column, decimal_point) for column in texts]
     findings = []
     for number, (name, (values, bad)) in enumerate(zip(names, cells, strict=True)):

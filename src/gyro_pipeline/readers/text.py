@@ -63,11 +63,12 @@ class _Rows:
         """The body with empty rows for those of another number of fields, and what is wrong."""
         width, lines, odd = len(self.names), list[str](), dict[int, str]()
         for row, (_, line) in enumerate(self.numbered):
-            sign = self.delimiter
-            fields = len(_split(line, sign)) if self.quoted else line.count(sign) + 1
-            lines.append(line if fields == width else sign * (width - 1))
+            fields = line.count(self.delimiter) + 1
+            if self.quoted:
+                fields = len(_split(line, self.delimiter, strict=True))
             if fields != width:
-                odd[row] = f"expected {width} fields, got {fields}"
+                odd[row] = f"expected {width} fields, got {fields or 'damaged quotes'}"
+            lines.append(self.delimiter * (width - 1) if row in odd else line)
         return "\n".join(lines).encode(), odd
 
 
@@ -123,7 +124,7 @@ def _refuse_headers(rows: _Rows, damaged: list[int]) -> None:
         line = rows.numbered[row][1]
         fields = _split(line, rows.delimiter)
         same = len(fields) == len(rows.names) or _filled(fields) == _filled([*rows.names])
-        if same and not _is_row(fields, rows.delimiter):
+        if same and not _is_row(fields):
             raise InputError(
                 f"{rows.where}: expected numbers, got a second header in {rows.place(row)}, "
                 f"{line[:80]!r}: two recordings in one file? Split it"
@@ -180,11 +181,8 @@ def _rows(where: str, text: bytes, delimiter: str | None) -> _Rows:
     if len(text) > _HEAD:  # without a line that is cut
         head = head[: 1 + max(head.rfind(b"\n"), head.rfind(b"\r"))] or head
     whole = head.splitlines(keepends=True)
-    numbered = {
-        n: line.decode("utf-8", "replace").strip("\r\n")
-        for n, line in enumerate(whole)
-        if line.strip()
-    }
+    decoded = enumerate(line.decode("utf-8", "replace").strip("\r\n") for line in whole)
+    numbered = {number: line for number, line in decoded if line.strip()}
     lines = [*numbered.values()]
     delimiters = [delimiter] if delimiter else [*DELIMITERS]
     starts = {sign: start for sign in delimiters if (start := _first_row(lines, sign))}
@@ -222,14 +220,14 @@ def _spelt(delimiter: str) -> str:
     return DELIMITERS.get(delimiter, repr(delimiter))
 
 
-def _split(line: str, delimiter: str) -> Row:
-    """Fields without quotes and outer blanks; none if the line cannot be split."""
+def _split(line: str, delimiter: str, strict: bool = False) -> Row:
+    """Fields without quotes and outer blanks; none if strict and quotes are damaged."""
     if delimiter == " ":
         return line.split()
     fields = line.split(delimiter)
     if '"' in line:
         try:
-            fields = next(csv.reader([line], delimiter=delimiter, strict=True))
+            fields = next(csv.reader([line], delimiter=delimiter, strict=strict))
         except csv.Error:  # an open quote, or a field beyond csv's limit
             return []
     return [field.strip() for field in fields]
@@ -245,15 +243,14 @@ def _are_numbers(*fields: str) -> bool:
     return True
 
 
-def _is_row(fields: Row, delimiter: str) -> bool:
-    """Whether three or half of the fields are numbers, times or dates; else they are names.
-
-    Words between blanks are a sentence.
-    """
+def _is_row(fields: Row) -> bool:
+    """Whether three or half of the fields are numbers, times or dates; else they are names."""
     filled = [field for field in fields if field]
-    figures = sum(field[0] in "+-.0123456789" or _are_numbers(field) for field in filled)
-    least = len(filled) if delimiter == " " else min(_LEAST, max(1, len(filled) / 2))
-    return len(fields) >= _LEAST and figures >= least
+    return sum(map(_is_figure, filled)) >= min(_LEAST, max(1, len(filled) / 2))
+
+
+def _is_figure(field: str) -> bool:
+    return field[0] in "+-.0123456789" or _are_numbers(field)
 
 
 def _first_row(lines: list[str], delimiter: str) -> tuple[int, int, int] | None:
@@ -262,7 +259,9 @@ def _first_row(lines: list[str], delimiter: str) -> tuple[int, int, int] | None:
     for line in lines:
         may_be = delimiter in line and not line.lstrip().startswith(_NO_ROW)
         fields = _split(line, delimiter) if may_be else []
-        is_row = may_be and _is_row(fields, delimiter)
+        # words between blanks are a sentence
+        is_row = all(map(_is_figure, fields)) if delimiter == " " else _is_row(fields)
+        is_row = is_row and len(fields) >= _LEAST
         shapes.append((len(fields), sum(map(_are_numbers, fields))) if is_row else (0, 0))
         width, numbers = shapes[-1][0], max(shapes[-2][1], shapes[-1][1])
         if width == shapes[-2][0] and numbers >= _LEAST:
@@ -282,14 +281,8 @@ def _header(
 ) -> tuple[tuple[str, ...], list[str]]:
     """The names, of the nearest line above the rows that is as wide as they, and the lines left.
 
-    A row of units, and rows of names that span columns, belong to it.
-
-    Args:
-        where: For messages.
-        above: The lines above the rows.
-        delimiter: Of the rows.
-        width: Fields of a row.
-        used: These without those at the end that are empty in all rows.
+    A row of units, and rows of names that span columns, belong to it. Of the ``width`` fields of a
+    row the first ``used`` are not empty at its end.
     """
     bare = [line.lstrip("#%/ ") for line in above]
     for at in reversed(range(len(above))):
