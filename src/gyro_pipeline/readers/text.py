@@ -61,15 +61,17 @@ class _Rows:
 
     def repaired(self) -> tuple[bytes, dict[int, str]]:
         """The body with empty rows for those of another number of fields, and what is wrong."""
-        width, lines, odd = len(self.names), list[str](), dict[int, str]()
-        for row, (_, line) in enumerate(self.numbered):
-            fields = line.count(self.delimiter) + 1
-            if self.quoted:
-                fields = len(_split(line, self.delimiter, strict=True))
-            if fields != width:
-                odd[row] = f"expected {width} fields, got {fields or 'damaged quotes'}"
-            lines.append(self.delimiter * (width - 1) if row in odd else line)
-        return "\n".join(lines).encode(), odd
+        width, lines = len(self.names), [line for _, line in self.numbered]
+        if self.quoted:
+            fields = [len(_split(line, self.delimiter, strict=True)) for line in lines]
+        else:
+            fields = [line.count(self.delimiter) + 1 for line in lines]
+        odd = {row: count for row, count in enumerate(fields) if count != width}
+        for row in odd:
+            lines[row] = self.delimiter * (width - 1)
+        problem = f"expected {width} fields, got"
+        problems = {row: f"{problem} {count or 'damaged quotes'}" for row, count in odd.items()}
+        return "\n".join(lines).encode(), problems
 
 
 def read_text(path: Path, options: ReaderOptions) -> Table:
