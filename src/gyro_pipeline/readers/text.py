@@ -50,10 +50,14 @@ class _Rows:
     texts: list[bool]  # whether a column is not of numbers alone in the head
 
     @cached_property  # needed only where rows are damaged
-    def numbered(self) -> list[tuple[int, str]]:
+    def numbered(self) -> list[tuple[int, bytes]]:
         """Numbers of lines from 1, and lines, without blank ones."""
         lines = enumerate(bytes(self.body).splitlines(), self.above + 1)
-        return [(number, line.decode("utf-8", "replace")) for number, line in lines if line.strip()]
+        return [(number, line) for number, line in lines if line.strip()]
+
+    def line(self, row: int) -> str:
+        """The text of a row."""
+        return self.numbered[row][1].decode("utf-8", "replace")
 
     def place(self, row: int) -> str:
         """Where a row is, for messages."""
@@ -61,17 +65,16 @@ class _Rows:
 
     def repaired(self) -> tuple[bytes, dict[int, str]]:
         """The body with empty rows for those of another number of fields, and what is wrong."""
-        width, lines = len(self.names), [line for _, line in self.numbered]
+        width, lines, sign = len(self.names), [line for _, line in self.numbered], self.delimiter
+        fields = [line.count(sign.encode()) + 1 for line in lines]
         if self.quoted:
-            fields = [len(_split(line, self.delimiter, strict=True)) for line in lines]
-        else:
-            fields = [line.count(self.delimiter) + 1 for line in lines]
+            fields = [len(_split(self.line(n), sign, strict=True)) for n in range(len(lines))]
         odd = {row: count for row, count in enumerate(fields) if count != width}
         for row in odd:
-            lines[row] = self.delimiter * (width - 1)
+            lines[row] = sign.encode() * (width - 1)
         problem = f"expected {width} fields, got"
         problems = {row: f"{problem} {count or 'damaged quotes'}" for row, count in odd.items()}
-        return "\n".join(lines).encode(), problems
+        return b"\n".join(lines).decode("utf-8", "replace").encode(), problems
 
 
 def read_text(path: Path, options: ReaderOptions) -> Table:
@@ -123,13 +126,12 @@ def _parsed(body: memoryview | bytes, rows: _Rows, number: pa.DataType | None) -
 def _refuse_headers(rows: _Rows, damaged: list[int]) -> None:
     """Refuse a second header among damaged rows; a message that has delimiters in it is none."""
     for row in damaged[:100]:
-        line = rows.numbered[row][1]
-        fields = _split(line, rows.delimiter)
+        fields = _split(rows.line(row), rows.delimiter)
         same = len(fields) == len(rows.names) or _filled(fields) == _filled([*rows.names])
         if same and not _is_row(fields):
             raise InputError(
                 f"{rows.where}: expected numbers, got a second header in {rows.place(row)}, "
-                f"{line[:80]!r}: two recordings in one file? Split it"
+                f"{rows.line(row)[:80]!r}: two recordings in one file? Split it"
             )
 
 
@@ -146,7 +148,7 @@ def _damage(rows: _Rows, odd: dict[int, str]) -> tuple[Finding, ...]:
         f"{rows.where}: expected rows of {len(rows.names)} columns, separated by "
         f"{_spelt(rows.delimiter)}, got {len(odd)} of {count} that are not: {shown}; correct or "
         "export the file anew, or, if other lines stand between the rows, "
-        f"{advice([line for _, line in rows.numbered[:200]])}"
+        f"{advice([rows.line(row) for row in range(min(count, 200))])}"
     )
 
 
