@@ -219,3 +219,12 @@ def test_a_finding_says_which_row_and_line_and_why(good, table):
         assert finding.detail == (
             f"1 of 60 cells of 'y' are no numbers and are NaN: 'error' in row 9 (line {line})"
         )
+
+
+@pytest.mark.parametrize("stray", ['"9","1.5","', '"9""1.5","3"', '"9,"1.5","3"'])
+def test_a_stray_quote_takes_no_other_row_with_it(stray, table):
+    rows = ['"1","2","3"'] * 9
+    log = table("\n".join(['"x","y","z"', *rows, stray, *rows, stray, *rows]))
+    assert np.flatnonzero(np.isnan(log.columns[0])).tolist() == [9, 19]
+    assert "row 19 (line 21)" in log.findings[0].detail
+    assert len(log.columns[0]) == 29
