@@ -189,7 +189,8 @@ def _rows(where: str, text: bytes, delimiter: str | None) -> _Rows:
     numbered = {number: line for number, line in decoded if line.strip()}
     lines = [*numbered.values()]
     delimiters = [delimiter] if delimiter else [*DELIMITERS]
-    starts = {sign: start for sign in delimiters if (start := _first_row(lines, sign))}
+    there = [sign for sign in delimiters if sign.encode() in head]
+    starts = {sign: start for sign in there if (start := _first_row(lines, sign))}
     if not starts:
         number, line = next(iter(numbered.items()), (0, ""))
         raise InputError(
