@@ -86,11 +86,11 @@ def _judged(log: Log, job: Inspection) -> Recording:
     if rate_hz is None:
         return job.recording(*log.findings, Finding("sample rate", REJECTED, _NO_RATE))
     with np.errstate(over="ignore"):  # becomes infinite, and is found as such
-        stored = np.asarray(log.samples, np.float32)
-    inspected = inspect(replace(log, samples=stored.astype(np.float64)), rate_hz, job.quality)
+        stored = np.array(log.samples.T, np.float32, order="C")
+    inspected = inspect(replace(log, samples=stored.T), rate_hz, job.quality)
     usable, length_s = inspected.stop - inspected.start, job.quality.length_s
     length = usable if length_s is None else round(length_s * rate_hz)
-    measured = {"rows": len(stored), "rate_hz": log.rate_hz}
+    measured = {"rows": len(log.samples), "rate_hz": log.rate_hz}
     if inspected.outcome == REJECTED:
         return job.recording(*inspected.findings, **measured)
     if usable < length:
@@ -101,7 +101,7 @@ def _judged(log: Log, job: Inspection) -> Recording:
     variables = {
         name: np.ascontiguousarray(values[kept].T, dtype=np.float32)
         for name, values in (
-            *(("angular_rate", stored), ("temperature_c", log.temperature_c)),
+            *(("angular_rate", stored.T), ("temperature_c", log.temperature_c)),
             ("acceleration_g", log.acceleration_g),
         )
         if values is not None

@@ -114,7 +114,7 @@ def check_levels(recording: Recording, least: float = 3) -> None:
 def frequent_values(
     recording: Recording, axis: int, least: float = 1.5, most: int = 3
 ) -> tuple[Array, NDArray[np.integer], Array]:
-    """Values, their counts, and how many times as often as their neighbours they come; 0: by chance.
+    """Values, their counts, and how many times as often as their neighbours they come; 0: chance.
 
     The neighbours' counts give the one between by a cubic through their logarithms, which is exact
     for normal noise on a fine grid and too large on a coarse one, or by a line where that is more.
