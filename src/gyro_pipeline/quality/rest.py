@@ -100,8 +100,9 @@ class RestDetector:
             student_limits(z, freedom) * np.sqrt(np.maximum(shown, white)),
             student_limits(z, worth * (self.size - 1)) * np.sqrt(largest),
         )
-        excess = np.cbrt(shown[:axes] / coloured) - 1 + 2 / (9 * freedom)
-        return chance, noise, worth, (excess > z * np.sqrt(2 / (9 * freedom))) & (freedom > 1)
+        scatter = 2 / (9 * freedom)  # of the cube root of what is shown
+        swaying = shown[:axes] > coloured * (1 - scatter + z * np.sqrt(scatter)) ** 3
+        return chance, noise, worth, swaying & (freedom > 1)
 
 
 @cache
