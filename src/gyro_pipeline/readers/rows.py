@@ -12,8 +12,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy import special
-from scipy.ndimage import uniform_filter1d
 
 from gyro_pipeline.conventions import AXES
 from gyro_pipeline.readers.file import File
@@ -165,6 +163,9 @@ def _change(rates: Floats, codes: Codes, least: float = 0.3, chance: float = 1e-
     starts = np.flatnonzero(np.diff(codes[finite], prepend=-1))
     if len(starts) < 3:  # noqa: PLR2004
         return ""
+    from scipy.ndimage import uniform_filter1d  # noqa: PLC0415 - SciPy starts slowly, and few
+    from scipy.special import stdtrit  # noqa: PLC0415 - files have such a column
+
     runs, lengths = codes[finite][starts[1:-1]], np.diff(starts, append=finite.sum())[:, None]
     level = _without_spikes(rates[finite])
     noise = _without_spikes(np.abs(level - uniform_filter1d(level, 51, axis=0)))
@@ -174,7 +175,7 @@ def _change(rates: Floats, codes: Codes, least: float = 0.3, chance: float = 1e-
         for code in np.flatnonzero(np.bincount(runs) > 2):  # noqa: PLR2004
             of_code = differences[runs == code]
             sizes, errors = np.abs(of_code.mean(axis=0)), of_code.std(axis=0) / len(of_code) ** 0.5
-            limits = -special.stdtrit(len(of_code) - 1, chance / 2) * errors
+            limits = -stdtrit(len(of_code) - 1, chance / 2) * errors
             excess = sizes - np.maximum(limits, least * noise.mean(axis=0))
             if excess.max() > 0:
                 size = f"{AXES[excess.argmax()]} changes by {sizes[excess.argmax()]:.3g} deg/s"

@@ -18,8 +18,6 @@ from gyro_pipeline.parameters import ReaderOptions
 from gyro_pipeline.readers import mat5
 from gyro_pipeline.readers.table import Reader, Table, column
 
-Arrays = Mapping[str, NDArray[Any]]
-
 
 def read_parquet(path: Path, _: ReaderOptions) -> Table:
     """Read columns; units are in the attributes of the fields."""
@@ -61,7 +59,11 @@ def read_zip(path: Path, _: ReaderOptions) -> Table:
 
 def read_mat(path: Path, _: ReaderOptions) -> Table:
     """Read arrays and structures of MATLAB 5 to 7."""
-    return _of_arrays(path, dict(mat5.arrays(path.read_bytes())))
+    import scipy.io  # noqa: PLC0415
+
+    mat5.check(path.read_bytes())
+    variables = scipy.io.loadmat(path, simplify_cells=True)
+    return _of_arrays(path, {k: v for k, v in variables.items() if not k.startswith("__")})
 
 
 def read_hdf5(path: Path, _: ReaderOptions) -> Table:
@@ -90,9 +92,12 @@ READERS: dict[bytes, Reader] = {
 """By the first bytes of a file."""
 
 
-def _of_arrays(path: Path, stored: Arrays) -> Table:
-    """Name columns: ``t`` of a vector, ``gyro.x`` of three columns, ``all.0`` of more."""
-    arrays = {name: array for key in stored for name, array in _fields(key, stored[key])}
+def _of_arrays(path: Path, stored: Mapping[str, Any]) -> Table:
+    """Name columns: ``t`` of a vector, ``gyro.x`` of three columns, ``all.0`` of more.
+
+    What is in fields of arrays or structures is named by them: ``log.gyro`` is ``gyro`` of ``log``.
+    """
+    arrays = dict(_arrays_in(stored, ""))
     columns: dict[str, NDArray[Any]] = {}
     for name, array in arrays.items():
         rows = np.squeeze(array)
@@ -114,12 +119,14 @@ def _of_arrays(path: Path, stored: Arrays) -> Table:
     return Table(str(path), tuple(columns), tuple(columns.values()))
 
 
-def _fields(name: str, array: NDArray[Any]) -> Iterator[tuple[str, NDArray[Any]]]:
-    """An array, or the arrays of its fields: ``log.gyro`` is ``gyro`` of ``log``."""
-    if array.dtype.names is None:
-        yield name, array
-    for label in array.dtype.names or ():
-        yield from _fields(_inside(name, label), array[label])
+def _arrays_in(stored: Any, name: str) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Arrays in arrays of fields and in mappings, by the names that lead to them."""
+    if isinstance(stored, np.ndarray) and stored.dtype.names is None:
+        yield name, stored
+    elif isinstance(stored, np.ndarray | Mapping):
+        labels = stored if isinstance(stored, Mapping) else stored.dtype.names
+        for label in labels:
+            yield from _arrays_in(stored[label], _inside(name, str(label)))
 
 
 def _inside(name: str, label: str) -> str:
