@@ -1,39 +1,65 @@
-"""Units as headers and options spell them, read by pint.
+"""Units as headers and options spell them, read by pint from a small registry of its own.
 
-To pint a radian is a number, so that 1/s would be an angular rate. Here an angle is a quantity of
-its own, a count of an AD converter is another, and g is the earth's acceleration, not a gram.
+In pint's registry a radian is a number, so that 1/s would be an angular rate. Here an angle is a
+quantity of its own, a count of an AD converter is another, and g is the earth's acceleration.
 """
 
 import re
 from functools import lru_cache
-from importlib.resources import files
 from typing import Any, NamedTuple
 
 _DEFINITIONS = """
-degree = [angle] = ° = deg = degs
-radian = 57.29577951308232 * degree = rad = rads
-turn = 360 * degree = _ = revolution = rev = revs
-@alias second = secs
+nano- = 1e-9 = n-
+micro- = 1e-6 = u- = µ- = μ-
+milli- = 1e-3 = m-
+centi- = 1e-2 = c-
+hecto- = 1e2 = h-
+kilo- = 1e3 = k-
+mega- = 1e6 = M-
+second = [time] = s = sec = secs
+minute = 60 * second = min
+hour = 60 * minute = h = hr
+day = 24 * hour
 millis = 0.001 * second
 micros = 0.000001 * second
-count = [count] = counts = lsb = digit = digits = raw
-earth_gravity = 9.80665 * meter / second ** 2 = g
+degree = [angle] = deg = degs
+radian = 57.29577951308232 * degree = rad = rads
+arcsecond = degree / 3600 = arcsec
+turn = 360 * degree = _ = revolution = rev = revs
 degree_per_second = degree / second = dps = degps = deg_s = deg_per_s = deg_sec = deg_per_sec
 radian_per_second = radian / second = radps = rad_s = rad_per_s = rad_sec = rad_per_sec
 degree_per_hour = degree / hour = dph = deg_h = deg_per_h
+turn_per_second = turn / second = rps
+turn_per_minute = turn / minute = rpm
+count = [count] = counts = lsb = LSB = digit = digits = raw
+meter = [length] = m = metre
+foot = 0.3048 * meter = ft
+earth_gravity = 9.80665 * meter / second ** 2 = g
+kelvin = [temperature] = K
+celsius = kelvin; offset: 273.15 = C = degC = degc
+fahrenheit = 5 / 9 * kelvin; offset: 459.67 * 5 / 9 = F = degF = degf
+hertz = 1 / second = Hz
+newton = [force] = N
+pascal = newton / meter ** 2 = Pa
+bar = 100000 * pascal
+volt = [voltage] = V
+ampere = [current] = A
+tesla = [magnetic_field] = T
+gauss = 0.0001 * tesla
+percent = [share]
 """
 _REFERENCES = {
     "rate": "degree_per_second",
     "angle": "degree",
     "time": "second",
     "acceleration": "earth_gravity",
-    "temperature": "degC",
+    "temperature": "celsius",
     "count": "count",
 }
 """What is told apart, and the unit in which each is used here."""
 
-_SPELLINGS = {"º": "°", "˚": "°", "℃": "°C", "℉": "°F", "°c": "°C", "°f": "°F", "·": "*", "⋅": "*"}
-_SPELLINGS |= {"⁻¹": "^-1", "⁻²": "^-2", "²": "^2", "°": "deg"}
+_SPELLINGS = {"º": "°", "˚": "°", "℃": "°C", "℉": "°F", "°": "deg", "%": "percent"}
+_SPELLINGS |= {"·": "*", "⋅": "*", "⁻¹": "^-1", "⁻²": "^-2", "²": "^2"}
 _TERM = r"[^\W\d_][^\W\d]*(?:\^?-?[1-3])?"
 # words, products and quotients, but neither numbers nor roots; pint would evaluate 9**9**9
 _EXPRESSION = re.compile(rf"(?=.{{1,40}}$)\(?{_TERM}(?:[/* ()]{{1,3}}{_TERM})*\)?")
@@ -57,12 +83,10 @@ class Unit(NamedTuple):
 @lru_cache(1)
 def _registry() -> tuple[Any, dict[Any, str]]:
     """The registry, and what quantity each dimensionality is of."""
-    import pint  # noqa: PLC0415  # a quarter of a second, which few commands need
+    import pint  # noqa: PLC0415  # it starts slowly, and few commands need it
 
-    units: Any = pint.UnitRegistry(None, on_redefinition="ignore")
-    units.load_definitions(str(files("pint") / "default_en.txt"))
-    for definition in _DEFINITIONS.strip().splitlines():
-        units.define(definition)
+    units: Any = pint.UnitRegistry(None)
+    units.load_definitions(_DEFINITIONS.strip().splitlines())
     references = {units.Quantity(1, unit): quantity for quantity, unit in _REFERENCES.items()}
     return units, {unit.dimensionality: quantity for unit, quantity in references.items()}
 
@@ -75,17 +99,12 @@ def read_unit(text: str) -> Unit | None:
         What it measures; ``other`` for known units of anything else; None where it is no unit.
     """
     text = text.strip()
-    if re.match("(?i)grad", text):  # to pint a gon or 10^9 radians; in German a degree
-        return None
     for spelling, of_pint in _SPELLINGS.items():
         text = text.replace(spelling, of_pint)
     text = re.sub(r"\.(?=\s|$)", "", text)  # Deg. per s
     text = re.sub(r"(?<=[^\W\d])\.(?=[^\W\d])", "*", text)
     text = re.sub(r"(?<=[^\W\d])(?=-?[123]\b)", "^", text)  # rad s-1, m/s2
-    written, small = _parsed(text), _parsed(text.lower())
-    # DPS, Deg/Sec, MS, G; as written where that says something else
-    usual = small is not None and small.quantity in ("rate", "time", "acceleration")
-    return small if written is None or (written.quantity == "other" and usual) else written
+    return _parsed(text) or _parsed(text.lower())  # DPS, Deg/Sec, G
 
 
 def _parsed(expression: str) -> Unit | None:

@@ -1,5 +1,6 @@
 import os
 import pickle
+import shutil
 import tracemalloc
 from dataclasses import replace
 
@@ -206,6 +207,20 @@ def test_a_damaged_unfinished_file_is_begun_anew(tmp_path, size):
     reading(tmp_path).save(listing(one))
     reading(tmp_path).save(one)
     assert reading(tmp_path).load() == [described(one)]
+
+
+def test_a_process_that_is_killed_loses_the_last_second_at_most(tmp_path, monkeypatch):
+    now, growing = [5.0], reading(tmp_path)
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    ones = [recording(1, number) for number in range(1, 5)]
+    growing.save(listing(*ones))
+    for one, seconds, there in zip(ones, (0, 0.5, 0.6, 0.1), (1, 1, 3, 3), strict=True):
+        now[0] += seconds
+        growing.save(one)
+        (tmp_path / "killed").mkdir(exist_ok=True)
+        shutil.copy(tmp_path / "dot.unfinished.nc", tmp_path / "killed")
+        assert reading(tmp_path / "killed").load() == [described(one) for one in ones[:there]]
+    assert growing.load() == [described(one) for one in ones]
 
 
 def test_a_new_listing_keeps_what_has_the_same_place_and_key(tmp_path):

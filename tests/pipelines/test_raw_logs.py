@@ -276,6 +276,7 @@ def test_an_interrupted_read_goes_on(quality, tmp_path, monkeypatch, inspected, 
     items = inspect_logs(listed(logs), [], quality, PAIR)
     for _ in range(3):  # what is listed, and two recordings
         reading.save(next(items))
+    reading.release()
     with caplog.at_level(logging.INFO, "gyro_pipeline"):
         recordings, _ = inspected(listed(logs))
     assert read == ["1_1.csv", "1_2.csv", "2_1.csv", "2_2.csv"]

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from gyro_pipeline.logs import REJECTED, REPAIRED
-from gyro_pipeline.readers.clock import check_rate, from_counter, from_stamps
+from gyro_pipeline.readers.clock import from_counter, from_stamps
 
 N = 6000
 EVEN = np.arange(N) / 120
@@ -61,11 +61,8 @@ def test_clocks_that_lose_nothing_have_their_rate_and_no_gap_and_are_kept(kind, 
         assert {finding.outcome for finding in timing.findings} <= {"kept"}
 
 
-@pytest.mark.parametrize(
-    ("rate", "tick"),
-    [(100, 1 / 64), (50, 1 / 64), (63.9, 1 / 64), (48, 0.01), (249.7, 0.004), (240, 0.004)],
-)
-def test_longer_steps_at_regular_intervals_are_the_ticks_of_a_clock(rate, tick):
+@pytest.mark.parametrize(("rate", "tick"), [(100, 1 / 64), (50, 1 / 64), (48, 0.01)])
+def test_a_clock_that_ticks_at_another_rate_than_the_samples_makes_no_gaps(rate, tick):
     timing = from_stamps(np.floor(np.arange(2 * N) / rate / tick) * tick, 1.0)
     assert not len(timing.gap_rows)
     assert timing.rate_hz == pytest.approx(rate, rel=1e-3)
@@ -207,21 +204,6 @@ def test_a_packet_counter_may_wrap_but_not_repeat_go_back_or_skip(bits):
     for stray in (np.nan, 60_000):
         counts[300] = stray
         assert not len(from_counter(counts, bits).gap_rows)
-
-
-@pytest.mark.parametrize(
-    ("rate", "advice"),
-    [
-        (60, "got 60 Hz; check the file's time"),
-        (0.12, "it is off by 10^-3: check time_units"),
-        (120e6, "it is off by 10^6: check time_units"),
-    ],
-)
-def test_a_rate_beyond_the_tolerance_is_rejected_with_advice(rate, advice):
-    (finding,) = check_rate(rate, 120, 2.0)
-    assert finding.outcome == REJECTED
-    assert advice in finding.detail
-    assert check_rate(121.9, 120, 2.0) == ()
 
 
 STAMPS = st.one_of(

@@ -123,7 +123,7 @@ def test_rows_without_rates_at_a_regular_share_are_no_samples(blank, details, re
     log = read_beside("k", ROWS, np.where(blank[:, None], np.nan, WHITE))
     np.testing.assert_array_equal(log.samples, WHITE[~blank])
     np.testing.assert_array_equal(log.rows, np.flatnonzero(~blank))
-    assert f"{blank.sum()} of {N} rows are blank, at a regular" in details(log, "blank rows")[0]
+    assert f"{blank.sum()} of {N} rows are blank, at a regular" in details(log, "rows")[0]
 
 
 def test_of_increments_the_step_between_rows_that_are_left_is_said(details, read):
@@ -147,4 +147,4 @@ def test_repeated_rows_are_left_out_where_the_options_say_so(details, read_besid
     assert len(read_beside("k", ROWS, rates).samples) == N
     log = read_beside("k", ROWS, rates, repeats="drop")
     np.testing.assert_array_equal(log.samples, WHITE[: N // 10])
-    assert "5400 of 6000 rows repeat the one before" in details(log, "repeated rows")[0]
+    assert "5400 of 6000 rows repeat the one before" in details(log, "rows")[0]

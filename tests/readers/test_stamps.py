@@ -61,7 +61,12 @@ def test_what_is_not_known_of_the_time_is_one_short_finding(header, column, word
     ("header", "column", "options", "words"),
     [
         ("t (ms)", S, {"time_units": "s"}, "0.001 s, which makes 100000 Hz, but.* 1 s.* 100 Hz"),
-        ("t", S, {"time_units": "s", "preamble": "tscale,0.001"}, "1 s; give time_units: 0.001"),
+        (
+            "t",
+            S,
+            {"time_units": "s", "preamble": "tscale,0.001"},
+            "line above.* 0.001 s.*read in 1 s, which",
+        ),
         ("k", S, {"time_column": "k"}, "'k' has no unit"),
         ("k", S * 0, {"time_column": "k", "time_units": "s"}, "'k' holds"),
         ("k", STEPS, {"time_column": "k", "time_units": "ms"}, "give time_is: steps"),
@@ -88,6 +93,20 @@ def test_a_rate_above_the_header_is_compared_with_the_measured_one(preamble, out
     assert tuple(f.outcome for f in log.findings if f.check == "stated rate") == outcome
     trusted = read(f"time (s),{RATES}", S, X, preamble=preamble, trust="options")
     assert {finding.outcome for finding in trusted.findings} <= {"kept"}
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "advice"),
+    [
+        (200, "expected 200 Hz within 2 %, got 100 Hz; check the file's time"),
+        (1e5, "it is off by 10^-3: check time_units"),
+        (1e-4, "it is off by 10^6: check time_units"),
+    ],
+)
+def test_a_rate_beyond_the_tolerance_is_rejected_with_advice(rate_hz, advice, read):
+    (finding,) = read(f"time (s),{RATES}", S, X, rate_hz=rate_hz).findings
+    assert finding.outcome == "rejected" and advice in finding.detail
+    assert not read(f"time (s),{RATES}", S, X, rate_hz=101.9).findings
 
 
 @pytest.mark.parametrize(

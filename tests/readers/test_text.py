@@ -185,10 +185,10 @@ def test_texts_are_columns_and_what_is_no_number_says_where(table):
 
 def test_names_that_are_not_utf_8_come_with_the_option(table):
     text = "时间,角速度x,角速度y,角速度z\n" + "1,2,3,4\n" * 9
-    assert "not UTF-8: if names look odd, give `encoding`" in table(text.encode("gbk")).listed()
+    assert "not UTF-8: if names look odd, give `encoding`" in table(text.encode("gbk")).where
     assert table(text.encode("utf-16-le"), encoding="utf-16-le").names[1] == "角速度x"
-    assert "encoding" not in table(text).listed()
-    with pytest.raises(InputError, match="as the rows, 4, got 5.*not UTF-8.*give `encoding`"):
+    assert "encoding" not in table(text).where
+    with pytest.raises(InputError, match="not UTF-8.*give `encoding`.*as the rows, 4, got 5"):
         table(f"号,{text}".encode("gbk"))
     with pytest.raises(InputError, match="`encoding` in `reader:`.*unknown encoding: gkb"):
         table(text, encoding="gkb")
@@ -219,3 +219,12 @@ def test_a_finding_says_which_row_and_line_and_why(good, table):
         assert finding.detail == (
             f"1 of 60 cells of 'y' are no numbers and are NaN: 'error' in row 9 (line {line})"
         )
+
+
+@pytest.mark.parametrize("stray", ['"9","1.5","', '"9""1.5","3"', '"9,"1.5","3"'])
+def test_a_stray_quote_takes_no_other_row_with_it(stray, table):
+    rows = ['"1","2","3"'] * 9
+    log = table("\n".join(['"x","y","z"', *rows, stray, *rows, stray, *rows]))
+    assert np.flatnonzero(np.isnan(log.columns[0])).tolist() == [9, 19]
+    assert "row 19 (line 21)" in log.findings[0].detail
+    assert len(log.columns[0]) == 29

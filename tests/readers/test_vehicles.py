@@ -8,7 +8,6 @@ import pytest
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.parameters import ReaderOptions
-from gyro_pipeline.readers import vehicles
 from gyro_pipeline.readers.table import read_table
 
 N = 50
@@ -176,7 +175,7 @@ def test_damaged_logs_end_in_a_refusal_or_a_table(tmp_path, kind, seed, capfd):
         data[at] = draws.integers(256)
     path.write_bytes(data)
     try:
-        vehicles.read(path, ReaderOptions())
+        read_table(path, ReaderOptions())
     except InputError as error:
         assert str(path) in str(error)
     assert capfd.readouterr() == ("", "")

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from itertools import permutations
+from itertools import permutations, product
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +52,16 @@ class ArrayLogs(LogSource):
         metadata: dict[str, Any] | None = None,
     ) -> None:
         super().__init__(sensor, sensors, source, path, metadata)
-        _check_entry(sensor, files, axes_order)
+        if set(files) not in ({"train", "test"}, {_WHOLE}) or len(set(files.values())) < len(files):
+            raise InputError(
+                f"{sensor}: files: expected a train and a test file, which are not the same one, "
+                f"or all, one file to be split, got {dict(files)}"
+            )
+        if axes_order is not None and sorted(axes_order) != sorted(LAYOUT):
+            raise InputError(
+                f"{sensor}: axes_order: expected {', '.join(LAYOUT)} in the order of the file's "
+                f"axes, got {list(axes_order)}"
+            )
         self._files = {split: files[split] for split in ("train", "test", _WHOLE) if split in files}
         self._axes_order = None if axes_order is None else tuple(axes_order)
 
@@ -67,11 +76,25 @@ class ArrayLogs(LogSource):
         """
         shapes = {name: self._open(name).shape for name in self._files.values()}
         order = self._order(shapes)
-        counts = [dict(zip(order, shape, strict=True)) for shape in shapes.values()]
         entries, first = list[LogEntry](), 1
-        for (split, name), count in zip(self._files.items(), counts, strict=True):
-            entries += self._entries(split, name, order, count, first)
-            first += count["recording"]
+        for split, name in self._files.items():
+            count = dict(zip(order, shapes[name], strict=True))
+            imus, recordings = count["gyroscope"] // len(AXES), count["recording"]
+            state = (self._path / name).stat()
+            file = [str(self._path / name), state.st_size, state.st_mtime_ns, order]
+            entries += [
+                LogEntry(
+                    imu + 1,
+                    first + recording,
+                    f"{name} recording {recording + 1}",
+                    partial(_read, self._path / name, order, imu, recording),
+                    size=state.st_size // (imus * recordings),
+                    key=fingerprint([*file, imu, recording]),
+                    split=None if split == _WHOLE else split,
+                )
+                for imu, recording in product(range(imus), range(recordings))
+            ]
+            first += recordings
         entries.sort(key=lambda entry: (entry.imu, entry.recording))
         return Logs(self._sensor, self._source, False, self.entry.rate_hz, entries)
 
@@ -106,12 +129,9 @@ class ArrayLogs(LogSource):
 
     def _order(self, shapes: Mapping[str, Shape]) -> Order:
         """Tell which axis is which, by the shapes where they allow only one answer."""
-        plausible = [
-            order
-            for order in permutations(LAYOUT)
-            if all(_is_plausible(order, shape) for shape in shapes.values())
-        ]
-        given = self._axes_order
+        given, plausible = self._axes_order, list(permutations(LAYOUT))
+        for shape in shapes.values():
+            plausible = [order for order in plausible if _is_plausible(order, shape)]
         if len(plausible) == 1 and given in (None, plausible[0]):
             return plausible[0]
         if given and len(plausible) != 1 and all(_in_threes(given, s) for s in shapes.values()):
@@ -123,40 +143,6 @@ class ArrayLogs(LogSource):
             f"[{', '.join(LAYOUT)}] in the order of the file's axes, got {list(given or [])}. By "
             "their lengths, gyroscopes in threes and far more samples than recordings or "
             f"gyroscopes, they can be {' or '.join(listed) or 'none'}"
-        )
-
-    def _entries(
-        self, split: str, name: str, order: Order, count: Mapping[str, int], first: int
-    ) -> list[LogEntry]:
-        """The recordings of one file, IMU by IMU, numbered from ``first`` on."""
-        path, imus = self._path / name, count["gyroscope"] // len(AXES)
-        state = path.stat()
-        file = [str(path), state.st_size, state.st_mtime_ns, order]
-        return [
-            LogEntry(
-                imu + 1,
-                first + recording,
-                f"{name} recording {recording + 1}",
-                partial(_read, path, order, imu, recording),
-                size=state.st_size // (imus * count["recording"]),
-                key=fingerprint([*file, imu, recording]),
-                split=None if split == _WHOLE else split,
-            )
-            for imu in range(imus)
-            for recording in range(count["recording"])
-        ]
-
-
-def _check_entry(sensor: str, files: Mapping[str, str], axes_order: Sequence[str] | None) -> None:
-    if set(files) not in ({"train", "test"}, {_WHOLE}) or len(set(files.values())) < len(files):
-        raise InputError(
-            f"{sensor}: files: expected a train and a test file, which are not the same one, or "
-            f"all, one file to be split, got {dict(files)}"
-        )
-    if axes_order is not None and sorted(axes_order) != sorted(LAYOUT):
-        raise InputError(
-            f"{sensor}: axes_order: expected {', '.join(LAYOUT)} in the order of the file's "
-            f"axes, got {list(axes_order)}"
         )
 
 

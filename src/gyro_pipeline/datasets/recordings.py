@@ -2,9 +2,10 @@
 
 import json
 import os
+import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -103,7 +104,7 @@ class InspectedRecordings(AbstractDataset[Listing | Recording, list[Recording]])
     def __init__(self, filepath: str, metadata: dict[str, Any] | None = None) -> None:
         self._final = Path(filepath)
         self._path = path_in_progress(self._final)
-        self._file: h5py.File | None = None  # stays open, as opening takes longer than writing
+        self._writer: _Writer | None = None
         self.metadata = metadata
 
     def load(self) -> list[Recording]:
@@ -113,16 +114,17 @@ class InspectedRecordings(AbstractDataset[Listing | Recording, list[Recording]])
 
     def save(self, data: Listing | Recording) -> None:
         """Begin a file for the recordings of a listing, or add one of them."""
-        if isinstance(data, Listing):
-            self._release()
-            with replacing(self._path) as temporary:
-                _begin(temporary, data.keys)
-                with h5py.File(temporary, "r+") as file:
-                    for recording in _stored(self._source(), data.keys):
-                        _append(file, recording)
-        else:
-            self._file = self._file or h5py.File(self._path, "r+")
-            _append(self._file, data)
+        if isinstance(data, Recording):
+            self._writer = self._writer or _Writer(self._path)
+            self._writer.add(data)
+            return
+        self._release()
+        with replacing(self._path) as temporary:
+            _begin(temporary, data.keys)
+            writer = _Writer(temporary)
+            for recording in _stored(self._source(), data.keys):
+                writer.add(recording)
+            writer.close()
 
     def _source(self) -> Path:
         return self._path if self._path.is_file() else self._final
@@ -131,12 +133,58 @@ class InspectedRecordings(AbstractDataset[Listing | Recording, list[Recording]])
         return self._source().is_file()
 
     def _release(self) -> None:
-        if self._file is not None:
-            self._file.close()
-            self._file = None
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
 
     def _describe(self) -> dict[str, Any]:
         return {"filepath": str(self._path)}
+
+
+class _Writer:
+    """Adds recordings to a file that :func:`_begin` wrote.
+
+    The file stays open, as opening it takes longer than writing. A process that is killed loses at
+    most the recordings of the last ``every_s`` seconds: their descriptions, which mark them as
+    complete, are written together after their samples.
+    """
+
+    def __init__(self, path: Path, every_s: float = 1.0) -> None:
+        self._file = h5py.File(path, "r+")
+        self._index = [{int(n): i for i, n in enumerate(self._file[name])} for name in _PLACE]
+        self._arrays = dict[str, h5py.Dataset]()
+        self._texts = dict[tuple[int, ...], str]()
+        self._every_s, self._due = every_s, time.monotonic()
+
+    def add(self, recording: Recording) -> None:
+        """Write the samples, and the description with those of the next ``every_s`` seconds."""
+        index = tuple(of[n] for of, n in zip(self._index, recording.place, strict=True))
+        for name, values in recording.variables.items():
+            if name not in self._arrays or self._arrays[name].shape[-1] < values.shape[-1]:
+                _make_room(self._file, name, values)
+                self._arrays[name] = self._file[name]
+            stored = self._arrays[name].id  # an assignment takes three times as long
+            part = stored.get_space()
+            part.select_hyperslab((*index, *[0] * values.ndim), (1, 1, *values.shape))
+            stored.write(h5py.h5s.create_simple(values.shape), part, values)
+        findings = [vars(finding) for finding in recording.findings]
+        changed = {"findings": findings, "variables": list(recording.variables)}
+        self._texts[index] = json.dumps(vars(recording) | changed)
+        if time.monotonic() >= self._due:
+            self._flush()
+
+    def close(self) -> None:
+        """Write what is left to write."""
+        self._flush()
+        self._file.close()
+
+    def _flush(self) -> None:
+        if self._texts:
+            chosen = np.zeros(self._file[_INSPECTION].shape, bool)
+            chosen[tuple(np.transpose(list(self._texts)))] = True
+            self._file[_INSPECTION][chosen] = [self._texts[key] for key in sorted(self._texts)]
+        self._file.flush()
+        self._texts, self._due = {}, time.monotonic() + self._every_s
 
 
 def path_in_progress(final: Path) -> Path:
@@ -188,23 +236,6 @@ def _begin(path: Path, places: Collection[tuple[int, int]]) -> None:
         file.create_variable(_INSPECTION, _PLACE, _TEXT)
 
 
-def _append(file: h5py.File, recording: Recording) -> None:
-    """Write one recording to its place; last of all its description, which marks it as complete."""
-    index = tuple(
-        int(np.searchsorted(file[name][:], label))
-        for name, label in zip(_PLACE, recording.place, strict=True)
-    )
-    for name, values in recording.variables.items():
-        stored = file.get(name)
-        if stored is None or stored.shape[-1] < values.shape[-1]:
-            _make_room(file, name, values)
-            stored = file[name]
-        stored[(*index, ..., slice(values.shape[-1]))] = values
-    described = asdict(replace(recording, variables={})) | {"variables": list(recording.variables)}
-    file[_INSPECTION][index] = json.dumps(described)
-    file.flush()  # a process that is killed later loses nothing of it
-
-
 def _make_room(file: h5py.File, name: str, values: np.ndarray) -> None:
     """Add a variable that is not there, or samples to all of them."""
     with h5netcdf.File(file, "r+") as netcdf:
@@ -225,42 +256,30 @@ def _stored(path: Path, wanted: Mapping[tuple[int, int], str] | None = None) -> 
     """
     damage = OSError, KeyError, ValueError
     with suppress(*damage), h5py.File(path) as file:
-        for index in np.ndindex(file[_INSPECTION].shape):
-            recording = None
-            with suppress(*damage):  # each by itself, or one would hide the others
-                recording = _read(file, index, wanted)
-            if recording is not None:
+        for index, text in np.ndenumerate(file[_INSPECTION][()]):
+            if not text:
+                continue
+            described = json.loads(text)
+            names = described.pop("variables")
+            described["findings"] = tuple(Finding(**kind) for kind in described["findings"])
+            recording = Recording(**described)
+            if wanted is None:
                 yield recording
-
-
-def _read(
-    file: h5py.File, index: tuple[int, ...], wanted: Mapping[tuple[int, int], str] | None
-) -> Recording | None:
-    """A recording as :func:`_stored` yields it; None where there is none."""
-    text = file[_INSPECTION][index]
-    if not text:
-        return None
-    described = json.loads(text)
-    names = described.pop("variables")
-    findings = tuple(Finding(**finding) for finding in described.pop("findings"))
-    recording = Recording(**described, findings=findings)
-    if wanted is None:
-        return recording
-    if not recording.key or recording.key != wanted.get(recording.place):
-        return None
-    stretch = (*index, ..., slice(recording.stop - recording.start))
-    kept = {name: file[name][stretch] for name in names}
-    intact = not kept or data_hash(kept["angular_rate"], None) == recording.content
-    return replace(recording, variables=kept) if intact else None
+            elif recording.key and recording.key == wanted.get(recording.place):
+                stretch = (*index, ..., slice(recording.stop - recording.start))
+                with suppress(*damage):  # each by itself, or one would hide the others
+                    kept = {name: file[name][stretch] for name in names}
+                    if not kept or data_hash(kept["angular_rate"], None) == recording.content:
+                        yield replace(recording, variables=kept)
 
 
 def _erase(path: Path, samples: xr.DataArray) -> None:
     """Take back what was kept of recordings that are not to be used after all."""
     with h5py.File(path, "r+") as file:
-        described = file[_INSPECTION]
+        texts = file[_INSPECTION][()]
         for index in map(tuple, np.argwhere(samples.transpose(*_PLACE).to_numpy() == 0)):
-            names = json.loads(described[index] or "{}").get("variables", [])
+            names = json.loads(texts[index] or "{}").get("variables", [])
             for name in names:
                 file[name][index] = np.nan
             if names:
-                described[index] = ""  # to be read again, should it be used some day
+                file[_INSPECTION][index] = ""  # to be read again, should it be used some day

@@ -42,9 +42,9 @@ class Inspection:
 
     def recording(self, *findings: Finding, **attributes: Any) -> Recording:
         """The recording as one that is rejected, unless its attributes say otherwise."""
-        entry, outcome = self.entry, attributes.pop("outcome", REJECTED)
-        place = entry.imu, entry.recording, entry.where
-        return Recording(*place, self.key, outcome, findings, **attributes)
+        place = {name: getattr(self.entry, name) for name in ("imu", "recording", "where")}
+        given = {"key": self.key, "outcome": REJECTED} | attributes
+        return Recording(**place, **given, findings=findings)
 
 
 def judge(job: Inspection, report: Callable[[float], None]) -> Recording:
@@ -61,9 +61,8 @@ def judge(job: Inspection, report: Callable[[float], None]) -> Recording:
     try:
         log = job.entry.read()
     except InputError as error:
-        recording = job.recording(Finding("file", REJECTED, str(error)))
-        if _of_the_system(error.__cause__):
-            recording = replace(recording, key="")
+        key = "" if _of_the_system(error.__cause__) else job.key
+        recording = job.recording(Finding("file", REJECTED, str(error)), key=key)
     else:
         recording = _judged(log, job)
     report(job.work)
@@ -86,11 +85,11 @@ def _judged(log: Log, job: Inspection) -> Recording:
     if rate_hz is None:
         return job.recording(*log.findings, Finding("sample rate", REJECTED, _NO_RATE))
     with np.errstate(over="ignore"):  # becomes infinite, and is found as such
-        stored = np.asarray(log.samples, np.float32)
-    inspected = inspect(replace(log, samples=stored.astype(np.float64)), rate_hz, job.quality)
+        stored = np.array(log.samples.T, np.float32, order="C")
+    inspected = inspect(replace(log, samples=stored.T), rate_hz, job.quality)
     usable, length_s = inspected.stop - inspected.start, job.quality.length_s
     length = usable if length_s is None else round(length_s * rate_hz)
-    measured = {"rows": len(stored), "rate_hz": log.rate_hz}
+    measured = {"rows": len(log.samples), "rate_hz": log.rate_hz}
     if inspected.outcome == REJECTED:
         return job.recording(*inspected.findings, **measured)
     if usable < length:
@@ -98,15 +97,12 @@ def _judged(log: Log, job: Inspection) -> Recording:
         short = Finding("too short", REJECTED, problem)
         return job.recording(*inspected.findings, short, **measured)
     kept, masked = slice(inspected.start, inspected.start + length), inspected.masked[:length]
-    variables = {
-        name: np.ascontiguousarray(values[kept].T, dtype=np.float32)
-        for name, values in (
-            *(("angular_rate", stored), ("temperature_c", log.temperature_c)),
-            ("acceleration_g", log.acceleration_g),
-        )
-        if values is not None
-    }
-    variables["angular_rate"][:, masked] = np.nan
+    stored[:, kept][:, masked] = np.nan
+    variables = {"angular_rate": np.ascontiguousarray(stored[:, kept])}
+    for name in ("temperature_c", "acceleration_g"):
+        values = getattr(log, name)
+        if values is not None:
+            variables[name] = np.ascontiguousarray(values[kept].T, np.float32)
     return job.recording(
         *inspected.findings,
         **measured,

@@ -7,21 +7,25 @@ import numpy as np
 from gyro_pipeline.conventions import AXES
 from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED
 from gyro_pipeline.parameters import LEAST_BLOCKS
-from gyro_pipeline.quality.recording import Recording, runs
+from gyro_pipeline.quality.recording import Recording, median, runs
 from gyro_pipeline.quality.rest import Array, Mask
 from gyro_pipeline.quality.values import zero_excess
 
 
 def cut_zero_rows(recording: Recording) -> None:
     """Rows of zeros at the ends, which loggers write before the first sample."""
-    zeros, all_so_far = ~np.any(recording.rates, axis=0), np.logical_and.accumulate
-    zeros = all_so_far(zeros) | all_so_far(zeros[::-1])[::-1]
+    rows = runs((recording.rates != 0).any(axis=0))
+    zeros = np.ones_like(recording.masked)
+    if rows.size:
+        zeros[rows[0, 0] : rows[-1, 1]] = False
     recording.mask("zero rows", zeros, "", KEPT)
 
 
 def mask_non_finite(recording: Recording, largest: float = 1e12) -> None:
     """No numbers, and garbage bytes read as a number whose square may overflow."""
-    _mask_samples(recording, "non-finite values", ~(np.abs(recording.rates) < largest))
+    rates = recording.rates
+    if not (rates.size and -largest < rates.min() <= rates.max() < largest):  # NaN fails as well
+        _mask_samples(recording, "non-finite values", ~(np.abs(rates) < largest))
 
 
 def mask_stuck(recording: Recording, least_s: float = 0.1) -> None:
@@ -34,7 +38,7 @@ def mask_stuck(recording: Recording, least_s: float = 0.1) -> None:
     rates, held = recording.rates, np.zeros(recording.rates.shape, bool)
     least = max(round(least_s * recording.rate_hz), 2)
     same = rates[:, 1:] == rates[:, :-1]
-    for axis in np.flatnonzero(np.count_nonzero(same, axis=1) + 1 >= least):
+    for axis in np.flatnonzero(same.sum(axis=1) + 1 >= least):
         lengths = np.diff(np.flatnonzero(np.concatenate([[True], ~same[axis], [True]])))
         others = lengths.sum() - lengths.max()
         p = (others - lengths.size + 2) / (others + 2)  # Laplace's: never 0 or 1
@@ -53,9 +57,9 @@ def mask_dropouts(recording: Recording) -> None:
     rows = np.count_nonzero(zeros.all(axis=0))
     if rows:
         others = zeros.shape[1] - rows + 1
-        shares = (np.count_nonzero(zeros, axis=1) - rows + 1) / others
+        shares = (zeros.sum(axis=1) - rows + 1) / others
         chance = rows * np.log(10 * zeros.shape[1] * np.prod(shares) / rows)
-        too_often = (zero_excess(recording, rates) > 0 for rates in recording.used)
+        too_often = (zero_excess(recording, axis) > 0 for axis in range(len(AXES)))
         if chance < np.log(recording.quality.false_alarm) and all(too_often):
             dropouts = ~recording.rates.any(axis=0) & ~recording.masked
             recording.mask("dropouts", dropouts, "zero on all axes, ")
@@ -70,24 +74,25 @@ def _mask_samples(recording: Recording, check: str, samples: Mask) -> None:
 
 def keep_longest_stretch(recording: Recording) -> None:
     """Keep the rows between two gaps of which most can be used."""
-    edges = np.unique([0, *recording.log.gap_rows, recording.masked.size]).astype(np.intp)
-    used = np.add.reduceat(~recording.masked, edges[:-1], dtype=np.intp)
-    start, stop = edges[used.argmax() :][:2] if used.size else (0, 0)
-    stretch = np.zeros_like(recording.masked)
-    stretch[start:stop] = True
-    recording.masked |= ~stretch
-    if used.size > 1:
-        detail = f"the longest stretch, of {edges[-1]} rows, is {recording.where(stretch)}"
+    edges = np.unique([0, *recording.log.gap_rows, recording.masked.size])
+    if edges.size > 2:  # noqa: PLR2004 - more than one stretch
+        used = np.add.reduceat(~recording.masked, edges[:-1], dtype=np.intp)
+        start, stop = edges[used.argmax() :][:2]
+        others = np.ones_like(recording.masked)
+        others[start:stop] = False
+        detail = f"the longest stretch, of {edges[-1]} rows, is {recording.where(~others)}"
         recording.add("gaps", REPAIRED, detail)
+        recording.leave_out(others)
     recording.trim()
 
 
 def require_length(recording: Recording) -> None:
     """Reject where too few rows, or too small a share of the stretch, can be used."""
-    used, q, rate_hz = int((~recording.masked).sum()), recording.quality, recording.rate_hz
+    q, rate_hz, rows = recording.quality, recording.rate_hz, recording.masked.size
+    used = rows - np.count_nonzero(recording.masked)
     least = max(q.least_s * rate_hz, LEAST_BLOCKS * recording.size)
-    enough = used >= max(least, q.least_share * recording.masked.size)
-    if not enough or recording.blocks.starts.size < LEAST_BLOCKS:
+    enough = used >= max(least, q.least_share * rows)
+    if not enough or np.count_nonzero(recording.occupied) < LEAST_BLOCKS:
         detail = (
             f"{used} of {len(recording.log.samples)} rows can be used, {used / rate_hz:.4g} s; "
             f"expected at least {least / rate_hz:.4g} s (quality.least_s) and {q.least_share:.0%} "
@@ -101,8 +106,11 @@ def mask_bursts(recording: Recording, few: int = 3) -> None:
 
     A shock of the first rows is a start. What lasts longer than a shock may is a motion.
     """
+    bursts = runs(beyond_noise(recording))
+    if not bursts.size:
+        return
     spikes, shocks, start, motion = np.zeros((4, recording.masked.size), bool)
-    for first, last in runs(beyond_noise(recording)):
+    for first, last in bursts:
         if last - first < few:
             spikes[first:last] = True
         else:
@@ -111,7 +119,7 @@ def mask_bursts(recording: Recording, few: int = 3) -> None:
     for first, last in runs(shocks):
         kind = motion if last - first >= longest else shocks if first else start
         shocks[first:last], kind[first:last] = False, True
-    level = np.median(recording.blocks.means, axis=1, keepdims=True)
+    level = median(recording.blocks.means)[:, None]
     kinds = {"motion": motion, "start": start, "shocks": shocks, "spikes": spikes}
     for check, chosen in kinds.items():
         rows = chosen & ~recording.masked
@@ -130,14 +138,16 @@ def beyond_noise(recording: Recording) -> Mask:
     White noise has any row with a probability of ``false_alarm``, however many there are.
     """
     rates, (starts, means, _, sigma, noise) = recording.filled, recording.blocks
-    lengths = np.diff(np.r_[0, starts[1:], rates.shape[1]])
+    edges = np.append(0, starts[1:])
+    lengths = np.diff(edges, append=rates.shape[1])
     apart = rates - local_levels(means).repeat(lengths, axis=1)
     normal = -NormalDist().inv_cdf(recording.quality.false_alarm / (2 * rates.size))
     limits = normal * np.sqrt(1 + np.pi / (18 * recording.size)) * sigma
     rows = (np.abs(apart) > limits[:, None]).any(axis=0)
-    others, edges = ~(rows | recording.masked), np.cumsum(lengths) - lengths
-    counts = np.maximum(np.add.reduceat(others, edges, dtype=np.intp), 1)
-    shifts = np.abs(np.add.reduceat(apart * others, edges, axis=1) / counts)
+    left_out = rows | recording.masked
+    apart[:, np.flatnonzero(left_out)] = 0
+    counts = np.maximum(lengths - np.add.reduceat(left_out, edges, dtype=np.intp), 1)
+    shifts = np.abs(np.add.reduceat(apart, edges, axis=1) / counts)
     blocks = shifts > recording.quality.least_change_dps + 6 * noise[:, None]
     return rows | blocks.any(axis=0).repeat(lengths)
 
@@ -145,8 +155,8 @@ def beyond_noise(recording: Recording) -> Mask:
 def local_levels(means: Array) -> Array:
     """Medians of nine block means, (axis, block), so that a movement does not hide itself."""
     # a slope goes on beyond the ends, whatever two of the first or of the last blocks hold
-    before = 2 * np.median(means[:, :5], axis=1, keepdims=True) - means[:, 8:4:-1]
-    after = 2 * np.median(means[:, -5:], axis=1, keepdims=True) - means[:, -6:-10:-1]
+    before = 2 * median(means[:, :5])[:, None] - means[:, 8:4:-1]
+    after = 2 * median(means[:, -5:])[:, None] - means[:, -6:-10:-1]
     padded = np.hstack([before, means, after])
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 9, axis=1)
-    return np.partition(windows, 4)[..., 4]
+    windows = [padded[:, first : first + means.shape[1]] for first in range(9)]
+    return np.partition(windows, 4, axis=0)[4]

@@ -9,7 +9,7 @@ import numpy as np
 
 from gyro_pipeline.conventions import AXES, MDPS
 from gyro_pipeline.logs import KEPT, REJECTED
-from gyro_pipeline.quality.recording import Recording
+from gyro_pipeline.quality.recording import Recording, median
 from gyro_pipeline.quality.rest import Array, Mask, RestDetector
 
 
@@ -22,7 +22,7 @@ def check_bias(recording: Recording, least_dps: float = 3e-3, longest: int = 8) 
     means, noise = recording.blocks.means, recording.blocks.noise
     late = means[:, -max(means.shape[1] // 4, 1) :]
     zero = np.clip(4 * noise / np.sqrt(late.shape[1]), least_dps, 4 * least_dps)
-    level = np.median(recording.filled[:, : recording.size], axis=1)  # a knock moves the mean
+    level = median(recording.filled[:, : recording.size])  # a knock moves the mean
     off = np.abs(level) > np.maximum(10 * zero, 5 * noise)
     if np.count_nonzero(off) > 1 and (np.abs(late.mean(axis=1)) < zero).all():
         axis = np.argmax(np.abs(level))
@@ -49,13 +49,13 @@ def fit_drift(recording: Recording, shortest: float = 0.5) -> Array:
     alone = np.abs(rates @ shapes.T) / noise[:, None]
     limit = -NormalDist().inv_cdf(recording.quality.false_alarm / (2 * alone.size))
     before = np.arange(1, times.size)
-    steps = np.cumsum(rates, axis=1)[:, :-1] ** 2 * (1 / before + 1 / before[::-1])
     for axis in np.flatnonzero(alone.max(axis=1) > limit):
         from scipy import optimize  # noqa: PLC0415 - it starts slowly, and most have no drift
 
         fits = [(sign, *optimize.nnls(shapes.T, sign * rates[axis])) for sign in (1, -1)]
         sign, weights, left = min(fits, key=lambda fit: fit[2])
-        if rates[axis] @ rates[axis] - left**2 > steps[axis].max():
+        steps = np.cumsum(rates[axis])[:-1] ** 2 * (1 / before + 1 / before[::-1])
+        if rates[axis] @ rates[axis] - left**2 > steps.max():
             drift[axis] = sign * weights @ shapes
     return drift
 
@@ -70,7 +70,7 @@ def check_rest(recording: Recording) -> None:
         detail += f"by at most {q.largest_drift_dps:g} (quality.largest_drift_dps)"
     elif changed.any():
         apart = blocks.means - drift
-        apart = np.abs(apart - np.median(apart, axis=1, keepdims=True))
+        apart = np.abs(apart - median(apart)[:, None])
         axis, rows = evidence(recording, apart / (q.least_change_dps + 6 * blocks.noise[:, None]))
         change = apart[axis].max()
         detail = f"the rate changes by up to {change:.2g} deg/s, axis {AXES[axis]}, {rows}"
@@ -90,7 +90,7 @@ def alarms(recording: Recording, left: Array) -> tuple[Mask, Mask]:
     q, axes = recording.quality, len(AXES)
     detector = RestDetector(recording.size, q.false_alarm, q.least_change_dps)
     # forwards and backwards: its first blocks have little before them to be compared with
-    series = (np.hstack([x.T, x.T[::-1]]) for x in (left, recording.blocks.variances))
+    series = (np.vstack([x, x[:, ::-1]]).T for x in (left, recording.blocks.variances))
     changed, noisier = (x[:, :axes] | x[::-1, axes:] for x in detector.update(*series))
     return np.any(changed, axis=1), np.any(noisier, axis=1)
 

@@ -45,19 +45,34 @@ class Recording:
         return self.rates.compress(~self.masked, axis=1) if self.masked.any() else self.rates
 
     @cached_property
+    def ordered(self) -> Array:
+        """(axis, unmasked row), deg/s, from the smallest to the largest, in the log's own type."""
+        return np.sort(self.used.astype(self.log.samples.dtype), axis=1)  # float32 is faster
+
+    @cached_property
     def changes(self) -> Array:
         """(axis, unmasked row), deg/s, from each to the next."""
         return np.diff(self.used, axis=1)
 
     @cached_property
+    def squares(self) -> Array:
+        """(axis,), (deg/s)^2, mean square of the changes."""
+        return np.einsum("as,as->a", self.changes, self.changes) / self.changes.shape[1]
+
+    @cached_property
+    def repeats(self) -> Array:
+        """(axis,), share of the rows that repeat the one before."""
+        return np.sum(self.changes == 0, axis=1) / self.changes.shape[1]
+
+    @cached_property
     def steps(self) -> Array:
         """(axis,), deg/s, in which values are written; 0 where they are well below the noise."""
-        sizes = np.abs(self.changes)
-        steps = np.zeros(len(sizes))
+        steps = np.zeros(len(self.repeats))
         # white noise repeats a tenth of its samples at a step of 0.36 sigma
-        for axis in np.flatnonzero(np.count_nonzero(sizes == 0, axis=1) > 0.1 * sizes.shape[1]):
+        for axis in np.flatnonzero(self.repeats > 0.1):  # noqa: PLR2004
+            sizes = np.abs(self.changes[axis])
             # a few values that lie off the grid, as interpolated ones do, are below the quantile
-            steps[axis] = np.quantile(sizes[axis][sizes[axis] > 0], 0.01, method="lower")
+            steps[axis] = np.quantile(sizes[sizes > 0], 0.01, method="lower")
         return steps
 
     @cached_property
@@ -69,43 +84,51 @@ class Recording:
         return np.array([np.interp(rows, used, axis) for axis in self.used])
 
     @cached_property
-    def blocks(self) -> Blocks:
-        """Averages of blocks of filled rows, but for those with more than a quarter masked."""
+    def occupied(self) -> NDArray[np.integer]:
+        """(block,), unmasked rows of each block; 0 where that is less than three quarters."""
         size, count = self.size, self.masked.size // self.size
-        samples = self.filled[:, : count * size].reshape(len(self.rates), count, size)
-        used = np.count_nonzero(~self.masked[: count * size].reshape(count, size), axis=1)
-        chosen = used >= 0.75 * size
+        used = size - self.masked[: count * size].reshape(count, size).sum(axis=1)
+        return np.where(used >= 0.75 * size, used, 0)
+
+    @cached_property
+    def blocks(self) -> Blocks:
+        """Averages of the occupied blocks of filled rows."""
+        size, chosen = self.size, np.flatnonzero(self.occupied)
+        samples = self.filled[:, : self.occupied.size * size].reshape(len(self.rates), -1, size)
         means = samples.mean(axis=-1)
         apart = samples - means[..., None]
-        variances = np.einsum("abs,abs->ab", apart, apart) / np.maximum(used - 1, 1)
+        squares = np.einsum("abs,abs->ab", apart, apart)
         # distances, as squares would let frequent spikes hide themselves
         distances = np.abs(apart, out=apart).mean(axis=-1)
-        means, variances, distances = (x[:, chosen] for x in (means, variances, distances))
+        means, squares, distances = (x[:, chosen] for x in (means, squares, distances))
         median_of_unit = np.sqrt(2 / np.pi * (1 - 1 / size)) * (1 - 1 / (7 * size))
-        sigma = np.median(distances, axis=1) / median_of_unit
-        noise = np.median(np.abs(np.diff(means, axis=1)), axis=1) / (0.6745 * np.sqrt(2))
+        sigma = median(distances) / median_of_unit
+        noise = median(np.abs(np.diff(means, axis=1))) / (0.6745 * np.sqrt(2))
         noise = np.maximum(noise, sigma / np.sqrt(size))
-        return Blocks(np.flatnonzero(chosen) * size, means, variances, sigma, noise)
-
-    def trim(self) -> None:
-        """Leave out what is masked at the ends."""
-        used = np.flatnonzero(~self.masked)
-        rows = slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0, 0)
-        self.start += rows.start
-        self.rates, self.masked = self.rates[:, rows], self.masked[rows]
-        self._forget()
+        return Blocks(chosen * size, means, squares / (self.occupied[chosen] - 1), sigma, noise)
 
     def mask(self, check: str, rows: Mask, detail: str, outcome: str = REPAIRED) -> None:
         """Mask rows, and say so, if there are any."""
         if rows.any():
-            self.masked = self.masked | rows
-            self._forget()
+            self.leave_out(rows)
             done = "cut" if check in {"zero rows", "start"} else "masked"
             self.add(check, outcome, f"{detail}{self.where(rows)}, {done}")
 
-    def _forget(self) -> None:
-        for name in ("used", "changes", "steps", "filled", "blocks"):
-            self.__dict__.pop(name, None)
+    def leave_out(self, rows: Mask) -> None:
+        """Mask rows; what was derived from the others is derived again."""
+        self.masked = self.masked | rows
+        for name, attribute in vars(Recording).items():
+            if isinstance(attribute, cached_property):
+                self.__dict__.pop(name, None)
+
+    def trim(self) -> None:
+        """Leave out what is masked at the ends."""
+        if self.masked[:1].any() or self.masked[-1:].any():
+            used = np.flatnonzero(~self.masked)
+            rows = slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0, 0)
+            self.start += rows.start
+            self.rates, self.masked = self.rates[:, rows], self.masked[rows]
+            self.leave_out(np.zeros_like(self.masked))
 
     def add(self, check: str, outcome: str, detail: str) -> None:
         """Add a finding."""
@@ -120,6 +143,12 @@ class Recording:
             times = f" ({first / self.rate_hz:.4g} to {last / self.rate_hz:.4g} s)"
             texts.append(text + times * int(last - first >= self.size))
         return ", ".join(texts) + f" and {len(spans) - most} more" * (len(spans) > most)
+
+
+def median(values: Array) -> Array:
+    """Median along the last axis; of few values, numpy.median takes several times as long."""
+    ordered, middle = np.sort(values, axis=-1), values.shape[-1] // 2
+    return (ordered[..., middle] + ordered[..., ~middle]) / 2
 
 
 def runs(chosen: Mask) -> NDArray[np.integer]:

@@ -41,7 +41,7 @@ class RestDetector:
         self.size, self.false_alarm, self.least_dps = size, false_alarm, least_dps
         self.growth = least_rise ** (2 / 3)  # of the cube root of the variance
         self.known = 0.0 if noise_dps is None else 1e9  # blocks that a known noise is worth
-        self.known_variance = np.square(0.0 if noise_dps is None else noise_dps)
+        self.known_variance = np.square(np.c_[0.0 if noise_dps is None else noise_dps])
         self.blocks, self._last, self._sums = 0, np.empty((0, 0)), np.empty((0, 0))
 
     def update(self, means: Array, variances: Array) -> tuple[Mask, Mask]:
@@ -50,54 +50,59 @@ class RestDetector:
         All are (block, axis): the means in deg/s, finite; the variances of the samples about the
         mean of their block; whether the mean changes; and whether the noise rises.
         """
-        axes, sums = means.shape[1], self._add(means, variances)
-        count = self.blocks - len(sums) + 1 + np.arange(len(sums))  # blocks up to each row
+        axes, sums = means.shape[1], self._add(means.T, variances.T)
+        count = self.blocks - sums.shape[1] + 1 + np.arange(sums.shape[1])  # blocks up to each
         chance, noise, worth, sways = self._limits(sums, count)
-        first = len(sums) - len(means)
-        moved, noisier = sways[first:], np.zeros(means.shape, bool)
+        first = count.size - len(means)
+        moved, noisier = sways[:, first:], np.zeros((axes, len(means)), bool)
         for lag in self.lags:
-            rows = np.arange(max(first, lag + (count[0] == 0)), len(sums))
-            before, start = rows - lag, np.maximum(rows - lag - self.reference, 0)
-            last = (sums[rows, : 2 * axes] - sums[before, : 2 * axes]) / lag
-            length = (before - start)[:, None]
-            change = last[:, :axes] - (sums[before, :axes] - sums[start, :axes]) / length
-            limit = self.least_dps + chance[before, :axes] * np.sqrt(1 / lag + 1 / length)
-            moved[rows - first] |= np.abs(change) > limit
-            limit = chance[before, axes:] * np.sqrt(1 / lag + 1 / worth[before])
-            noisier[rows - first] |= last[:, axes:] > self.growth * noise[before] + limit
-        self._sums = sums[-(self.reference + max(self.lags)) - 1 :]
-        return moved, noisier
+            edge = max(first, lag + (count[0] == 0))  # of the blocks that others come before
+            if edge >= count.size:
+                break
+            now, before = slice(edge, None), slice(edge - lag, -lag)
+            end = np.arange(edge - lag, count.size - lag)
+            start = np.maximum(end - self.reference, 0)
+            last = (sums[: 2 * axes, now] - sums[: 2 * axes, before]) / lag
+            change = last[:axes] - (sums[:axes, before] - sums[:axes, start]) / (end - start)
+            limit = self.least_dps + chance[:axes, before] * np.sqrt(1 / lag + 1 / (end - start))
+            moved[:, edge - first :] |= np.abs(change) > limit
+            limit = chance[axes:, before] * np.sqrt(1 / lag + 1 / worth[before])
+            noisier[:, edge - first :] |= last[axes:] > self.growth * noise[:, before] + limit
+        self._sums = sums[:, -(self.reference + max(self.lags)) - 1 :]
+        return moved.T, noisier.T
 
     def _add(self, means: Array, variances: Array) -> Array:
         """Sums up to each block of both series, of half their squared differences, of variances."""
-        series = np.hstack([means, np.cbrt(variances)])
-        steps = np.diff(series, axis=0, prepend=self._last if self.blocks else series[:1])
-        new = np.hstack([series, steps**2 / 2, variances])
-        sums = self._sums if self.blocks else np.zeros((1, new.shape[1]))
-        self.blocks, self._last = self.blocks + len(series), series[-1:]
-        return np.vstack([sums[:-1], np.add.accumulate(np.vstack([sums[-1:], new]))])
+        series = np.vstack([means, np.cbrt(variances)])
+        steps = np.diff(series, prepend=self._last if self.blocks else series[:, :1])
+        new = np.vstack([series, steps**2 / 2, variances])
+        sums = self._sums if self.blocks else np.zeros((len(new), 1))
+        self.blocks, self._last = self.blocks + series.shape[1], series[:, -1:]
+        added = np.add.accumulate(np.hstack([sums[:, -1:], new]), axis=1)
+        return np.hstack([sums[:, :-1], added])
 
     def _limits(self, sums: Array, count: NDArray[np.integer]) -> tuple[Array, Array, Array, Mask]:
-        """After each row: what chance allows one block of both series, noise, its worth, sways."""
-        axes, known = sums.shape[1] // 5, self.known
-        worth = np.maximum(count, 1)[:, None] + known
-        variance = (sums[:, 4 * axes :] + known * self.known_variance) / worth
+        """After each block: what chance allows one of both series, noise, its worth, sways."""
+        axes, known = len(sums) // 5, self.known
+        worth = np.maximum(count, 1) + known
+        variance = (sums[4 * axes :] + known * self.known_variance) / worth
         relative = 2 / (9 * (self.size - 1))  # variance of the cube root, and what its mean lacks
-        noise = sums[:, axes : 2 * axes] + known * np.cbrt(self.known_variance) * (1 - relative)
+        noise = sums[axes : 2 * axes] + known * np.cbrt(self.known_variance) * (1 - relative)
         noise /= worth
-        white = np.hstack([variance / self.size, noise**2 * relative])
+        white = np.vstack([variance / self.size, noise**2 * relative])
         coloured = variance / min(self.size, 8) + self.least_dps**2
-        largest = np.hstack([coloured, white[:, axes:] + ((self.growth - 1) * noise) ** 2])
-        shown = (sums[:, 2 * axes : 4 * axes] + known * white) / np.maximum(worth - 1, 1)
+        largest = np.vstack([coloured, white[axes:] + ((self.growth - 1) * noise) ** 2])
+        shown = (sums[2 * axes : 4 * axes] + known * white) / np.maximum(worth - 1, 1)
         freedom = np.maximum(worth - 1, 1e-3) * 2 / 3  # of differences between neighbours
         tests = 8 * axes * len(self.lags)  # two sides of the mean, noise, sways; two limits each
-        z = spent_limits(self.false_alarm / tests)[np.frexp(np.maximum(count, 1))[1] - 1][:, None]
+        z = spent_limits(self.false_alarm / tests)[np.frexp(np.maximum(count, 1))[1] - 1]
         chance = np.minimum(
             student_limits(z, freedom) * np.sqrt(np.maximum(shown, white)),
             student_limits(z, worth * (self.size - 1)) * np.sqrt(largest),
         )
-        excess = np.cbrt(shown[:, :axes] / coloured) - 1 + 2 / (9 * freedom)
-        return chance, noise, worth, (excess > z * np.sqrt(2 / (9 * freedom))) & (freedom > 1)
+        scatter = 2 / (9 * freedom)  # of the cube root of what is shown
+        swaying = shown[:axes] > coloured * (1 - scatter + z * np.sqrt(scatter)) ** 3
+        return chance, noise, worth, swaying & (freedom > 1)
 
 
 @cache

@@ -6,10 +6,11 @@ from statistics import NormalDist
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import AXES, MDPS
 from gyro_pipeline.logs import KEPT, REJECTED
-from gyro_pipeline.quality.recording import Recording
+from gyro_pipeline.quality.recording import Recording, median
 from gyro_pipeline.quality.rest import Array
 
 READER = "in `reader:` of the catalog entry in catalog.yml"
@@ -25,10 +26,10 @@ def check_equal_axes(recording: Recording) -> None:
 
 def check_repeats(recording: Recording, reported: float = 0.01, most: float = 0.2) -> None:
     """A share of rows that repeat the one before, beyond what chance makes of coarse axes."""
-    same = recording.changes == 0
-    shares = np.count_nonzero(same, axis=1) / same.shape[1]
+    shares = recording.repeats
     if shares.min() <= reported:
         return
+    same = recording.changes == 0
     # an axis repeats by chance as often as where the one that repeats least does not
     rarest = int(np.argmin(shares))
     others = np.delete(same, rarest, axis=0)[:, ~same[rarest]]
@@ -61,7 +62,7 @@ def check_steps(recording: Recording) -> None:
     """A quantisation step above the noise, on the coarsest axis."""
     steps, largest = recording.steps / MDPS, recording.quality.largest_step
     # rounding to a step adds step^2 / 12 to the variance (Sheppard)
-    variances = np.median(recording.blocks.variances, axis=1) / MDPS**2 - steps**2 / 12
+    variances = median(recording.blocks.variances) / MDPS**2 - steps**2 / 12
     noise = np.sqrt(np.maximum(variances, 0))
     axis = np.argmax(steps - largest * noise)
     if steps[axis] > noise[axis]:
@@ -76,21 +77,21 @@ def check_steps(recording: Recording) -> None:
 
 def check_dead_band(recording: Recording) -> None:
     """Zeros amid the noise that come too often: small values, or parts of a count, were cut."""
-    for name, rates in zip(AXES, recording.used, strict=True):
-        often = zero_excess(recording, rates)
+    for axis, rates in enumerate(recording.used):
+        often = zero_excess(recording, axis)
         if often and rates.min() < 0 < rates.max():
             band, step = np.abs(rates[rates != 0]).min(), np.diff(np.unique(rates))
             cut = f"± {band:.2g} deg/s" if band > 1.5 * np.median(step) else "counts cut to zero?"  # noqa: PLR2004
-            detail = f"axis {name}, {cut}: 0 comes {often:.2g} times as often as its neighbours; "
-            detail += "the mean is pulled to zero; log the raw rates"
+            detail = f"axis {AXES[axis]}, {cut}: 0 comes {often:.2g} times as often as its "
+            detail += "neighbours; the mean is pulled to zero; log the raw rates"
             recording.add("dead band", REJECTED, detail)
 
 
-def zero_excess(recording: Recording, rates: Array, least: int = 8) -> float:
+def zero_excess(recording: Recording, axis: int, least: int = 8) -> float:
     """How many times as often as its neighbours zero comes; 0: no more than by chance."""
-    if np.count_nonzero(rates == 0) < least:
+    if np.count_nonzero(recording.used[axis] == 0) < least:
         return 0.0
-    values, often = frequent_values(recording, rates)
+    values, _, often = frequent_values(recording, axis)
     return float(often[values == 0].sum())
 
 
@@ -99,59 +100,54 @@ def check_levels(recording: Recording, least: float = 3) -> None:
 
     Elsewhere it comes ``least`` times as often: where numbers are rounded twice, two share a value.
     """
-    for name, rates in zip(AXES, recording.used, strict=True):
-        values, often = frequent_values(recording, rates)
+    for axis, name in enumerate(AXES):
+        values, counts, often = frequent_values(recording, axis)
         often[1:-1][often[1:-1] < least] = 0
         if often.any():
             most = often.argmax()
             end = most in {0, values.size - 1}
             detail = f"axis {name} {'is cut off' if end else 'is held'} at {values[most]:.4g} deg/s"
-            detail += f", {np.count_nonzero(rates == values[most])} times; the mean is pulled there"
+            detail += f", {counts[most]} times; the mean is pulled there"
             recording.add("saturation" if end else "frequent value", REJECTED, detail)
 
 
 def frequent_values(
-    recording: Recording, rates: Array, least: float = 1.5, most: int = 3
-) -> tuple[Array, Array]:
-    """Values, and how many times as often as their neighbours they come; 0: no more than by chance.
+    recording: Recording, axis: int, least: float = 1.5, most: int = 3
+) -> tuple[Array, NDArray[np.integer], Array]:
+    """Values, their counts, and how many times as often as their neighbours they come; 0: chance.
 
     The neighbours' counts give the one between by a cubic through their logarithms, which is exact
     for normal noise on a fine grid and too large on a coarse one, or by a line where that is more.
     Chance is that of runs, as of independent samples. More than ``most`` such values are a pattern,
     as of numbers rounded twice, which moves no mean.
     """
-    ordered = np.sort(rates)
-    nowhere = np.zeros(0), np.zeros(0)
+    ordered, nothing = recording.ordered[axis], np.zeros(0)
     if not np.any(ordered[7:] == ordered[:-7]):  # fewer never are beyond chance
-        return nowhere
+        return nothing, nothing.astype(np.intp), nothing
     values, counts = np.unique(ordered, return_counts=True)
     if values.size < 3:  # noqa: PLR2004 - of two values alone, nothing is a tail
-        return nowhere
+        return values, counts, np.zeros(values.size)
     # beyond the ends a tail goes on to less than one count
     below, above = (np.clip(a**2 / b, 0.05, 0.5) for a, b in (counts[:2], counts[:-3:-1]))
     padded = np.array([below, below, *counts, above, above])
     second, first, _, third, fourth = sliding_window_view(padded, values.size)
     near, far = np.log(first) + np.log(third), np.log(second) + np.log(fourth)
     expected = np.exp(np.maximum(near / 2, (4 * near - far) / 6)) / counts
-    runs = counts - np.bincount(
-        np.searchsorted(values, rates[1:][np.diff(rates) == 0]), minlength=values.size
-    )
+    repeated = recording.used[axis, 1:][recording.changes[axis] == 0]
+    runs = counts - np.bincount(np.searchsorted(values, repeated), minlength=values.size)
     # twice the root of a count scatters by 1
     variance = (16 / first + 16 / third + 1 / second + 1 / fourth) / 36 * counts
     beyond = 2 * np.sqrt(runs) * (1 - np.sqrt(expected)) / np.sqrt(1 + expected * variance)
     limit = -NormalDist().inv_cdf(recording.quality.false_alarm / (len(AXES) * values.size))
-    often = np.where(beyond > limit, 1 / expected, 0)
-    often[often < least] = 0
-    return (values, often) if np.count_nonzero(often) <= most else nowhere
+    often = np.where((beyond > limit) & (1 / expected >= least), 1 / expected, 0)
+    return values, counts, often * (np.count_nonzero(often) <= most)
 
 
 def check_turns(recording: Recording, least: float = 0.5) -> None:
     """Rows of several levels, as of several devices: in turn, or in any order if far apart."""
-    changes = np.diff(recording.filled, axis=1)
-    squares = np.einsum("as,as->a", changes, changes) / changes.shape[1]
-    jumps = turns(changes, squares, least)
-    widths = np.maximum(0.4 * np.sqrt(squares), recording.steps)
-    jumps = np.maximum(jumps, list(map(jump_apart, changes, widths)))
+    jumps = turns(recording.filled, recording.squares, least)
+    widths = np.maximum(0.4 * np.sqrt(recording.squares), recording.steps)
+    jumps = np.maximum(jumps, list(map(jump_apart, recording.changes, widths)))
     if jumps.any():
         detail = f"axis {AXES[jumps.argmax()]} jumps by {jumps.max():.2g} deg/s from row to row; "
         detail += "several sensors in one file? Split it by device, or log a column that names the "
@@ -160,7 +156,7 @@ def check_turns(recording: Recording, least: float = 0.5) -> None:
 
 
 def turns(
-    changes: Array, squares: Array, least: float, periods: Sequence[int] = (60, 56, 54, 44, 52, 48)
+    rates: Array, squares: Array, least: float, periods: Sequence[int] = (60, 56, 54, 44, 52, 48)
 ) -> Array:
     """(axis,), how far rows jump that are a period, or a divisor of it, apart; 0: nowhere.
 
@@ -168,16 +164,17 @@ def turns(
     of their own, beyond ``least`` times the noise and beyond chance. Nearly all of one frequency is
     a vibration, unless 2 to 4 rows make its period.
     """
-    jumps = np.zeros(len(changes))
-    for longest in periods:
-        period = longest if changes.shape[1] > 10 * longest else 12
-        count = changes.shape[1] // period
-        means = changes[:, : count * period].reshape(len(changes), count, period).mean(axis=1)
-        within = np.maximum(squares - means.var(axis=1), 0.01 * squares) / (1 - 1 / count)
+    (axes, rows), jumps = rates.shape, np.zeros(len(rates))
+    for period in periods if rows > 10 * max(periods) else (12,):
+        count = rows // period
+        levels = np.ones(count) @ rates[:, : count * period].reshape(axes, count, period) / count
+        means = np.diff(levels)
         sizes = np.ptp(means, axis=1) / 2
+        within = np.maximum(squares - (means**2).mean(axis=1), 0.01 * squares) / (1 - 1 / count)
         beyond = sizes > max(least, 7 / np.sqrt(count)) * np.sqrt(within / 2)
         for axis in np.flatnonzero(beyond & (sizes > jumps)):
-            powers = np.abs(np.fft.rfft(means[axis])) ** 2
+            around = np.diff(levels[axis], append=levels[axis, 0])
+            powers = np.abs(np.fft.rfft(around)) ** 2
             main = powers.argmax()
             if main in {period / 2, period / 3, period / 4} or powers[main] < 0.9 * powers.sum():  # noqa: PLR2004
                 jumps[axis] = sizes[axis]
@@ -200,7 +197,7 @@ def jump_apart(changes: Array, width: float, hollow: float = 0.1, share: float =
 def check_noise(recording: Recording, least_mdps_rts: float = 0.2) -> None:
     """More noise than a MEMS gyroscope has, or a smaller N: the best have 0.33 mdps sqrt(s)."""
     # of changes, not of samples: a swing is a motion, and no noise
-    sigma = np.sqrt((recording.changes**2).mean(axis=1).max() / 2)
+    sigma = np.sqrt(recording.squares.max() / 2)
     density = recording.blocks.noise.max() * np.sqrt(recording.size / recording.rate_hz) / MDPS
     largest = recording.quality.largest_noise_dps
     if sigma > largest:

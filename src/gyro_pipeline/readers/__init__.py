@@ -96,7 +96,7 @@ def _stacked(file: File, columns: Sequence[int]) -> Floats:
         lengths = [len(column) for column in values]
         names = file.listed(columns)
         raise file.refusal(f"expected columns of one length, got {lengths} of {names}; correct it")
-    return np.stack(values, axis=1)
+    return np.array(values).T
 
 
 def _in_dps(file: File, raw: Floats, scale: float, rate_hz: float | None) -> Floats:
@@ -104,8 +104,11 @@ def _in_dps(file: File, raw: Floats, scale: float, rate_hz: float | None) -> Flo
     options = file.options
     if options.signed_bits is not None:
         raw = signed(file, raw, options.signed_bits)
-    rates = (raw - (options.offset or 0.0)) * scale
-    if options.increments and rate_hz is None:
+    if options.offset is not None:
+        raw = raw - options.offset
+    if not options.increments:
+        return raw * scale
+    if rate_hz is None:
         text = "increments: true: the step between samples is not known; give time_column"
         raise file.refusal(text)
-    return rates * rate_hz if options.increments and rate_hz else rates
+    return raw * scale * rate_hz

@@ -25,7 +25,9 @@ def read_beside(file: File, beside: Beside, keep: NDArray[np.bool_]) -> NDArray[
     columns = [file.table.columns[number] for number in numbers]
     if not columns or any(c.dtype.kind != "f" or len(c) != len(keep) for c in columns):
         return None
-    values = np.stack(columns, axis=1) * unit.factor + unit.offset
+    values = np.array(columns).T
+    values *= unit.factor
+    values += unit.offset
     values = values if keep.all() else values[keep]
     return values if np.isfinite(values).any() else None
 

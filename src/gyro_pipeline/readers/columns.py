@@ -62,37 +62,37 @@ def rate_columns(file: File, imu: int | None = None) -> Columns:
 
 
 def _by_options(file: File, columns: Sequence[Column]) -> Columns:
-    """The columns of the options; they contradict names of something else or of another order."""
+    """The columns of the options, compared with what their names say of quantity, axes, samples."""
     rates = [file.find(column) for column in columns]
     if len(set(rates)) < len(AXES):
         raise file.refusal(f"expected three columns of rates, got {list(columns)}; correct columns")
-    known = triples(file.headers) + numbered(file.headers)
-    others = [triple for triple in known if {*triple} & {*rates}]
-    same = [triple for triple in others if {*triple} == {*rates}]
-    if others and tuple(rates) not in same:
+    headers, contradict = file.headers, file.contradictions.append
+    overlapping = [t for t in (*triples(headers), *numbered(headers)) if {*t} & {*rates}]
+    same = [triple for triple in overlapping if {*triple} == {*rates}]
+    if overlapping and tuple(rates) not in same:
         together = "in this order" if same else "together"
-        file.contradictions.append(
+        contradict(
             f"columns of the options are {file.listed(rates)}, but by their names "
-            f"{file.listed((same or others)[0])} belong {together}; give these, or no columns"
+            f"{file.listed((same or overlapping)[0])} belong {together}; give these, or no columns"
         )
-    arrays = [INDEX.sub("", header.name) for header in file.headers]
+    arrays = [INDEX.sub("", header.name) for header in headers]
     samples = min(arrays.count(arrays[number]) for number in rates)
     if samples > 1 and len({arrays[number] for number in rates}) == len(AXES):
-        file.contradictions.append(
+        contradict(
             f"a row holds {samples} samples, {file.listed(rates)} and so on, of which the options "
             "name one; write a row for each sample"
         )
-    strange = [n for n in rates if not _may_be_rate(file, file.headers[n])]
-    if strange or is_quaternion(file.headers, rates):
-        file.contradictions.append(
-            f"columns of the options name {file.listed(strange or rates)}, by name "
-            f"{'no angular rate' if strange else 'of a quaternion'}; give columns of angular rates"
+    others = [number for number in rates if not _may_be_rate(file, headers[number])]
+    if others or is_quaternion(headers, rates):
+        contradict(
+            f"columns of the options name {file.listed(others or rates)}, by name "
+            f"{'no angular rate' if others else 'of a quaternion'}; give columns of angular rates"
         )
     return rates
 
 
 def _may_be_rate(file: File, header: Header) -> bool:
-    """Whether a name allows it; that of an angle does, of increments or with a unit of rates."""
+    """Whether a name allows a rate; that of an angle allows increments, or a rate by its unit."""
     angle_turned = file.options.increments or header.measures("rate")
     return header.quantity in ("", RATE) or (header.quantity == ATTITUDE and angle_turned)
 
@@ -102,41 +102,42 @@ def _by_name(file: File) -> Columns:
     if file.form:
         return find_all(file.table, *file.form.rates.split())
     measured = "angle" if file.options.increments else "rate"
-    groups: dict[bool, list[Columns]] = {True: [], False: []}
+    certain, possible = list[Columns](), list[Columns]()
     with_axes = triples(file.headers)
     for triple in with_axes + numbered(file.headers):
         header = file.headers[triple[0]]
-        certain = header.quantity == RATE or header.measures(measured)
-        if header.quantity in ("", RATE) and (certain or triple in with_axes):
-            groups[certain].append(triple)
+        if header.quantity in ("", RATE):
+            if header.quantity == RATE or header.measures(measured):
+                certain.append(triple)
+            elif triple in with_axes:
+                possible.append(triple)
     if not any(file.table.names) and len(file.table.names) == len(AXES):
-        groups[False].append((0, 1, 2))
-    rates, silent = groups[True], groups[False]
-    if not rates and len(silent) == 1 and is_quaternion(file.headers, silent[0]):
-        raise file.refusal(f"{file.listed(silent[0])} are by name of a quaternion; give columns")
-    if not rates and file.options.units:  # the user's word
-        rates = silent
-        if len(rates) == 1:
-            text = f"nothing but units of the options says that {file.listed(rates[0])} are rates"
-            file.note("rates", text)
-    if len(rates) == 1:
-        return rates[0]
-    raise _refusal_of(file, rates, silent)
+        possible.append((0, 1, 2))
+    if len(certain) == 1:
+        return certain[0]
+    if certain or len(possible) != 1:
+        raise _refusal_of(file, certain or possible)
+    names = file.listed(possible[0])
+    if is_quaternion(file.headers, possible[0]):
+        raise file.refusal(f"{names} are by name of a quaternion; give columns")
+    if not file.options.units:
+        raise file.refusal(
+            f"{names} do not say what they measure, got {file.table.listed()}; if they are angular "
+            f"rates, give units: {RATE_UNITS}"
+        )
+    file.note("rates", f"nothing but units of the options says that {names} are rates")
+    return possible[0]
 
 
-def _refusal_of(file: File, certain: Sequence[Columns], silent: Sequence[Columns]) -> InputError:
-    if certain:
-        first, second = map(list, certain[:2])
+def _refusal_of(file: File, candidates: Sequence[Columns]) -> InputError:
+    """An error about columns of several sensors or samples, or of none."""
+    if candidates:
+        first, second = map(list, candidates[:2])
         return file.refusal(
-            f"expected one sensor and one sample a row, got {len(certain)}, such as "
+            f"expected one sensor and one sample a row, got {len(candidates)}, such as "
             f"{file.listed(first)} and {file.listed(second)}; if they are samples, write a row for "
             f"each; if they are sensors, give columns of the one to read, such as {first}, or of "
             f"both as IMUs, {{1: {first}, 2: {second}}},"
-        )
-    if len(silent) == 1:
-        return file.refusal(
-            f"{file.listed(silent[0])} do not say what they measure, got {file.table.listed()}; if "
-            f"they are angular rates, give units: {RATE_UNITS}"
         )
     return file.refusal(
         "expected three columns of angular rate about x, y, z that say so by name or unit, got "

@@ -24,11 +24,12 @@ def contradict_values(file: File, raw: Floats, rates: Floats, are_counts: bool) 
         rates: (n, 3), deg/s.
         are_counts: Whether the file's numbers are known to be counts.
     """
-    options = file.options
-    explained = options.offset is not None
-    text = "" if explained or options.signed_bits else wrapped(raw)
-    text = text or ("" if are_counts else lost_decimal_points(raw))
-    text = text or ("" if explained else implausible_level(rates))
+    options, text = file.options, ""
+    if _are_whole(raw[:100]):
+        explained = options.signed_bits or options.offset is not None
+        text = "" if explained else wrapped(raw)
+        text = text or ("" if are_counts else lost_decimal_points(raw))
+    text = text or ("" if options.offset is not None else implausible_level(rates))
     if text:
         file.contradictions.append(text)
 
@@ -39,14 +40,12 @@ def wrapped(values: Floats, bits: Sequence[int] = (*range(12, 25), 32), compact:
     Nearly all rows are whole numbers without a sign, of which some lie so high that their signed
     reading is smaller, in range or in size, by the factor ``compact``.
     """
-    if not _are_whole(values[:100]):
-        return ""
     counts = values[((values == np.rint(values)) & (values >= 0)).all(axis=1)]
     for width in bits:
         within = counts[(counts < 2**width).all(axis=1)]
-        if len(within) < 0.99 * len(_finite(values)):  # noqa: PLR2004
-            continue
         high = within >= 2 ** (width - 1)
+        if not high.any() or len(within) < 0.99 * len(_finite(values)):  # noqa: PLR2004
+            continue
         signed = np.where(high, within - 2.0**width, within)
         smaller = np.abs(signed).max(axis=0) * compact <= within.max(axis=0)
         narrower = (np.ptp(signed, axis=0) + 1) * compact <= np.ptp(within, axis=0)
@@ -77,8 +76,6 @@ def signed(file: File, values: Floats, bits: int) -> Floats:
 
 def lost_decimal_points(values: Floats, digits: tuple[int, int] = (6, 9), most: float = 0.9) -> str:
     """Whole numbers of many digits: a spreadsheet took decimal points for separators."""
-    if not _are_whole(values[:100]):
-        return ""
     values = np.abs(_finite(values))
     many = (values >= 10.0 ** (digits[0] - 1)) & (values < 10.0 ** digits[1])
     if (many & (values == np.rint(values))).mean() < most:
@@ -91,7 +88,7 @@ def lost_decimal_points(values: Floats, digits: tuple[int, int] = (6, 9), most: 
 
 def implausible_level(rates: Floats, most_dps: float = 100.0) -> str:
     """A level that no MEMS gyroscope at rest has; of rates in deg/s."""
-    if (np.abs(rates) > most_dps).mean() < 1 / 6:  # most recordings, at a glance
+    if np.count_nonzero(np.abs(rates) > most_dps) < rates.size / 6:  # most recordings, at a glance
         return ""
     levels = np.median(_finite(rates), axis=0)
     axis = int(np.abs(levels).argmax())

@@ -6,6 +6,7 @@ open. Loggers whose headers name all units need no row: NGIMU, x-IMU3, phyphox, 
 
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.readers.table import IN_READER, Table
@@ -46,9 +47,13 @@ class Format:
 
 
 def find_all(table: Table, *names: str) -> list[int]:
-    """Columns of these names, also within a message: ``field.angular_velocity.x``."""
-    headers = [f".{header}" for header in table.names]
-    return [n for name in names for n, text in enumerate(headers) if text.endswith(f".{name}")]
+    """Numbers of the columns of these names, also within a message: ``field.accel.x``."""
+    return [number for name in names for number in _named(table.names, name)]
+
+
+@lru_cache(1 << 10)  # a folder's files have the same headers
+def _named(headers: tuple[str, ...], name: str) -> list[int]:
+    return [n for n, header in enumerate(headers) if f".{header}".endswith(f".{name}")]
 
 
 FORMATS: dict[str, Format] = {
@@ -107,10 +112,10 @@ FORMATS: dict[str, Format] = {
 
 
 def check_format(name: str, where: str) -> None:
-    """Refuse a name that no format has.
+    """Check that there is a format of this name.
 
     Raises:
-        InputError: So it is.
+        InputError: There is none; lists those that there are.
     """
     names = (AUTO, *FORMATS, GENERAL)
     if name not in names:
@@ -123,10 +128,11 @@ def format_of(table: Table, name: str) -> Format | None:
     Raises:
         InputError: There is no format of that name, or the table lacks its columns.
     """
+    if name == AUTO:
+        return next((form for form in FORMATS.values() if form.claims(table)), None)
     check_format(name, f"{table.where}: format {IN_READER}")
-    if name in (AUTO, GENERAL):
-        claiming = (form for form in FORMATS.values() if name == AUTO and form.claims(table))
-        return next(claiming, None)
+    if name == GENERAL:
+        return None
     for column in FORMATS[name].rates.split():
         if len(find_all(table, column)) != 1:
             raise InputError(

@@ -57,7 +57,7 @@ def read_lines(where: str, data: bytes, expression: str) -> Table:
     def place(row: int) -> str:
         return f"row {row} (line {numbers[row]})"
 
-    columns, findings, _ = columns_of(names, texts, place)
+    columns, findings, _ = columns_of(names, texts, place, ".")
     skipped = [number for number in filled if number not in matches]
     if skipped:
         detail = f"{len(skipped)} of {len(filled)} lines do not match `row` and were skipped, the "

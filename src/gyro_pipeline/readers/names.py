@@ -2,8 +2,8 @@
 
 import re
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 from gyro_pipeline.conventions import AXES
 from gyro_pipeline.units import Unit, read_unit
@@ -29,37 +29,50 @@ _AXIS_WORDS = [
 _BRACKETS = re.compile(r"\s*[(\[]((?:[^()\[\]]|[(\[][^()\[\]]*[)\]])*)[)\]]")
 _BEHIND_UNIT = re.compile(r"(?i)[\W_]*([xyz]|[xyz][\W_]?axis|cal|raw|since .*)?[\W_]*")
 INDEX = re.compile(r"[\[.](\d+)\]?$")
-_CLOCK_UNITS_S = (1.0, 1e-3, 1e-6, 1e-9, 60.0, 3600.0)
+_TIME = re.compile(
+    r"time|stamp|elapsed|epoch?|clock|date|utc|unix|tick|second|milli|micro|nano|^d?ts?$|^$"
+)
+_DURATION = re.compile(
+    r"loop|exposure|response|integration|latency|duration|lag|age\b|offset|valid|zone|out\b|temp"
+)
 _LONGEST = 200  # characters of a name that is looked into
 
 
-class Header(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Header:
     """A name, its unit as written (an empty text: none), and what that is (None: not known)."""
 
     name: str
     unit_text: str = ""
     unit: Unit | None = None
 
-    @property
+    @cached_property
     def quantity(self) -> str:
         """``rate``, ``attitude``, ``other``, or an empty text, by the words of the name."""
-        return _quantity_of(self.name)
+        words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", self.name.replace("ω", "omega"))
+        text = " ".join(words).lower()
+        matches = (name for name, word in _QUANTITIES if re.search(rf"\b({word})\b", text))
+        return next(matches, "")
 
     def measures(self, *quantities: str) -> bool:
         """Whether its unit is of one of these quantities."""
         return self.unit is not None and self.unit.quantity in quantities
 
-    @property
+    @cached_property
+    def names_time(self) -> bool:
+        """Whether it is the name of a column of times."""
+        allowed = _TIME.search(self.name.lower()) and not self.names_duration
+        return bool(allowed and (self.name or self.measures("time")))
+
+    @cached_property
+    def names_duration(self) -> bool:
+        """Whether it is the name of something else that is measured in seconds."""
+        return bool(_DURATION.search(self.name.lower()))
+
+    @cached_property
     def has_unit(self) -> bool:
         """Whether it has a unit, if an unknown one, rather than a remark in brackets."""
         return self.unit is not None or bool(re.search(r"[/^√*\d]", self.unit_text))
-
-
-@lru_cache(1 << 10)
-def _quantity_of(name: str) -> str:
-    text = " ".join(re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name.replace("ω", "omega"))).lower()
-    matches = (name for name, word in _QUANTITIES if re.search(rf"\b({word})\b", text))
-    return next(matches, "")
 
 
 @lru_cache(64)  # the files of a folder have the same header
@@ -81,7 +94,7 @@ def read_header(text: str) -> Header:
     if matches:
         brackets = [_in_brackets(text, match) for match in matches]
         last = next((h for h in reversed(brackets) if h.unit), brackets[-1])
-        return last._replace(name=last.name + array)
+        return replace(last, name=last.name + array)
     for start, end in [(0, 0), *(m.span() for m in re.finditer(r"[ _./]+", text))]:
         unit = read_unit(text[end:])
         if unit and _stands_without_brackets(unit, text[end:], alone=end == 0):
@@ -97,18 +110,15 @@ def _in_brackets(text: str, match: re.Match[str]) -> Header:
     before, behind = text[: match.start()], text[match.end() :]
     is_all = _BEHIND_UNIT.fullmatch(_BRACKETS.sub("", behind))  # not gx (deg/s)*100
     unit_text = match[1].strip() if is_all else text[match.start() :].strip()
-    if re.search("temp", before, re.IGNORECASE) and unit_text in ("C", "F"):
-        unit_text = f"deg{unit_text}"  # and no coulomb or farad
     return Header((before + behind).strip(), unit_text, read_unit(unit_text))
 
 
 def _stands_without_brackets(unit: Unit, text: str, alone: bool) -> bool:
-    """Whether it is a unit rather than a word that pint knows, such as ``a``, ``fs``, ``cal``."""
-    if unit.quantity == "time":
-        return unit.factor in _CLOCK_UNITS_S and (len(text) > 1 or text in "sS")
-    if unit.quantity == "temperature":
-        return len(text) > 1
-    return unit.quantity == "rate" or (not alone and unit.quantity != "other")
+    """Whether a text without brackets is a unit rather than a word or the letter of an axis."""
+    if len(text) == 1 and text not in "sSgG":
+        return False
+    certain = unit.quantity in ("rate", "time", "temperature")
+    return certain or (not alone and unit.quantity != "other")
 
 
 @lru_cache(64)
@@ -131,15 +141,15 @@ def triples(headers: tuple[Header, ...]) -> list[tuple[int, ...]]:
 
 @lru_cache(64)
 def numbered(headers: tuple[Header, ...]) -> list[tuple[int, ...]]:
-    """The same of columns without axes that end in 1, 2, 3 or 0, 1, 2: ``w0``, ``gyro 3``."""
+    """Numbers of columns without axes that end in 1, 2, 3 or 0, 1, 2: ``w0``, ``gyro 3``."""
     with_axes = {number for triple in triples(headers) for number in triple}
     groups: dict[str, dict[int, int]] = {}
     for number, header in enumerate(headers):
         match = re.fullmatch(r"(.*\D)(\d)", header.name[:_LONGEST])
         if match and number not in with_axes:
             groups.setdefault(match[1], {})[int(match[2])] = number
-    wanted = ([0, 1, 2], [1, 2, 3])
-    return [tuple(g[k] for k in sorted(g)) for g in groups.values() if sorted(g) in wanted]
+    complete = [group for group in groups.values() if {*group} in ({0, 1, 2}, {1, 2, 3})]
+    return [tuple(group[digit] for digit in sorted(group)) for group in complete]
 
 
 def is_quaternion(headers: tuple[Header, ...], triple: Sequence[int]) -> bool:

@@ -6,23 +6,24 @@ options or where the rows themselves say so. What could be either is refused.
 """
 
 import re
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy import special
-from scipy.ndimage import uniform_filter1d
 
 from gyro_pipeline.conventions import AXES
 from gyro_pipeline.readers.file import File
 from gyro_pipeline.readers.names import OTHER, RATE, Header, triples
-from gyro_pipeline.readers.stamps import names_time
 
 Codes = NDArray[np.intp]
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Texts = NDArray[Any]
+
+MOST_VALUES = 32
+"""Of a column that says what a row is of; one of more holds measurements or counts."""
 
 _DEVICE = re.compile(
     r"(?i)(?:^|[ _.])(?:device|dev|sensor|imu|node|serial|mac|topic)"
@@ -40,15 +41,14 @@ def sample_rows(file: File, rates: Floats) -> Mask:
     keep = np.ones(len(rates), bool)
     for name, value in file.options.rows.items():
         keep &= _with_value(file, file.find(name), value, len(rates))
-    for check, wanted, leave_out, why in (
-        ("blank rows", True, blank_at_regular_shares, "are blank, at a regular share"),
-        ("repeated rows", file.options.repeats, repeated, "repeat the one before"),
-    ):
-        if not wanted:
-            continue
-        out = leave_out(rates if keep.all() else rates[keep])
+    checks: dict[str, Callable[[Floats], Mask]]
+    checks = {"are blank, at a regular share": blank_at_regular_shares}
+    if file.options.repeats:
+        checks["repeat the one before"] = repeated
+    for text, no_samples in checks.items():
+        out = no_samples(rates if keep.all() else rates[keep])
         if out.any():
-            file.note(check, f"{out.sum()} of {len(out)} rows {why}: no samples, left out")
+            file.note("rows", f"{out.sum()} of {len(out)} rows {text}: no samples, left out")
             keep[np.flatnonzero(keep)[out]] = False
     return keep
 
@@ -73,28 +73,25 @@ def _with_value(file: File, number: int, value: str | float, count: int) -> Mask
 def blank_at_regular_shares(
     rates: Floats, least_share: float = 0.05, least_runs: int = 10, alike: float = 0.9
 ) -> Mask:
-    """Rows without rates that come regularly, as where another sensor has a higher rate.
+    """Rows (n,) without rates that come regularly, as where another sensor has a higher rate.
 
     Args:
         rates: (n, 3), NaN where blank.
         least_share: Of the rows; fewer are losses.
-        least_runs: Of such rows in a row.
-        alike: Share of the runs, of blank rows and of others, that are of about one length; where
-            rows are lost at random, lengths scatter.
-
-    Returns:
-        (n,), nothing where blank rows are losses.
+        least_runs: Of blank rows, and of others.
+        alike: Share of the runs of each that are about as long as their median; where rows are lost
+            at random, lengths scatter.
     """
     none = np.zeros(len(rates), bool)
-    if np.isnan(rates[:, 0]).mean() < least_share:
+    if np.count_nonzero(np.isnan(rates[:, 0])) < least_share * len(rates):
         return none
     blank = np.isnan(rates).all(axis=1)
     lengths = np.diff(np.flatnonzero(np.diff(blank)))
     if blank.mean() < least_share or len(lengths) < 2 * least_runs:
         return none
-    for some in (lengths[0::2], lengths[1::2]):
-        usual = np.median(some)
-        if (np.abs(some - usual) <= max(1, usual / 4)).mean() < alike:
+    for runs in (lengths[0::2], lengths[1::2]):
+        median = np.median(runs)
+        if (np.abs(runs - median) <= max(1, median / 4)).mean() < alike:
             return none
     return np.asarray(blank)
 
@@ -118,51 +115,45 @@ def contradict_turns(file: File, used: Collection[int], keep: Mask, rates: Float
     """
     of_axes = {number for triple in triples(file.headers) for number in triple}
     for number, (header, column) in enumerate(zip(file.headers, file.table.columns, strict=True)):
-        measures = header.has_unit or names_time(header) or (number in of_axes and header.quantity)
+        measures = header.has_unit or header.names_time or (number in of_axes and header.quantity)
         if number in used or (measures and column.dtype.kind == "f") or len(column) != len(keep):
             continue
-        name = file.table.names[number]
-        turns, value = _takes_turns(name, column, keep, rates)
-        if turns:
+        cells = column[:: len(column) // 100 + 1].tolist()
+        if len({cell for cell in cells if cell == cell}) > MOST_VALUES:  # noqa: PLR0124 - not NaN
+            continue
+        codes, texts = _coded(column[keep])
+        if evidence := _evidence(header.name, codes, texts, rates):
+            name, value = file.table.names[number] or number, _suggested(texts, np.bincount(codes))
             file.contradictions.append(
-                f"{file.listed([number])} takes turns among {turns}, but a recording is of one "
-                f"device; pick its rows, such as rows: {{{name or number}: {value}}}"
+                f"{file.listed([number])} takes turns among {_counted(codes, texts)}, {evidence}, "
+                "but a recording is of one device; pick its rows, such as rows: "
+                f"{{{name}: {value}}}"
             )
 
 
-def _takes_turns(
-    name: str, column: NDArray[Any], keep: Mask, rates: Floats, most_values: int = 32
-) -> tuple[str, str]:
-    """Values of a column (n,) and evidence, for a message, and a value; empty where there is none.
-
-    A column of more values holds measurements or counts.
-    """
-    if len(pd.unique(column[:: len(column) // 100 + 1])) > most_values:  # most columns
-        return "", ""
-    codes, texts = _coded(column[keep])
-    if not 1 < len(texts) <= most_values:
-        return "", ""
-    rows, filled = np.bincount(codes), texts.astype(bool)
+def _evidence(name: str, codes: Codes, texts: Texts, rates: Floats) -> str:
+    """What tells that the value of a row, by the codes (m,), says what it is of; or nothing."""
+    if not 1 < len(texts) <= MOST_VALUES:
+        return ""
+    filled, rows = texts.astype(bool), np.bincount(codes)
     runs = np.bincount(codes[np.flatnonzero(np.diff(codes, prepend=-1))])
     words = filled & [not _NUMBER_OR_FLAG.fullmatch(text) for text in texts]
     if _DEVICE.search(name) and (filled & (rows >= len(codes) / 100)).sum() > 1:
-        evidence = "by its name devices"
-    elif (words & (runs > 2)).sum() > 1:  # noqa: PLR2004
-        evidence = "which say what a row is"
-    else:
-        evidence = _change(rates, codes)
-    return evidence and f"{_counted(codes, texts)}, {evidence}", _value(texts, rows)
+        return "by its name devices"
+    if (words & (runs > 2)).sum() > 1:  # noqa: PLR2004
+        return "which say what a row is"
+    return _change(rates, codes)
 
 
-def _value(texts: NDArray[Any], rows: NDArray[np.intp]) -> str:
-    """The value to suggest: of a rate by its word, else of most rows; of no other quantity."""
+def _suggested(texts: Texts, rows: Codes) -> str:
+    """The value to pick: of a rate by its word, else of most rows; of no other quantity."""
     ranks = [{RATE: 2, "": 1}.get(Header(text).quantity, 0) * bool(text) for text in texts]
     rank, _, best = max(zip(ranks, rows.tolist(), range(len(texts)), strict=True))
     return str(texts[best]) if rank else "…"
 
 
 def _change(rates: Floats, codes: Codes, least: float = 0.3, chance: float = 1e-12) -> str:
-    """How level or noise of rates (n, 3) change with the codes (n,) of their rows, for a message.
+    """How level or noise of rates (m, 3) change with the codes (m,) of their rows, for a message.
 
     Each run of a code is compared with both of its neighbours, which takes off drift and the slow
     part of flicker; how these differences scatter is the rest. A change is more than ``least`` of
@@ -172,20 +163,23 @@ def _change(rates: Floats, codes: Codes, least: float = 0.3, chance: float = 1e-
     starts = np.flatnonzero(np.diff(codes[finite], prepend=-1))
     if len(starts) < 3:  # noqa: PLR2004
         return ""
+    from scipy.ndimage import uniform_filter1d  # noqa: PLC0415 - SciPy starts slowly, and few
+    from scipy.special import stdtrit  # noqa: PLC0415 - files have such a column
+
     runs, lengths = codes[finite][starts[1:-1]], np.diff(starts, append=finite.sum())[:, None]
     level = _without_spikes(rates[finite])
     noise = _without_spikes(np.abs(level - uniform_filter1d(level, 51, axis=0)))
-    for what, values in (("rate", level), ("noise", noise)):
+    for quantity, values in (("rate", level), ("noise", noise)):
         means = np.add.reduceat(values, starts) / lengths
-        apart = means[1:-1] - (means[:-2] + means[2:]) / 2
+        differences = means[1:-1] - (means[:-2] + means[2:]) / 2
         for code in np.flatnonzero(np.bincount(runs) > 2):  # noqa: PLR2004
-            some = apart[runs == code]
-            sizes, errors = np.abs(some.mean(axis=0)), some.std(axis=0) / np.sqrt(len(some))
-            limits = -special.stdtrit(len(some) - 1, chance / 2) * errors
+            of_code = differences[runs == code]
+            sizes, errors = np.abs(of_code.mean(axis=0)), of_code.std(axis=0) / len(of_code) ** 0.5
+            limits = -stdtrit(len(of_code) - 1, chance / 2) * errors
             excess = sizes - np.maximum(limits, least * noise.mean(axis=0))
             if excess.max() > 0:
                 size = f"{AXES[excess.argmax()]} changes by {sizes[excess.argmax()]:.3g} deg/s"
-                return f"with which {what} about {size}"
+                return f"with which {quantity} about {size}"
     return ""
 
 
@@ -194,7 +188,7 @@ def _without_spikes(values: Floats) -> Floats:
     return np.clip(values, *np.quantile(values, [0.01, 0.99], axis=0))
 
 
-def _coded(column: NDArray[Any]) -> tuple[Codes, NDArray[Any]]:
+def _coded(column: NDArray[Any]) -> tuple[Codes, Texts]:
     """Of each row the number of its value, and the values as texts."""
     codes, values = pd.factorize(column, use_na_sentinel=False)
     return codes, np.array([_as_text(value) for value in values], object)
@@ -205,7 +199,7 @@ def _as_text(value: Any) -> str:
     return "" if pd.isna(value) else f"{value:.15g}" if isinstance(value, float) else str(value)
 
 
-def _counted(codes: Codes, texts: NDArray[Any], most: int = 8) -> str:
+def _counted(codes: Codes, texts: Texts, most: int = 8) -> str:
     """Values and how many rows have each, for a message."""
     pairs = zip(texts[:most], np.bincount(codes), strict=False)
     shown = [f"{text or 'blank'} ({count} rows)" for text, count in pairs]

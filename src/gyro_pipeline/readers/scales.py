@@ -1,12 +1,12 @@
 """What one unit of the rates is, in deg/s.
 
-The options, the header, the lines above it and the format may say so; all that say it must agree.
+The options, the header, the lines above it and the format may say so; all that say it must agree. A
+factor that the file states beside them must be that unit in one of its readings.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from math import isclose
-from typing import NamedTuple
 
 from gyro_pipeline.readers.file import File
 from gyro_pipeline.readers.formats import find_all
@@ -15,6 +15,7 @@ from gyro_pipeline.units import Unit, read_unit
 
 RATE_UNITS = "deg/s, rad/s, mdps, deg/h, … or raw (with scale_dps)"
 
+# no part of a name, a date, a time of day or a count of bits
 _NUMBER = (
     r"(?<![\w.])(?<!\d[-:])([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(?![\w.]*\d|[-:/]\d|\s*-?bit)"
 )
@@ -30,19 +31,11 @@ _RANGE = re.compile(r"(?i)(?:full[ _-]?scale|range)[^\d\n]*[\d.]+")
 _FACTOR = re.compile(r"(?i)[*×]\s*\d|\d\s*[*×]|(?<![a-z])x\d+(?![a-z\d])")
 _DPS_PER_RAD = 57.29577951308232
 
+Readings = Mapping[str, float]
+"""deg/s a count, by what a stated factor may be."""
 
-class Statement(NamedTuple):
-    """Who says what the unit is, and the unit."""
-
-    text: str
-    unit: Unit
-
-    def agrees(self, other: "Statement") -> bool:
-        """Whether units are the same; one of counts may say nothing of their size."""
-        sizes = self.unit.factor, other.unit.factor
-        of_any_size = self.unit.quantity == "count" and 1 in sizes
-        alike = of_any_size or isclose(*sizes, rel_tol=1e-6)
-        return self.unit.quantity == other.unit.quantity and alike
+Statement = tuple[str, Unit]
+"""Who says what the unit is, for a message, and the unit."""
 
 
 def scale_of(file: File, rates: Sequence[int]) -> tuple[float, bool]:
@@ -51,73 +44,74 @@ def scale_of(file: File, rates: Sequence[int]) -> tuple[float, bool]:
     Raises:
         InputError: Nobody says the unit, or the scale of raw counts.
     """
-    options, names = file.options, file.listed(rates)
-    by_options, by_format = _of_options(file), _of_format(file, rates)
-    by_file = [*_of_headers(file, rates), *_above(file)]
-    scales = _stated_scales(file, rates)
-    stated = "".join(f"; {where}: give {_typed(readings)}" for where, readings in scales)
+    names, by_options = file.listed(rates), [*_of_options(file)]
+    by_file, by_format = [*_of_headers(file, rates), *_of_lines(file)], [*_of_format(file, rates)]
+    factors = [*_stated_factors(file, rates)]
+    to_type = "".join(f"; {where}: give {_typed(readings)}" for where, readings in factors)
     if not (by_options or by_file or by_format):
-        text = f"expected a unit of the rates, got {names}; give units: {RATE_UNITS}{stated}"
+        text = f"expected a unit of the rates, got {names}; give units: {RATE_UNITS}{to_type}"
         raise file.refusal(file.contradictions[0] if file.contradictions else text)
     if not (by_options or by_file):
-        file.note("unit", f"{by_format[0].text}; the file does not say")
+        file.note("unit", f"{by_format[0][0]}; the file does not say")
     statements = [*by_options, *by_file, *by_format]
-    first = statements[0]
-    for other in statements[1:]:
-        if not other.agrees(first):
-            text = f"{first.text}, but {other.text}, of {names}"
+    first, unit = statements[0]
+    for other, other_unit in statements:
+        if not _agree(unit, other_unit):
+            text = f"{first}, but {other}, of {names}"
             if not by_options:
                 raise file.refusal(f"{text}; give units and trust: options")
             file.contradictions.append(f"{text}; correct units")
-    counts = first.unit.quantity == "count"
-    if counts and first.unit.factor == 1 and options.scale_dps is None:
-        text = f"{names} are raw counts: give units: raw and scale_dps, deg/s a count{stated},"
+    scale, are_counts = unit.factor, unit.quantity == "count"
+    if are_counts and not by_options and scale == 1:
+        text = f"{names} are raw counts: give units: raw and scale_dps, deg/s a count{to_type},"
         raise file.refusal(text)
-    _contradict_scales(file, first.unit.factor, scales)
-    if options.scale_dps is None and all(_FACTOR.search(file.table.names[n]) for n in rates):
-        text = f"{names} name a factor, and the scale is {first.unit.factor:g} deg/s"
-        file.contradictions.append(f"{text}; give units: raw and scale_dps, deg/s a count")
-    return first.unit.factor, counts
+    _compare_factors(file, rates, scale, factors)
+    return scale, are_counts
 
 
-def _of_options(file: File) -> list[Statement]:
+def _agree(first: Unit, second: Unit) -> bool:
+    """Whether units are the same; one of counts may say nothing of their size."""
+    of_any_size = first.quantity == "count" and 1 in (first.factor, second.factor)
+    alike = of_any_size or isclose(first.factor, second.factor, rel_tol=1e-6)
+    return first.quantity == second.quantity and alike
+
+
+def _of_options(file: File) -> Iterator[Statement]:
     units, scale_dps = file.options.units, file.options.scale_dps
     if scale_dps is not None:
-        return [Statement(f"the options say raw, of {scale_dps:g} deg/s", Unit("count", scale_dps))]
-    unit = read_unit(units) if units else None
-    return [Statement(f"units of the options are {units}", unit)] if unit else []
+        yield f"the options say raw, of {scale_dps:g} deg/s", Unit("count", scale_dps)
+    elif units and (unit := read_unit(units)):
+        yield f"units of the options are {units}", unit
 
 
-def _of_format(file: File, rates: Sequence[int]) -> list[Statement]:
-    """Of the format's own columns."""
+def _of_format(file: File, rates: Sequence[int]) -> Iterator[Statement]:
     form = file.form
-    if form is None or {*rates} != {*find_all(file.table, *form.rates.split())}:
-        return []
-    return [Statement(f"the format has {form.units}", read_unit(form.units) or Unit("rate"))]
+    if form and {*rates} == {*find_all(file.table, *form.rates.split())}:
+        yield f"the format has {form.units}", read_unit(form.units) or Unit("rate")
 
 
-def _of_headers(file: File, rates: Sequence[int]) -> list[Statement]:
+def _of_headers(file: File, rates: Sequence[int]) -> Iterator[Statement]:
     """Units in brackets and names; a unit of anything but a rate contradicts."""
     headers = [file.headers[number] for number in rates]
     inner = [read_header(header.name) for header in headers if header.unit_text]
     headers += [header for header in inner if header.measures("rate")]  # gx_dps (rad/s)
-    quantities = ("angle",) if file.options.increments else ("rate", "count")
-    strange = [h for h in headers if h.has_unit and not h.measures(*quantities)]
-    if strange:
+    expected = ("angle",) if file.options.increments else ("rate", "count")
+    others = [h for h in headers if h.has_unit and not h.measures(*expected)]
+    if others:
         kind = "angle turned" if file.options.increments else "angular rate"
         angles = "give increments: true if they are angles turned since the last row"
-        hint = angles if strange[0].measures("angle") else "give columns of angular rates"
-        names = f"{file.listed(rates)} say {strange[0].unit_text!r}"
+        hint = angles if others[0].measures("angle") else "give columns of angular rates"
+        names = f"{file.listed(rates)} say {others[0].unit_text!r}"
         file.contradictions.append(f"{names}, but that is no {kind}; {hint}")
     elif headers[0].unit_text and headers[0].unit is None:
         text = f"the remark {headers[0].unit_text!r} in the header is no unit that is known"
         file.note("unit", text)
-    units = {h.unit: h for h in headers if h.unit and h not in strange}
-    return [Statement(f"the header says {h.unit_text}", unit) for unit, h in units.items()]
+    units = {h.unit: h.unit_text for h in headers if h.unit and h not in others}
+    yield from ((f"the header says {text}", unit) for unit, text in units.items())
 
 
-def _above(file: File) -> list[Statement]:
-    """The unit of angular rate that lines above name, if one; not that of a range of 250 dps."""
+def _of_lines(file: File) -> Iterator[Statement]:
+    """The only unit of angular rate in lines above the header, but for that of a range in dps."""
     words = re.findall(r"[^\s,;:=()\[\]\"'#%]+", file.table.preamble)
     units: dict[Unit, str] = {}
     for at, word in enumerate(words):
@@ -129,65 +123,59 @@ def _above(file: File) -> list[Statement]:
             if unit and unit.quantity in ("rate", "count"):
                 units.setdefault(unit, text)
                 break
-    statements = [Statement(f"lines above the header say {t}", u) for u, t in units.items()]
-    return statements if len(statements) == 1 else []
+    if len(units) == 1:
+        yield from ((f"lines above the header say {text}", unit) for unit, text in units.items())
 
 
-def _stated_scales(file: File, rates: Sequence[int]) -> list[tuple[str, dict[str, float]]]:
-    """Factors on the rates that lines above the header or constant columns name.
-
-    Returns:
-        Where each stands, and deg/s a count by what it may be.
-    """
-    lines = [
-        (f"a line above the header says {line[:200].strip()!r}", line[:200])
-        for line in file.table.preamble.splitlines()
-    ]
+def _stated_factors(file: File, rates: Sequence[int]) -> Iterator[tuple[str, Readings]]:
+    """Factors on the rates that lines above the header and constant columns state, and where."""
+    above = [line[:200].strip() for line in file.table.preamble.splitlines()]
+    texts = {f"a line above the header says {line!r}": line for line in above}
     for number, (name, column) in enumerate(zip(file.table.names, file.table.columns, strict=True)):
-        if number not in rates and len(column) and (column == column[0]).all():
-            lines.append((f"column {name!r} is {column[0]}", f"{name}: {column[0]}"))
-    scales = []
-    for where, line in lines:
-        text = _RANGE.sub("", line)
+        ends_equal = len(column) > 0 and column[0] == column[-1]  # at a glance
+        if number not in rates and ends_equal and (column == column[0]).all():
+            texts[f"column {name!r} is {column[0]}"] = f"{name}: {column[0]}"
+    for where, text in texts.items():
+        line = _RANGE.sub("", text)
         # acc: 16384 LSB/g, gyro: 131 LSB/dps
-        of_several = _OF_OTHERS.search(text) and "gyr" in text.lower()
-        for part in re.split(r"[,;]\s*(?=[^\W\d])", text) if of_several else [text]:
+        of_several = _OF_OTHERS.search(line) and "gyr" in line.lower()
+        for part in re.split(r"[,;]\s*(?=[^\W\d])", line) if of_several else [line]:
             match = None if _OF_OTHERS.search(part) else _SCALE.search(part)
             if match and (factor := abs(float(match[1] or match[2]))):
-                scales.append((where, _readings(part, factor)))
-    return scales
+                readings = _readings(part, factor)
+                if not isclose(readings.get("deg/s a count", 0), 1, rel_tol=1e-3):
+                    yield where, readings
 
 
-def _readings(line: str, factor: float) -> dict[str, float]:
-    """deg/s a count, by what a factor may be; the unit in its line leaves fewer readings."""
+def _readings(line: str, factor: float) -> Readings:
+    """What a factor may be, by a unit in its line; a gyroscope's count is less than 1 deg/s."""
     factor *= 1e-3 if re.search(r"(?i)mdps|m(?:illi)?(?:deg|°)", line) else 1
-    in_rad = {"rad/s a count": factor * _DPS_PER_RAD}
-    in_deg = {"deg/s a count": factor, "counts per deg/s": 1 / factor}
-    if re.search(r"(?i)dps|deg|°", line):
-        return in_deg
-    if re.search(r"(?i)rad", line):
-        return in_rad | {"counts per rad/s": _DPS_PER_RAD / factor}
-    return in_deg | in_rad
+    in_deg = re.search(r"(?i)dps|deg|°", line)
+    in_rad = not in_deg and re.search("(?i)rad", line)
+    unit, size = ("rad/s", _DPS_PER_RAD) if in_rad else ("deg/s", 1)
+    readings = {f"{unit} a count": factor * size, f"counts per {unit}": size / factor}
+    if not (in_deg or in_rad):
+        readings["rad/s a count"] = factor * _DPS_PER_RAD
+    return {what: dps for what, dps in readings.items() if dps < 1} or readings
 
 
-def _typed(readings: dict[str, float]) -> str:
-    """What to type for a factor; a count of a gyroscope is less than a degree per second."""
-    likely = {what: dps for what, dps in readings.items() if dps < 1} or readings
-    return "units: raw, scale_dps: " + ", or ".join(
-        f"{dps:.6g} if it is {what}" for what, dps in likely.items()
-    )
+def _typed(readings: Readings) -> str:
+    """What to type for a factor."""
+    texts = (f"{dps:.6g} if it is {what}" for what, dps in readings.items())
+    return "units: raw, scale_dps: " + ", or ".join(texts)
 
 
-def _contradict_scales(
-    file: File, scale: float, scales: Sequence[tuple[str, dict[str, float]]]
+def _compare_factors(
+    file: File, rates: Sequence[int], scale: float, factors: Sequence[tuple[str, Readings]]
 ) -> None:
-    """Factors that are named and are not the scale; which reading of one is taken is said."""
-    for where, readings in scales:
-        if isclose(readings.get("deg/s a count", 0), 1, rel_tol=1e-3):
-            continue
+    """Factors that are stated and are not the scale; which reading of one is taken is said."""
+    for where, readings in factors:
         same = [what for what, dps in readings.items() if isclose(dps, scale, rel_tol=1e-3)]
         if not same:
             text = f"{where}, but the scale is {scale:g} deg/s; give {_typed(readings)}"
             file.contradictions.append(text)
-        elif sum(dps < 1 for dps in readings.values()) > 1:
+        elif len(readings) > 1:
             file.note("scale", f"{where}, which is taken for {same[0]}")
+    if file.options.scale_dps is None and all(_FACTOR.search(file.table.names[n]) for n in rates):
+        text = f"{file.listed(rates)} name a factor, and the scale is {scale:g} deg/s"
+        file.contradictions.append(f"{text}; give units: raw and scale_dps, deg/s a count")

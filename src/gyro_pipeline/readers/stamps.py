@@ -11,36 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyro_pipeline.logs import KEPT, REJECTED, Finding
-from gyro_pipeline.readers.clock import Timing, check_rate, from_counter, from_stamps
+from gyro_pipeline.readers.clock import Timing, from_counter, from_stamps
 from gyro_pipeline.readers.file import File
 from gyro_pipeline.readers.formats import find_all
-from gyro_pipeline.readers.names import Header
 from gyro_pipeline.readers.table import IN_READER
 from gyro_pipeline.readers.times import are_steps, seconds
 from gyro_pipeline.units import Unit, read_unit
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Rows = NDArray[np.intp]
 
-_TIME = re.compile(
-    r"time|stamp|elapsed|epoch?|clock|date|utc|unix|tick|second|milli|micro|nano|^d?ts?$|^$"
-)
-_DURATION = re.compile(
-    r"loop|exposure|response|integration|latency|duration|lag|age\b|offset|valid|zone|out\b|temp"
-)
 _STATED_RATE = re.compile(
     r"(?i)\b(?:(?:sampl\w*|output|update|data)[ _-]?(?:rate|freq\w*)|odr|fs)\b"
     r"[^\w\n]{0,20}(?:hz)?[^\w\n.]{0,20}(\d+(?:\.\d+)?)[ ]{0,3}(k?)(?:hz|\s|$|[,;\"])"
 )
 _UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _TIME_SCALE = re.compile(r"(?im)^\W*t(?:ime)?[ _]?scale\W+([\d.]+(?:e[-+]?\d+)?)\s*$")
-
-
-def names_time(header: Header) -> bool:
-    """Whether a column is one of times by its name."""
-    name = header.name.lower()
-    allowed = _TIME.search(name) and not _DURATION.search(name)
-    return bool(allowed and (name or header.measures("time")))
 
 
 def timing_of(file: File, keep: Mask) -> Timing:
@@ -50,20 +37,20 @@ def timing_of(file: File, keep: Mask) -> Timing:
         InputError: The column that the options name holds no times.
     """
     problem, stepwise = "", file.options.time_is == "steps"
-    for number, unit_s, named in _candidates(file):
+    for number, unit_s, by_name in _candidates(file):
         values = file.table.columns[number]
         times = values if values.dtype.kind == "f" else seconds(values, None)
         if times is None or len(times) != len(keep):
             continue
         if are_steps(times) != stepwise:
-            if named and not stepwise and not problem:
+            if by_name and not stepwise and not problem:
                 name = file.listed([number])
                 problem = f"{name} holds the time since the last row; give time_is: steps"
             continue
         if stepwise:
             times = np.cumsum(np.nan_to_num(times))  # of all rows, also of those left out
-        if _increase(times[keep], 0.0 if named else 0.95):
-            return _measured(file, number, unit_s, times, keep)
+        if _increase(times[keep], 0.0 if by_name else 0.95):
+            return _measured(file, number, unit_s, times[keep], np.flatnonzero(keep))
     if file.options.time_column is not None:
         problem = problem or f"{file.options.time_column!r} holds no times that can be read"
         raise file.refusal(f"{problem}, or correct time_column")
@@ -76,14 +63,14 @@ def _increase(times: Floats, share: float) -> bool:
     finite = times[np.isfinite(times)]
     if len(finite) < max(len(times) / 2, 2) or finite[-1] <= finite[0]:
         return False
-    return share == 0 or bool((np.diff(finite) >= 0).mean() > share)
+    return share == 0 or bool(np.count_nonzero(np.diff(finite) >= 0) > share * (len(finite) - 1))
 
 
 def _candidates(file: File) -> list[tuple[int, float | None, bool]]:
-    """Columns that may be of times: number, seconds in a unit by the file, and whether named so.
+    """Columns that may be of times: number, seconds in a unit by the file, and whether by name.
 
     The format's go first, then others in the file's order; those with a time's name and a unit
-    that nothing contradicts before the rest. One that is not named so must increase.
+    that nothing contradicts before the rest. A column without such a name must increase.
     """
     times, column = file.form.times if file.form else (), file.options.time_column
     by_format = {n: unit_s for name, unit_s in times for n in find_all(file.table, name)}
@@ -93,10 +80,10 @@ def _candidates(file: File) -> list[tuple[int, float | None, bool]]:
         header, unit = file.headers[number], file.headers[number].unit
         unit_s = unit.factor if unit and header.measures("time") else by_format.get(number)
         is_text = file.table.columns[number].dtype.kind != "f"
-        named = is_text or column is not None or number in by_format or names_time(header)
+        by_name = is_text or column is not None or number in by_format or header.names_time
         certain = is_text or len({unit_s, options_s} - {None}) == 1
-        if named or (unit_s and not _DURATION.search(header.name.lower())):
-            candidates.append(((not named, not certain), (number, unit_s, named)))
+        if by_name or (unit_s and not header.names_duration):
+            candidates.append(((not by_name, not certain), (number, unit_s, by_name)))
     return [candidate for _, candidate in sorted(candidates, key=lambda pair: pair[0])]
 
 
@@ -106,53 +93,46 @@ def _options_s(file: File) -> float | None:
     return (read_unit(units) or Unit("time")).factor if isinstance(units, str) else units
 
 
-def _measured(file: File, number: int, unit_s: float | None, times: Floats, keep: Mask) -> Timing:
-    """Rate and gaps by times (n,), where rows are kept.
+def _measured(
+    file: File, number: int, header_s: float | None, times: Floats, numbers: Rows
+) -> Timing:
+    """Rate and gaps by times (n,) of the rows with these numbers.
 
-    A unit of the options contradicts another one of the file.
+    Options, header and a line above it may state the unit; what differs from it contradicts.
     """
     if file.table.columns[number].dtype.kind != "f":
-        return from_stamps(times[keep], 1.0, np.flatnonzero(keep))
-    name, options_s = file.listed([number]), _options_s(file)
-    scale = _TIME_SCALE.search(file.table.preamble)
-    stated_s = float(scale[1]) if scale else 0.0
-    timing = from_stamps(times[keep], options_s or unit_s, np.flatnonzero(keep))
-    if not (options_s or unit_s):
+        return from_stamps(times, 1.0, numbers)
+    name, unit_s = file.listed([number]), _options_s(file) or header_s
+    match = _TIME_SCALE.search(file.table.preamble)
+    line_s = float(match[1]) if match else 1.0
+    timing = from_stamps(times, unit_s, numbers)
+    if not unit_s:
         text = f"{name} has no unit: the rate is not measured; give time_units"
-        text += f": {stated_s:g}, as a line above the header says" if stated_s else ""
+        text += f": {line_s:g}, as a line above the header says" if match else ""
         if file.options.time_column is not None:
             raise file.refusal(text)
         return replace(timing, findings=(*timing.findings, Finding("timestamps", KEPT, text)))
-    if options_s and unit_s and timing.rate_hz and not isclose(options_s, unit_s):
-        file.contradictions.append(
-            f"{name} has a unit of {unit_s:g} s, which makes "
-            f"{timing.rate_hz * options_s / unit_s:.6g} Hz, but time_units of the options "
-            f"{options_s:g} s, which makes {timing.rate_hz:.6g} Hz"
-        )
-    used_s = options_s or unit_s or stated_s
-    if stated_s not in (0.0, 1.0) and not isclose(stated_s, used_s):
-        file.contradictions.append(
-            f"a line above the header says {scale and scale[0].strip()!r}, but a unit of {name} is "
-            f"{used_s:g} s; give time_units: {stated_s:g}"
-        )
-    return replace(timing, findings=(*timing.findings, *_implausible(file, name, timing, used_s)))
+    hz = timing.rate_hz
+    stated = {f"{name} has": header_s, "a line above the header says": line_s if match else None}
+    for where, stated_s in stated.items():
+        if hz and stated_s and not isclose(stated_s, unit_s):
+            file.contradictions.append(
+                f"{where} a unit of {stated_s:g} s, which makes {hz * unit_s / stated_s:.6g} Hz, "
+                f"but it is read in {unit_s:g} s, which makes {hz:.6g} Hz; correct time_units"
+            )
+    return replace(timing, findings=(*timing.findings, *_implausible(file, name, hz, unit_s)))
 
 
 def _implausible(
-    file: File, name: str, timing: Timing, unit_s: float, slow: float = 0.1, fast: float = 2e4
+    file: File, name: str, hz: float | None, unit_s: float, slow: float = 0.1, fast: float = 2e4
 ) -> tuple[Finding, ...]:
-    """A rate in Hz at which no gyroscope is read, and the units that make a usual one."""
-    hz = timing.rate_hz
+    """A rate at which no gyroscope is read, and the units that make an ordinary one."""
     if hz is None or slow <= hz <= fast:
         return ()
-    rates = {f"time_units: {u}": hz * unit_s / s for u, s in _UNITS_S.items()}
-    usual = [
-        f"{text}, which makes {rate:.6g} Hz" for text, rate in rates.items() if 1 <= rate < fast
-    ]
-    text = (
-        f"{name}, in units of {unit_s:g} s, makes {hz:.6g} Hz, at which no gyroscope is read; give "
-        f"{', or '.join(usual) or 'time_units'}, and trust: options {IN_READER}"
-    )
+    rates = {unit: hz * unit_s / s for unit, s in _UNITS_S.items() if 1 <= hz * unit_s / s < fast}
+    units = ", or ".join(f"time_units: {u}, which makes {r:.6g} Hz" for u, r in rates.items())
+    text = f"{name}, in units of {unit_s:g} s, makes {hz:.6g} Hz, at which no gyroscope is read; "
+    text += f"give {units or 'time_units'}, and trust: options {IN_READER}"
     return (Finding("sample rate", KEPT if file.options.trust else REJECTED, text),)
 
 
@@ -173,17 +153,24 @@ def counted(file: File, keep: Mask) -> Timing:
 def compare_rates(
     file: File, rate_hz: float | None, expected_hz: float | None, keep: Mask
 ) -> tuple[Finding, ...]:
-    """The measured rate with the expected one, and with that of the lines above the header."""
-    tolerance_pct = file.options.rate_tolerance_pct
-    findings = check_rate(rate_hz, expected_hz, tolerance_pct) if rate_hz and expected_hz else ()
+    """Rates that differ by more than the tolerance: measured, expected, stated above the header."""
+    findings, tolerance = [], file.options.rate_tolerance_pct / 100
+    if rate_hz and expected_hz and abs(rate_hz / expected_hz - 1) > tolerance:
+        text = f"expected {expected_hz:g} Hz within {100 * tolerance:g} %, got {rate_hz:.6g} Hz; "
+        powers = [n for n in (-6, -3, 3, 6) if abs(rate_hz / expected_hz / 10.0**n - 1) < tolerance]
+        text += (
+            f"it is off by 10^{powers[0]}: check time_units"
+            if powers
+            else ("check the file's time, and samples and recording_s of the sensor")
+        )
+        findings.append(Finding("sample rate", REJECTED, text))
     # it is stated of the file's rows, not of those that are left of them
     match = _STATED_RATE.search(file.table.preamble) if keep.all() else None
-    stated_hz = float(match[1]) * (1e3 if match[2] else 1) if match else 0.0
+    stated_hz = float(match[1]) * (1e3 if match[2] else 1) if match else None
     hz, how = (rate_hz, "measured") if rate_hz else (expected_hz, "expected")
-    if not (stated_hz and hz and check_rate(hz, stated_hz, tolerance_pct)):
-        return findings
-    text = (
-        f"lines above the header state {stated_hz:g} Hz, {hz:.6g} Hz is {how}; give time_units, "
-        f"or, if it is right, trust: options {IN_READER}"
-    )
-    return *findings, Finding("stated rate", KEPT if file.options.trust else REJECTED, text)
+    if stated_hz and hz and abs(hz / stated_hz - 1) > tolerance:
+        text = f"lines above the header state {stated_hz:g} Hz, {hz:.6g} Hz is {how}; give "
+        text += f"time_units, or, if it is right, trust: options {IN_READER}"
+        outcome = KEPT if file.options.trust else REJECTED
+        findings.append(Finding("stated rate", outcome, text))
+    return (*findings,)

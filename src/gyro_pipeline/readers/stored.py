@@ -1,41 +1,29 @@
 """Stored arrays and columns as a table: NumPy, MATLAB, HDF5 and Parquet.
 
-A recording has more samples than columns: the longer side of an array is that of its rows.
+A recording has more samples than columns: the longer side of an array is that of its rows. What
+reads a kind of files is imported with the first of them, as most files are texts.
 """
 
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import AXES, InputError
+from gyro_pipeline.parameters import ReaderOptions
 from gyro_pipeline.readers import mat5
-from gyro_pipeline.readers.table import Table, column
+from gyro_pipeline.readers.table import Reader, Table, column
 
 
-def guarded(path: Path, read: Callable[[Path], Table]) -> Table:
-    """Read, and turn whatever a library raises on a damaged file into a message."""
-    try:
-        return read(path)
-    except InputError:
-        raise
-    except Exception as error:  # each of the libraries fails in many ways
-        raise InputError(
-            f"{path}: expected columns or arrays of numbers, but: "
-            f"{str(error)[:200] or type(error).__name__}; copy the file anew if it is damaged, or "
-            "save its columns of numbers alone"
-        ) from error
-
-
-def read_parquet(path: Path) -> Table:
+def read_parquet(path: Path, _: ReaderOptions) -> Table:
     """Read columns; units are in the attributes of the fields."""
+    import pyarrow as pa  # noqa: PLC0415
+    import pyarrow.parquet as pq  # noqa: PLC0415
+
     with pq.ParquetFile(path) as file:
         table = file.read(use_threads=False)
     names = tuple(_with_unit(field.name, field.metadata or {}) for field in table.schema)
@@ -46,13 +34,13 @@ def read_parquet(path: Path) -> Table:
     return Table(str(path), names, tuple(column(values.to_numpy()) for values in plain))
 
 
-def read_npy(path: Path) -> Table:
+def read_npy(path: Path, _: ReaderOptions) -> Table:
     """Read an array, of columns or of named fields."""
     # maps the file, so that a damaged header cannot ask for more memory than there is
-    return _of_arrays(path, np.lib.format.open_memmap(path, mode="r"))
+    return _of_arrays(path, {"": np.lib.format.open_memmap(path, mode="r")})
 
 
-def read_zip(path: Path) -> Table:
+def read_zip(path: Path, _: ReaderOptions) -> Table:
     """Read the named arrays of ``.npz``; those of objects are never unpickled."""
     with zipfile.ZipFile(path) as archive:
         members = archive.namelist()
@@ -69,17 +57,19 @@ def read_zip(path: Path) -> Table:
     return _of_arrays(path, arrays)
 
 
-def read_mat(path: Path) -> Table:
+def read_mat(path: Path, _: ReaderOptions) -> Table:
     """Read arrays and structures of MATLAB 5 to 7."""
-    import scipy.io  # noqa: PLC0415 - it starts slowly, and most files are texts
+    import scipy.io  # noqa: PLC0415
 
     mat5.check(path.read_bytes())
     variables = scipy.io.loadmat(path, simplify_cells=True)
     return _of_arrays(path, {k: v for k, v in variables.items() if not k.startswith("__")})
 
 
-def read_hdf5(path: Path) -> Table:
+def read_hdf5(path: Path, _: ReaderOptions) -> Table:
     """Read HDF5, as MATLAB 7.3 writes it too; groups named ``#…`` are what its cells refer to."""
+    import h5py  # noqa: PLC0415
+
     arrays: dict[str, NDArray[Any]] = {}
 
     def add(name: str, data: Any) -> None:
@@ -91,7 +81,7 @@ def read_hdf5(path: Path) -> Table:
     return _of_arrays(path, arrays)
 
 
-READERS: dict[bytes, Callable[[Path], Table]] = {
+READERS: dict[bytes, Reader] = {
     b"PAR1": read_parquet,
     b"\x93NUMPY": read_npy,
     b"PK": read_zip,
@@ -102,13 +92,13 @@ READERS: dict[bytes, Callable[[Path], Table]] = {
 """By the first bytes of a file."""
 
 
-def _of_arrays(path: Path, stored: Any) -> Table:
+def _of_arrays(path: Path, stored: Mapping[str, Any]) -> Table:
     """Name columns: ``t`` of a vector, ``gyro.x`` of three columns, ``all.0`` of more.
 
     What is in fields of arrays or structures is named by them: ``log.gyro`` is ``gyro`` of ``log``.
     """
-    columns: dict[str, NDArray[Any]] = {}
     arrays = dict(_arrays_in(stored, ""))
+    columns: dict[str, NDArray[Any]] = {}
     for name, array in arrays.items():
         rows = np.squeeze(array)
         if rows.size < 2 or rows.ndim > 2 or rows.dtype.kind not in "biufmMUS":  # noqa: PLR2004

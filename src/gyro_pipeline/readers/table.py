@@ -3,8 +3,10 @@
 A file is a table, or the option ``row`` makes it one. What a file is, its first bytes tell.
 """
 
+import io
 import re
 from collections.abc import Callable, Sequence
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +30,7 @@ class Table:
     """A file as named columns, all of them read.
 
     Attributes:
-        where: Path of the file, for messages.
+        where: Path of the file, for messages, and what may be wrong with its names.
         names: The header, with units in brackets where a row or an attribute of units gives them;
             an empty string for each column that it says nothing of.
         columns: Each (n,): float64, with NaN where a value is missing or cannot be read; objects,
@@ -37,7 +39,6 @@ class Table:
         preamble: Lines above the header.
         findings: Of the reading.
         place: Where a row is, for messages: ``row 5 (line 12)``, the row from 0.
-        hint: What may be wrong with the names, for messages that show them.
     """
 
     where: str
@@ -46,14 +47,12 @@ class Table:
     preamble: str = ""
     findings: tuple[Finding, ...] = ()
     place: Callable[[int], str] = "row {}".format
-    hint: str = ""
 
     def listed(self) -> str:
-        """The first thirty names for a message, and what may be wrong with them."""
+        """The first thirty names, for a message."""
         shown = ", ".join(repr(name[:40]) for name in self.names[:30])
         more = ", …" * (len(self.names) > 30)  # noqa: PLR2004
-        hint = f" ({self.hint})" if self.hint and not shown.isascii() else ""
-        return (shown + more if any(self.names) else "no header") + hint
+        return shown + more if any(self.names) else "no header"
 
     def numbers(self, column: int) -> NDArray[np.float64]:
         """The values of a column, (n,), for whoever needs numbers.
@@ -89,19 +88,9 @@ def column(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def columns_of(
-    names: Sequence[str],
-    texts: Sequence[Any],
-    place: Callable[[int], str],
-    decimal_point: str = ".",
+    names: Sequence[str], texts: Sequence[Any], place: Callable[[int], str], decimal_point: str
 ) -> tuple[tuple[NDArray[Any], ...], tuple[Finding, ...], set[int]]:
-    """Columns of a text; what is unreadable in those of numbers, and in which rows.
-
-    Args:
-        names: Of the columns, for the findings.
-        texts: Arrow strings, or numbers, of each column, (n,).
-        place: Where a row is.
-        decimal_point: A point or a comma.
-    """
+    """Columns of Arrow strings or numbers; what is unreadable in those of numbers; and its rows."""
     cells = [_of_texts(column, decimal_point) for column in texts]
     findings = []
     for number, (name, (values, bad)) in enumerate(zip(names, cells, strict=True)):
@@ -142,6 +131,8 @@ def few(bad: int, rows: int, least: int = 3, share: float = 0.01) -> bool:
     return bad <= max(least, share * rows)
 
 
+Reader = Callable[[Path, ReaderOptions], Table]
+
 _ADVICE = {
     (b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd", b"7z\xbc\xaf", b"Rar!", b"\x1f\x8b"): (
         "an archive; unpack it"
@@ -153,7 +144,6 @@ _ADVICE = {
         "data of R; save its table in R by `write.csv(TABLE, 'log.csv', row.names = FALSE)`"
     ),
 }
-_VEHICLES = (b"ULog\x01\x12\x35", b"#ROSBAG", b"\x89MCAP", b"SQLite format 3", b"\xa3\x95")
 
 
 def read_table(path: Path, options: ReaderOptions) -> Table:
@@ -163,24 +153,36 @@ def read_table(path: Path, options: ReaderOptions) -> Table:
         InputError: It cannot be read, is damaged or empty, is no table, or is of a kind that is
             not read; says what to do.
     """
-    from gyro_pipeline.readers import stored, text  # noqa: PLC0415 - they make tables
+    from gyro_pipeline.readers import stored, text, vehicles  # noqa: PLC0415 - they make tables
 
-    head = _head(path)
-    if head is None or head.startswith(_VEHICLES):
-        from gyro_pipeline.readers import vehicles  # noqa: PLC0415 - its libraries are optional
+    head, readers = _head(path), stored.READERS | vehicles.READERS
+    read = next((read for magic, read in readers.items() if head.startswith(magic)), None)
+    if read is None:
+        return text.read_text(path, options)
+    try:
+        # libraries print what they skip
+        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+            return read(path, options)
+    except InputError:
+        raise
+    except ImportError as error:
+        raise InputError(
+            f"{path}: expected the library {error.name}, which is not installed; type "
+            "pip install -e '.[logs]'"
+        ) from error
+    except Exception as error:  # each library has its own ways to fail at damaged bytes
+        raise InputError(
+            f"{path}: is damaged, cut or of an unknown version ({type(error).__name__}: "
+            f"{str(error)[:200]}); copy the file anew, a bag with its metadata.yaml, or save its "
+            "columns of numbers alone"
+        ) from error
 
-        return vehicles.read(path, options)
-    for magic, read in stored.READERS.items():
-        if head.startswith(magic):
-            return stored.guarded(path, read)
-    return text.read_text(path, options)
 
-
-def _head(path: Path) -> bytes | None:
-    """The first bytes of a file; None of the folder of a ROS 2 bag."""
+def _head(path: Path) -> bytes:
+    """The first bytes of a file; of a folder that is a bag of ROS 2, those of a bag."""
     try:
         if (path / "metadata.yaml").exists():
-            return None
+            return b"#ROSBAG"
         with path.open("rb") as file:
             head = file.read(64)
     except OSError as error:

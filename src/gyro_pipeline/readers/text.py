@@ -8,14 +8,12 @@ that has another number of fields is a damaged row.
 import codecs
 import csv
 import re
-from collections.abc import Sequence
-from dataclasses import replace
-from functools import cache
-from itertools import pairwise
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import chain, pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 
@@ -28,19 +26,55 @@ from gyro_pipeline.readers.table import IN_READER, Table, columns_of, few
 DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab", " ": "blanks"}
 
 _HEAD = 1 << 14  # bytes that tell the layout
+_SAMPLE = 50  # rows of the head that tell decimal commas and columns of texts
 _LEAST = 3  # numbers in a row
-_COMMENT, _SENTENCE = ("#", "%", "//"), ("$", "!")  # NMEA 0183 begins sentences so
+_COMMENT = ("#", "%", "//")
+_NO_ROW = (*_COMMENT, "$", "!")  # NMEA 0183 begins sentences so
 _MISSING = ["", " ", "NA", "N/A", "null", "NULL", "None"]
 
+Row = list[str]
 
-class _Layout(NamedTuple):
+
+@dataclass(frozen=True)
+class _Rows:
+    """Rows of a text, and how they are laid out."""
+
+    where: str
     names: tuple[str, ...]  # the header, as long as a row; all empty where there is none
     preamble: str  # the lines above it
     above: int  # how many lines of the file are above the rows
+    body: memoryview
     delimiter: str  # a blank stands for runs of them
     decimal_point: str
     quoted: bool  # if fields are not in quotes, a stray quote is one more damaged field
-    texts: list[int]  # columns that are not of numbers alone in the head
+    texts: list[bool]  # whether a column is not of numbers alone in the head
+
+    @cached_property  # needed only where rows are damaged
+    def numbered(self) -> list[tuple[int, bytes]]:
+        """Numbers of lines from 1, and lines, without blank ones."""
+        lines = enumerate(bytes(self.body).splitlines(), self.above + 1)
+        return [(number, line) for number, line in lines if line.strip()]
+
+    def line(self, row: int) -> str:
+        """The text of a row."""
+        return self.numbered[row][1].decode("utf-8", "replace")
+
+    def place(self, row: int) -> str:
+        """Where a row is, for messages."""
+        return f"row {row} (line {self.numbered[row][0]})"
+
+    def repaired(self) -> tuple[bytes, dict[int, str]]:
+        """The body with empty rows for those of another number of fields, and what is wrong."""
+        width, lines, sign = len(self.names), [line for _, line in self.numbered], self.delimiter
+        fields = [line.count(sign.encode()) + 1 for line in lines]
+        if self.quoted:
+            fields = [len(_split(self.line(n), sign, strict=True)) for n in range(len(lines))]
+        odd = {row: count for row, count in enumerate(fields) if count != width}
+        for row in odd:
+            lines[row] = sign.encode() * (width - 1)
+        problem = f"expected {width} fields, got"
+        problems = {row: f"{problem} {count or 'damaged quotes'}" for row, count in odd.items()}
+        return b"\n".join(lines).decode("utf-8", "replace").encode(), problems
 
 
 def read_text(path: Path, options: ReaderOptions) -> Table:
@@ -49,17 +83,77 @@ def read_text(path: Path, options: ReaderOptions) -> Table:
     Raises:
         InputError: It is not a text, or not one of rows that are told apart safely.
     """
-    text, hint = _decoded(path, options.encoding)
+    where, text = _decoded(path, options.encoding)
+    if options.row is not None:
+        return read_lines(where, text, options.row)
+    rows, odd = _rows(where, text, options.delimiter), dict[int, str]()
     try:
-        if options.row is not None:
-            return read_lines(str(path), text, options.row)
-        return replace(_read_rows(str(path), text, options.delimiter), hint=hint)
-    except InputError as error:
-        raise InputError(f"{error}; {hint}" if hint else str(error)) from error
+        arrays = _parsed(rows.body, rows, pa.float64())
+    except pa.ArrowInvalid:
+        body, odd = rows.repaired()
+        arrays = _parsed(body, rows, None)
+    columns, findings, damaged = columns_of(rows.names, arrays, rows.place, rows.decimal_point)
+    _refuse_headers(rows, sorted(damaged | {*odd}))
+    findings += _damage(rows, odd)
+    return Table(where, rows.names, columns, rows.preamble, findings, rows.place)
 
 
-def _decoded(path: Path, encoding: str | None) -> tuple[bytes, str]:
-    """The text in UTF-8, and what to say of its names if they look odd."""
+def _parsed(body: memoryview | bytes, rows: _Rows, number: pa.DataType | None) -> list[Any]:
+    """Columns as Arrow reads them; those of numbers are of one type, or else of whatever they hold.
+
+    Raises:
+        pyarrow.ArrowInvalid: A value is not of its type, or a row has another number of fields.
+    """
+    types = {str(n): pa.string() if is_text else number for n, is_text in enumerate(rows.texts)}
+    table = pyarrow.csv.read_csv(
+        pa.BufferReader(pa.py_buffer(body)),
+        pyarrow.csv.ReadOptions(
+            use_threads=False,
+            block_size=min(len(body) + 1, 2**31 - 1),  # so that no line is too long
+            column_names=[*types],
+        ),
+        pyarrow.csv.ParseOptions(delimiter=rows.delimiter, quote_char=rows.quoted and '"'),
+        pyarrow.csv.ConvertOptions(
+            column_types={name: kind for name, kind in types.items() if kind},
+            null_values=_MISSING,
+            strings_can_be_null=True,
+            decimal_point=rows.decimal_point,
+        ),
+    )
+    return list(table.columns)
+
+
+def _refuse_headers(rows: _Rows, damaged: list[int]) -> None:
+    """Refuse a second header among damaged rows; a message that has delimiters in it is none."""
+    for row in damaged[:100]:
+        fields = _split(rows.line(row), rows.delimiter)
+        same = len(fields) == len(rows.names) or _filled(fields) == _filled([*rows.names])
+        if same and not _is_row(fields):
+            raise InputError(
+                f"{rows.where}: expected numbers, got a second header in {rows.place(row)}, "
+                f"{rows.line(row)[:80]!r}: two recordings in one file? Split it"
+            )
+
+
+def _damage(rows: _Rows, odd: dict[int, str]) -> tuple[Finding, ...]:
+    """Say that a few rows have another number of fields, or refuse more."""
+    if not odd:
+        return ()
+    count = len(rows.numbered)
+    shown = "; ".join(f"{rows.place(row)}: {problem}" for row, problem in [*odd.items()][:3])
+    if few(len(odd), count) and len(odd) < count - 1:
+        detail = f"{len(odd)} of {count} rows cannot be read and are NaN: {shown}"
+        return (Finding("unreadable rows", REPAIRED, detail),)
+    raise InputError(
+        f"{rows.where}: expected rows of {len(rows.names)} columns, separated by "
+        f"{_spelt(rows.delimiter)}, got {len(odd)} of {count} that are not: {shown}; correct or "
+        "export the file anew, or, if other lines stand between the rows, "
+        f"{advice([rows.line(row) for row in range(min(count, 200))])}"
+    )
+
+
+def _decoded(path: Path, encoding: str | None) -> tuple[str, bytes]:
+    """The path, for messages, and the text in UTF-8, but for damaged bytes."""
     data = path.read_bytes()
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         encoding = encoding or "utf-16"
@@ -73,224 +167,133 @@ def _decoded(path: Path, encoding: str | None) -> tuple[bytes, str]:
             f"{path}: expected a text, got binary data, or UTF-16 without byte order mark; export "
             f"the recording as CSV in UTF-8, or give `encoding: utf-16-le` {IN_READER}"
         )
-    if data.isascii():
-        return data, ""
     try:
         data[: data.rfind(b"\n", 0, _HEAD) + 1].decode()
     except UnicodeDecodeError:
-        hint = f"the text is not UTF-8: if names look odd, give `encoding`, as gbk, {IN_READER}"
-        return data.decode("cp1252", "replace").encode(), hint
-    return data.decode("utf-8", "replace").encode(), ""  # a damaged byte is no other encoding
+        hint = f"not UTF-8: if names look odd, give `encoding`, such as gbk, {IN_READER}"
+        return f"{path} ({hint})", data.decode("cp1252", "replace").encode()
+    return str(path), data
 
 
-def _read_rows(where: str, text: bytes, delimiter: str | None) -> Table:
-    layout = _layout(where, text, delimiter)
-    start = sum(map(len, text[:_HEAD].splitlines(keepends=True)[: layout.above]))
-    body = memoryview(text)[start:]  # not a copy
-    if layout.delimiter == " ":
-        body = memoryview(b"\n".join(b" ".join(row.split()) for row in bytes(body).splitlines()))
-
-    @cache  # needed only where rows are damaged
-    def lines() -> list[tuple[int, str]]:
-        numbered = enumerate(bytes(body).splitlines(), layout.above + 1)
-        return [(number, row.decode()) for number, row in numbered if row.strip()]
-
-    def place(row: int) -> str:
-        return f"row {row} (line {lines()[row][0]})"
-
-    arrays, odd = _parse(body, layout)
-    columns, findings, damaged = columns_of(layout.names, arrays, place, layout.decimal_point)
-    for row in sorted(damaged | {*odd})[:100]:
-        if _is_header(_split(lines()[row][1], layout.delimiter), layout.names):
-            raise InputError(
-                f"{where}: expected numbers, got a second header in {place(row)}, "
-                f"{lines()[row][1][:80]!r}: two recordings in one file? Split it"
-            )
-    if odd:
-        shown = "; ".join(f"{place(row)}: {problem}" for row, problem in [*odd.items()][:3])
-        findings += (_odd_rows(where, layout, len(odd), shown, [row for _, row in lines()]),)
-    return Table(where, layout.names, columns, layout.preamble, findings, place)
-
-
-def _odd_rows(where: str, layout: _Layout, odd: int, shown: str, rows: list[str]) -> Finding:
-    """Say that a few rows have another number of fields, or refuse more."""
-    if few(odd, len(rows)) and odd < len(rows) - 1:
-        detail = f"{odd} of {len(rows)} rows cannot be read and are NaN: {shown}"
-        return Finding("unreadable rows", REPAIRED, detail)
-    raise InputError(
-        f"{where}: expected rows of {len(layout.names)} columns, separated by "
-        f"{DELIMITERS.get(layout.delimiter, repr(layout.delimiter))}, got {odd} of {len(rows)} "
-        f"that are not: {shown}; correct or export the file anew, or, if other lines stand between "
-        f"the rows, {advice(rows[:200])}"
-    )
-
-
-def _parse(body: memoryview, layout: _Layout) -> tuple[list[Any], dict[int, str]]:
-    """Let Arrow split rows; what it does not take for a number is a text.
-
-    Returns:
-        Arrow's columns, and what is wrong with rows of another number of fields, by row, which are
-        null in them.
-    """
-    skipped: list[Any] = []
-
-    def skip(row: Any) -> str:
-        skipped.append(row)
-        return "skip"
-
-    table = pyarrow.csv.read_csv(
-        pa.BufferReader(pa.py_buffer(body)),
-        pyarrow.csv.ReadOptions(
-            use_threads=False,
-            block_size=min(len(body) + 1, 2**31 - 1),  # so that no line is too long
-            column_names=[str(number) for number in range(len(layout.names))],
-        ),
-        pyarrow.csv.ParseOptions(
-            delimiter=layout.delimiter,
-            quote_char='"' if layout.quoted else False,
-            invalid_row_handler=skip,
-        ),
-        pyarrow.csv.ConvertOptions(
-            column_types={str(number): pa.string() for number in layout.texts},
-            null_values=_MISSING,
-            strings_can_be_null=True,
-            decimal_point=layout.decimal_point,
-        ),
-    )
-    blank = np.cumsum([not row.text.strip() for row in skipped])  # lines of blanks are no rows
-    odd = {
-        row.number - 1 - before: f"expected {row.expected_columns} fields, got {row.actual_columns}"
-        for row, before in zip(skipped, blank.tolist(), strict=True)
-        if row.text.strip()
-    }
-    if not odd:
-        return table.columns, odd
-    rows = np.insert(np.arange(table.num_rows + 0.0), [*odd] - np.arange(len(odd)), np.nan)
-    return table.take(pa.array(rows, pa.int64(), from_pandas=True)).columns, odd
-
-
-def _layout(where: str, text: bytes, delimiter: str | None) -> _Layout:
+def _rows(where: str, text: bytes, delimiter: str | None) -> _Rows:
     """Tell the layout of a text: by which delimiter a row has most numbers, blanks last.
 
     Raises:
         InputError: There are no rows, or they cannot be told safely.
     """
-    numbered = _head(text)
+    head = text[:_HEAD]
+    if len(text) > _HEAD:  # without a line that is cut
+        head = head[: 1 + max(head.rfind(b"\n"), head.rfind(b"\r"))] or head
+    whole = head.splitlines(keepends=True)
+    decoded = enumerate(line.decode("utf-8", "replace").strip("\r\n") for line in whole)
+    numbered = {number: line for number, line in decoded if line.strip()}
     lines = [*numbered.values()]
     delimiters = [delimiter] if delimiter else [*DELIMITERS]
-    starts: dict[str, tuple[int, int, int]] = {}
-    for sign in delimiters:
-        if (sign != " " or not starts) and (start := _first_row(lines, sign)):
-            starts[sign] = start
+    there = [sign for sign in delimiters if sign.encode() in head]
+    starts = {sign: start for sign in there if (start := _first_row(lines, sign))}
     if not starts:
-        number, line = next(iter(numbered.items()), (1, ""))
+        number, line = next(iter(numbered.items()), (0, ""))
         raise InputError(
             f"{where}: expected two rows or more of three numbers or more, separated by "
-            f"{' or '.join(DELIMITERS.get(d, repr(d)) for d in delimiters)}, got none in the "
-            f"first {len(lines)} lines; line {number} begins {line[:60]!r}; {advice(lines)}"
+            f"{' or '.join(map(_spelt, delimiters))}, got none in the "
+            f"first {len(lines)} lines; line {number + 1} begins {line[:60]!r}; {advice(lines)}"
         )
-    delimiter = max(starts, key=lambda sign: starts[sign][-1])
+    delimiter = max(starts, key=lambda sign: (sign != " ", starts[sign][-1]))
     first, width, _ = starts[delimiter]
-    rows = [_split(line, delimiter) for line in lines[first : first + 50]]
-    rows = [row for row in rows if len(row) == width]
-    names, above = _header(where, lines[:first], rows, delimiter)
-    return _Layout(
+    samples = [_split(line, delimiter) for line in lines[first : first + _SAMPLE]]
+    columns = list(zip(*(row for row in samples if len(row) == width), strict=True))
+    used = max(number for number, column in enumerate(columns, 1) if any(column))
+    names, preamble = _header(where, lines[:first], delimiter, width, used)
+    above = [*numbered][first]
+    body = memoryview(text)[sum(map(len, whole[:above])) :]  # not a copy
+    if delimiter == " ":
+        body = memoryview(b"\n".join(b" ".join(row.split()) for row in bytes(body).splitlines()))
+    return _Rows(
+        where=where,
         names=names,
-        preamble="\n".join(above),
-        above=[0, *numbered][first],
+        preamble="\n".join(preamble),
+        above=above,
+        body=body,
         delimiter=delimiter,
-        decimal_point=_decimal_point(where, [field for row in rows for field in row]),
+        decimal_point=_decimal_point(where, [*chain(*columns)]),
         quoted='"' in lines[first],
-        texts=[n for n in range(width) if not all(_is_number(row[n]) for row in rows)],
+        texts=[not _are_numbers(*column) for column in columns],
     )
 
 
-def _head(text: bytes) -> dict[int, str]:
-    """The lines in the head of a text that are not blank, whole if others follow them."""
-    head = text[:_HEAD]
-    if len(text) > _HEAD:
-        head = head[: 1 + max(head.rfind(b"\n"), head.rfind(b"\r"))] or head
-    lines = enumerate(head.decode("utf-8", "replace").encode().splitlines(), 1)
-    return {number: line.decode() for number, line in lines if line.strip()}
+def _spelt(delimiter: str) -> str:
+    return DELIMITERS.get(delimiter, repr(delimiter))
 
 
-def _split(line: str, delimiter: str) -> list[str]:
-    """Fields without quotes and outer blanks; none if the line cannot be split."""
+def _split(line: str, delimiter: str, strict: bool = False) -> Row:
+    """Fields without quotes and outer blanks; none if strict and quotes are damaged."""
     if delimiter == " ":
         return line.split()
-    try:
-        return [field.strip() for field in next(csv.reader([line], delimiter=delimiter), [])]
-    except csv.Error:  # a field beyond csv's limit
-        return []
+    fields = line.split(delimiter)
+    if '"' in line:
+        try:
+            fields = next(csv.reader([line], delimiter=delimiter, strict=strict))
+        except csv.Error:  # an open quote, or a field beyond csv's limit
+            return []
+    return [field.strip() for field in fields]
 
 
-def _is_number(field: str) -> bool:
-    """Whether it is a number, with a point or a comma, or NaN or infinity."""
+def _are_numbers(*fields: str) -> bool:
+    """Whether all are numbers, with a point or a comma, or NaN or infinity."""
     try:
-        float(field.replace(",", "."))
+        for field in fields:
+            float(field.replace(",", "."))
     except ValueError:
         return False
     return True
 
 
-def _are_names(fields: Sequence[str]) -> bool:
-    """Whether these are names of columns rather than a row, be it a damaged one."""
-    filled = [field.lstrip("[(") for field in fields if field]
-    words = [field for field in filled if field[:1].isalpha() and not _is_number(field)]
-    return len(words) > max(1, len(filled) // 2)
+def _is_row(fields: Row) -> bool:
+    """Whether three or half of the fields are numbers, times or dates; else they are names."""
+    filled = [field for field in fields if field]
+    return sum(map(_is_figure, filled)) >= min(_LEAST, max(1, len(filled) / 2))
 
 
-def _is_header(fields: list[str], names: Sequence[str]) -> bool:
-    """Whether a line below the header is another one, not a message that has delimiters in it."""
-    same = len(fields) == len(names) or _filled(fields) == _filled([*names])
-    return same and _are_names(fields)
+def _is_figure(field: str) -> bool:
+    return field[0] in "+-.0123456789" or _are_numbers(field)
 
 
 def _first_row(lines: list[str], delimiter: str) -> tuple[int, int, int] | None:
     """The index of the first row, and how many fields and numbers rows have; None without rows."""
-    rows = [(0, 0)]  # fields and numbers of the lines
+    shapes = [(0, 0)]  # fields and numbers of rows; no fields of other lines
     for line in lines:
-        rows.append(_counts(line, delimiter))
-        width, numbers = rows[-1][0], max(rows[-1][1], rows[-2][1])
-        if width == rows[-2][0] and numbers >= _LEAST:
+        may_be = delimiter in line and not line.lstrip().startswith(_NO_ROW)
+        fields = _split(line, delimiter) if may_be else []
+        # words between blanks are a sentence
+        is_row = all(map(_is_figure, fields)) if delimiter == " " else _is_row(fields)
+        is_row = is_row and len(fields) >= _LEAST
+        shapes.append((len(fields), sum(map(_are_numbers, fields))) if is_row else (0, 0))
+        width, numbers = shapes[-1][0], max(shapes[-2][1], shapes[-1][1])
+        if width == shapes[-2][0] and numbers >= _LEAST:
             break
     else:
         return None
-    at = len(rows) - 3
-    while rows[at][0]:  # a row of which numbers are missing, or a damaged one
-        at -= 1
-    first = [field for field in _split(lines[at], delimiter) if _is_number(field)]
-    numbered = at == 0 and first == [str(number) for number in range(len(first))]  # by pandas
-    return at + numbered, width, numbers
-
-
-def _counts(text: str, delimiter: str) -> tuple[int, int]:
-    """How many fields a row has, and how many of them are numbers; no fields if it is no row."""
-    if delimiter not in text or text.lstrip().startswith(_COMMENT + _SENTENCE):
-        return 0, 0
-    fields = _split(text, delimiter)
-    numbers = sum(map(_is_number, fields))
-    figures = [field[:1] in "+-.0123456789" for field in fields if field]  # times and dates, too
-    if delimiter == " ":  # words between blanks are a sentence
-        is_row = all(figures) or numbers == len(fields)
-    else:
-        is_row = numbers >= _LEAST or (any(figures) and not _are_names(fields))
-    return (len(fields), numbers) if is_row and len(fields) >= _LEAST else (0, 0)
+    first = len(shapes) - 3
+    while shapes[first][0]:  # a row of which numbers are missing, or a damaged one
+        first -= 1
+    by_pandas = [field for field in _split(lines[first], delimiter) if _are_numbers(field)]
+    is_header = first == 0 and by_pandas == [str(number) for number in range(len(by_pandas))]
+    return first + is_header, width, numbers
 
 
 def _header(
-    where: str, above: list[str], rows: list[list[str]], delimiter: str
+    where: str, above: list[str], delimiter: str, width: int, used: int
 ) -> tuple[tuple[str, ...], list[str]]:
     """The names, of the nearest line above the rows that is as wide as they, and the lines left.
 
-    A row of units, and a row of names that span columns, belong to it.
+    A row of units, and rows of names that span columns, belong to it. Of the ``width`` fields of a
+    row the first ``used`` are not empty at its end.
     """
-    width, used = len(rows[0]), max(len(_filled(row)) for row in rows)
+    bare = [line.lstrip("#%/ ") for line in above]
     for at in reversed(range(len(above))):
-        fields = _names(above[at], delimiter, width, used)
-        names = _filled(fields)
-        if _fit(fields, width, used):
+        if names := _names(bare[at], delimiter, width, used):
             break
+        names = _filled(_split(bare[at], delimiter))
         if len(names) >= _LEAST and not above[at].lstrip().startswith(_COMMENT):
             raise InputError(
                 f"{where}: expected a header of as many columns as the rows, {used}, got "
@@ -299,8 +302,7 @@ def _header(
             )
     else:
         return ("",) * width, above
-    names, units = (names + [""] * width)[:width], [""] * width
-    upper = [_split(line.lstrip("#%/ "), delimiter) for line in above[:at]]
+    upper, units = [_split(line, delimiter) for line in bare[:at]], [""] * width
     # neighbours have the same unit but different axes: names repeated side by side are units
     if upper and len(upper[-1]) == width and any(a == b != "" for a, b in pairwise(names)):
         names, units = upper.pop(), [unit.strip("[]() ") for unit in names]
@@ -310,26 +312,26 @@ def _header(
     return tuple(names), above[: len(upper)] + above[at + 1 :]
 
 
-def _filled(fields: list[str]) -> list[str]:
+def _names(line: str, delimiter: str, width: int, used: int) -> Row:
+    """The names in a header, as many as rows have fields; none if they do not fit.
+
+    NumPy and others write it by a delimiter of its own. One too many or too few would shift names.
+    """
+    rows = [_split(line, sign) for sign in (delimiter, *DELIMITERS)]
+    rows.append(re.findall(r"[^\s(\[]\S*(?:\s+[(\[][^)\]]*[)\]])?", line))  # gx (deg/s) is one
+    for fields in rows:
+        names = _filled(fields)
+        if len(names) == used or (len(fields) == width and "" not in names):
+            return (names + [""] * width)[:width]
+    return []
+
+
+def _filled(fields: Row) -> Row:
     """Fields without empty ones at the end: a delimiter at the end of a line is no column."""
     return fields[: max((n for n, field in enumerate(fields, 1) if field), default=0)]
 
 
-def _fit(fields: list[str], width: int, used: int) -> bool:
-    """Whether names are those of rows; a delimiter too many or too few would shift them."""
-    names = _filled(fields)
-    return len(names) == used or (len(fields) == width and "" not in names)
-
-
-def _names(text: str, delimiter: str, width: int, used: int) -> list[str]:
-    """Names in a header; NumPy and others write it as a comment, and by a delimiter of its own."""
-    text = text.lstrip("#%/ ")
-    ways = [_split(text, d) for d in (delimiter, ",", ";", "\t")]
-    ways.append(re.findall(r"[^\s(\[]\S*(?:\s+[(\[][^)\]]*[)\]])?", text))  # gx (deg/s) is one
-    return next((fields for fields in ways if _fit(fields, width, used)), ways[0])
-
-
-def _joined(upper: Sequence[str], lower: Sequence[str]) -> list[str]:
+def _joined(upper: Row, lower: Row) -> Row:
     """Two rows of a header as one: a name carries on over the empty fields beside it.
 
     Its unit stays behind the axis: ``Gyro (rad/s)`` above ``X`` is ``Gyro X (rad/s)``.
@@ -342,7 +344,7 @@ def _joined(upper: Sequence[str], lower: Sequence[str]) -> list[str]:
     return joined
 
 
-def _decimal_point(where: str, fields: list[str]) -> str:
+def _decimal_point(where: str, fields: Row) -> str:
     """A comma where numbers have one that cannot separate thousands."""
     pattern = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
     commas = [field for field in fields if "," in field and pattern.fullmatch(field)]

@@ -58,8 +58,9 @@ def are_steps(values: NDArray[np.float64]) -> bool:
     values = values[np.isfinite(values)]
     change = np.diff(values[1:])  # a first row has no last one, so it may hold anything
     rises, falls = np.count_nonzero(change > 0), np.count_nonzero(change < 0)
-    alike = rises <= 3 * falls and falls <= 3 * rises
-    return bool(len(change) and (values >= 0).all() and np.median(values) > 0 and alike)
+    if not len(change) or rises > 3 * falls or falls > 3 * rises:
+        return False
+    return bool((values >= 0).all() and np.median(values) > 0)
 
 
 def _of_parts(parts: dict[str, pa.Array]) -> NDArray[np.float64] | None:

@@ -27,7 +27,8 @@ _WORTH_PROCESSES = 10**8
 _AT_ONCE, _BYTES_AT_ONCE = 16, 16 * 10**6
 """Recordings, and bytes of them, that go to a process together, and come back so."""
 _OF_USED = ("start", "stop", "masked")
-"""Columns of recordings that are used."""
+_COLUMNS = ("imu", "recording", "where", "outcome", "rows", *_OF_USED)
+"""What the table has of each recording, and the part that rejected ones lack."""
 
 
 def inspect_logs(
@@ -87,22 +88,15 @@ def quality_table(files: Logs, inspected: Sequence[Recording]) -> pd.DataFrame:
     """
     rows = []
     for recording in _without_copies(inspected):
-        used = recording.outcome != REJECTED
         findings = [f"{finding.check}: {finding.detail}" for finding in recording.findings]
-        rows.append(
-            {
-                "sensor": files.sensor,
-                "imu": recording.imu,
-                "recording": recording.recording,
-                "file": recording.where,
-                "outcome": recording.outcome,
-                "rows": recording.rows,
-                **{name: getattr(recording, name) if used else None for name in _OF_USED},
-                "rate_hz": _rounded(recording.rate_hz),
-                "findings": "; ".join(findings) or None,
-            }
-        )
-    return pd.DataFrame(rows).astype(dict.fromkeys(_OF_USED, "Int64"))
+        row = {name: getattr(recording, name) for name in _COLUMNS}
+        if recording.outcome == REJECTED:
+            row |= dict.fromkeys(_OF_USED)
+        rate_hz = _rounded(recording.rate_hz)
+        rows.append(row | {"rate_hz": rate_hz, "findings": "; ".join(findings) or None})
+    table = pd.DataFrame(rows).rename(columns={"where": "file"})
+    table.insert(0, "sensor", files.sensor)
+    return table.astype(dict.fromkeys(_OF_USED, "Int64"))
 
 
 def label_recordings(
@@ -147,7 +141,8 @@ def label_recordings(
         # the reader has rejected those whose rate is far from the expected one
         "rate_hz": _rounded(measured.median()) if len(measured) else files.rate_hz,
     }
-    contents = [[*one.place, one.content] for one in inspected if one.place in used.index]
+    places = set(used.index)
+    contents = [[*one.place, one.content] for one in inspected if one.place in places]
     attributes["data_hash"] = fingerprint([attributes, contents])
     labels = xr.Dataset({"samples": (("imu", "recording"), samples)}, coordinates, attributes)
     if files.drawn is not None:
