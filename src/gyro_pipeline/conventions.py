@@ -33,6 +33,9 @@ MDPS = 1e-3
 TRAIN, VALIDATION, TEST = "train", "validation", "test"
 """The roles of windows and recordings."""
 
+UNSEEN = 0
+"""In place of the number of an IMU, of which the first is 1: any that is not there."""
+
 UNUSED = ""
 """The role of a window that has none in a fold."""
 

@@ -88,10 +88,14 @@ def test_a_split_that_the_source_gives_is_used(parameters):
 
 def test_the_seed_chooses_validation_recordings_and_no_test_ones(parameters):
     first, other = (
-        split_recordings(range(100), range(100), parameters("base", splits={"split_seed": s}).splits)
+        split_recordings(
+            range(100), range(100), parameters("base", splits={"split_seed": s}).splits
+        )
         for s in (1, 2)
     )
-    validation = [{n for n, role in roles.items() if role == VALIDATION} for roles in (first, other)]
+    validation = [
+        {n for n, role in roles.items() if role == VALIDATION} for roles in (first, other)
+    ]
     assert validation[0] != validation[1]
     assert all(first[n] == other[n] == TEST for n in range(80, 100))
 
@@ -129,7 +133,9 @@ def test_every_device_in_turn_is_unseen(make, parameters, make_study):
     for imu in (1, 3):
         assert numbers(table, TRAIN, "without IMU 2", imu) == list(range(1, 81))
     few = table_of(make(3, splits), parameters, make_study, protocol="leave_one_device_out")
-    assert numbers(few, TEST, "without IMU 1") == numbers(few, TRAIN, "without IMU 1", 2) == [1, 2, 3]
+    assert (
+        numbers(few, TEST, "without IMU 1") == numbers(few, TRAIN, "without IMU 1", 2) == [1, 2, 3]
+    )
     with pytest.raises(InputError, match="expected at least 2 IMUs, got 1; bring recordings"):
         table_of(make(3, splits, imus=1), parameters, make_study, protocol="leave_one_device_out")
 
@@ -138,7 +144,8 @@ def test_every_device_in_turn_is_unseen(make, parameters, make_study):
 
 
 @pytest.mark.parametrize(
-    ("training_windows", "starts"), [("all", [0, 200, 400]), ("first", [0]), (5.0, range(0, 401, 100))]
+    ("training_windows", "starts"),
+    [("all", [0, 200, 400]), ("first", [0]), (5.0, range(0, 401, 100))],
 )
 def test_training_windows_are_all_the_first_or_at_a_stride(
     make, parameters, make_study, training_windows, starts
@@ -160,7 +167,9 @@ def test_the_leak_studys_windows_test_once_each(make, parameters, make_study, pr
         train, test = (set(rows.recording[rows.role == role]) for role in (TRAIN, TEST))
         assert bool(train & test) == (protocol == "window_split")
         if protocol == "best_epoch_on_test":
-            places = [rows[rows.role == role][["recording", "start"]] for role in (VALIDATION, TEST)]
+            places = [
+                rows[rows.role == role][["recording", "start"]] for role in (VALIDATION, TEST)
+            ]
             assert places[0].to_numpy().tolist() == places[1].to_numpy().tolist()
 
 
@@ -178,8 +187,11 @@ def test_a_copy_with_another_role_is_refused(make, parameters, make_study):
     recordings.angular_rate.loc[{"imu": 2, "recording": 3}] = recordings.angular_rate.sel(
         imu=1, recording=90
     )
-    with pytest.raises(InputError, match=r"IMU 1 recording 90 \(test\) holds the same samples as|"
-                       r"IMU 2 recording 3 \(train\) holds"):
+    with pytest.raises(
+        InputError,
+        match=r"IMU 1 recording 90 \(test\) holds the same samples as|"
+        r"IMU 2 recording 3 \(train\) holds",
+    ):
         table_of(recordings, parameters, make_study)
 
 

@@ -49,8 +49,8 @@ class TrainingSet:
         virtual: The same of virtual IMUs, where there are windows of them.
         windows: Rows ``role`` (train or validation), ``origin, imu, recording, start``.
         size: Samples of a window.
-        device: The IMU whose windows will be seen. If none of its windows trains, or it is None,
-            it is an unseen one, and the others tell what devices are like.
+        device: The IMU whose windows will be seen. If none of its windows trains, or it is
+            UNSEEN, it is an unseen one, and the others tell what devices are like.
         side_by_side: IMUs whose windows are seen together (method 1), the device first.
 
     Attributes:
@@ -66,7 +66,7 @@ class TrainingSet:
         virtual: xr.Dataset | None,
         windows: pd.DataFrame,
         size: int,
-        device: int | None,
+        device: int,
         side_by_side: Sequence[int] = (),
     ) -> None:
         self.real, self.virtual, self.windows = real, virtual, _sorted(windows, device)

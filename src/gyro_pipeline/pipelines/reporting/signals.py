@@ -211,7 +211,8 @@ def _draw_allan(ax: Axes, allan: xr.Dataset, noise: pd.DataFrame) -> None:
 
 def _first(bias: pd.DataFrame) -> pd.Series:
     """The first axis of the first IMU, in its first recording."""
-    return bias[(bias.imu == bias.imu.min()) & (bias.axis == AXES[0])].sort_values("recording").iloc[0]
+    own = bias[(bias.imu == bias.imu.min()) & (bias.axis == AXES[0])]
+    return own.sort_values("recording").iloc[0]
 
 
 def _samples(recordings: xr.Dataset, one: pd.Series) -> NDArray[np.float64]:

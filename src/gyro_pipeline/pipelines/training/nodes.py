@@ -16,6 +16,7 @@ from gyro_pipeline.conventions import (
     ORIGIN_REAL,
     ORIGIN_VIRTUAL,
     TEST,
+    UNSEEN,
     InputError,
 )
 from gyro_pipeline.estimators import entry, estimator_class, make_estimator
@@ -57,7 +58,7 @@ class TrainingSets:
         if (key, counts) not in self._made:
             rows = self.table_of(spec)
             tested = rows.imu[rows.role == TEST].unique()
-            only = int(tested[0]) if len(tested) == 1 else None  # else an unseen device
+            only = int(tested[0]) if len(tested) == 1 else UNSEEN
             self._made[key, counts] = {
                 str(fold): self._training_set(spec, own, only)
                 for fold, own in rows.groupby("fold", observed=True, sort=False)
@@ -71,7 +72,7 @@ class TrainingSets:
         chosen &= (w.window_s == spec.window_s) & (w.window_stride_s == spec.window_stride_s)
         return w[chosen]
 
-    def _training_set(self, spec: RunSpec, rows: pd.DataFrame, tested: int | None) -> TrainingSet:
+    def _training_set(self, spec: RunSpec, rows: pd.DataFrame, tested: int) -> TrainingSet:
         """What a fold trains on; the tested IMU first, where it trains, then others in order."""
         tests = rows.imu[rows.role == TEST].unique()
         device = int(tests[0]) if len(tests) else tested
