@@ -202,6 +202,8 @@ class Ridge(_Linear):
                 given = inputs[axis, chosen], aim[axis, chosen], groups[chosen]
                 line = LinearEstimate(edges, *ridge_regression(*given), np.nan)
                 self._fitted[axis, target, start] = line
+        if not self._fitted:
+            raise InputError("expected two training recordings with windows at the same time")
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
         self._demand_size(windows, self._size)
