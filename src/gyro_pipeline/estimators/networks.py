@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gyro_pipeline.conventions import ALL, BIAS, RECORDING_MEAN
+from gyro_pipeline.conventions import BIAS, REAL, RECORDING_MEAN
 from gyro_pipeline.estimators.base import Estimator, Windows
 from gyro_pipeline.estimators.linear import BestLinear
 from gyro_pipeline.estimators.training import ImuRecordings, TrainingSet
@@ -65,7 +65,7 @@ class ResidualNetwork(Estimator):
         warm_up: See :class:`BestLinear`; by default the recordings say.
     """
 
-    uses = ALL
+    uses = REAL  # virtual recordings follow the model, so they would teach it nothing
     fewest_recordings = FEWEST_RECORDINGS
     recommended = True
     uses_prior = True
