@@ -197,5 +197,5 @@ def _left_out(plans: Iterable[pd.DataFrame | Missing]) -> set[RunSpec]:
         RunSpec(**{name: row[name] for name in RunSpec.names()})
         for plan in plans
         if isinstance(plan, pd.DataFrame)
-        for row in plan[plan[LEFT_OUT].fillna("") != ""].to_dict("records")
+        for row in plan[plan[LEFT_OUT].notna()].to_dict("records")
     }
