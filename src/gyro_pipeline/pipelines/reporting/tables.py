@@ -88,7 +88,8 @@ def comparison(results: pd.DataFrame, elsewhere: pd.DataFrame) -> pd.DataFrame |
     made = made.sort_values(["sensor", "simulated", "source", "window_s", "rank"])
     groups = made.groupby(["sensor", "source", "window_s"], sort=False)
     rows = [_compared(row, group) for _, group in groups for _, row in group.iterrows()]
-    return pd.DataFrame(rows)
+    columns = ["Within ±1σ %", "Within ±2σ %"]
+    return pd.DataFrame(rows).round(dict.fromkeys(columns, 1))
 
 
 def _compared(row: pd.Series, group: pd.DataFrame) -> dict[str, Any]:
@@ -110,8 +111,8 @@ def _compared(row: pd.Series, group: pd.DataFrame) -> dict[str, Any]:
             for name in (MEAN, DEFAULT)
         },
         "Ceiling mdps": round(row.ceiling_rmse_dps_all / MDPS, 3),
-        "Within ±1σ %": _covered(row.coverage_1sigma_pct),
-        "Within ±2σ %": _covered(row.coverage_2sigma_pct),
+        "Within ±1σ %": row.coverage_1sigma_pct,
+        "Within ±2σ %": row.coverage_2sigma_pct,
         "Recordings": int(group.recordings.max()),
         "Split": _split(row),
         "Runs": _short(row.run_ids),
@@ -169,10 +170,6 @@ def _ratio(row: pd.Series, gain: str) -> str:
     if pd.isna(value):
         return "–"
     return f"{value:.3f}" if pd.isna(lo) else f"{value:.3f} [{lo:.3f}, {hi:.3f}]"
-
-
-def _covered(fraction: float | None) -> float | None:
-    return None if fraction is None else round(100 * fraction, 1)
 
 
 def _difference(row: pd.Series, name: str, truth: str = PAPER) -> str:
