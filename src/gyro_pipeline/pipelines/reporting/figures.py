@@ -226,7 +226,7 @@ def _augmentation(
     results: pd.DataFrame, curves: pd.DataFrame, published: Published, sensor: str, real: int
 ) -> Figure | Missing:
     of_sensor = _of(results, sensor)
-    shown = of_sensor[of_sensor.real_gyros.isin([0, real])]  # 0: the running mean
+    shown = of_sensor[(of_sensor.real_gyros == real) | (of_sensor.estimator == MEAN)]
     claims = published.of_networks(sensor, real_gyros=real)
     title = f"{sensor}: {real} real gyroscopes and virtual ones"
     return _on_curve(shown, curves, claims, "virtual_gyros", title)
