@@ -198,9 +198,10 @@ def _draw_estimators(left: Axes, right: Axes, rows: pd.DataFrame) -> None:
     means = rows[rows.estimator == MEAN].set_index("window_s").sort_index()
     for place, (name, own) in enumerate(rows.groupby("estimator", sort=False)):
         rmse = own.set_index("window_s").test_rmse_dps_all.sort_index()
+        look = estimator_look(str(name), bool(own.recommended.any()))
         shift = 1 + 0.015 * (place - rows.estimator.nunique() / 2)
         for ax, values in ((left, rmse / MDPS), (right, rmse / means.test_rmse_dps_all)):
-            ax.plot(values.index * shift, values, **estimator_look(str(name)))
+            ax.plot(values.index * shift, values, **look)
     limit = means.ceiling_rmse_dps_all
     for ax, values in ((left, limit / MDPS), (right, limit / means.test_rmse_dps_all)):
         ax.plot(values.index, values, color=CEILING, lw=2, ls="--", label="ceiling")

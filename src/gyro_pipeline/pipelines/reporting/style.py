@@ -9,8 +9,6 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from gyro_pipeline.estimators import ESTIMATORS, estimator_class
-
 # Okabe and Ito's palette: distinct for all common kinds of colour vision.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
 CEILING = "#D55E00"
@@ -37,15 +35,15 @@ _FAMILIES = {
 _UNKNOWN = "grey"
 
 
-def estimator_look(name: str) -> dict[str, Any]:
+def estimator_look(name: str, recommended: bool) -> dict[str, Any]:
     """How an estimator's line is drawn: relatives in one colour, recommended ones filled.
 
     Args:
         name: As in ``ESTIMATORS``; others are grey.
+        recommended: Whether it is one of these.
     """
     found = [(c, names.index(name)) for c, names in _FAMILIES.items() if name in names]
     colour, place = found[0] if found else (_UNKNOWN, 0)
-    recommended = name in ESTIMATORS and estimator_class(name).recommended
     return {
         "color": colour,
         "marker": MARKERS[place],

@@ -20,7 +20,7 @@ from gyro_pipeline.conventions import (
     InputError,
     Missing,
 )
-from gyro_pipeline.estimators import DEFAULT, ESTIMATORS, estimator_class
+from gyro_pipeline.estimators import DEFAULT, ESTIMATORS
 from gyro_pipeline.parameters import (
     Published,
     PublishedHours,
@@ -147,20 +147,19 @@ def _ratios(rows: pd.DataFrame) -> pd.DataFrame:
     for window_s, group in rows.sort_values("window_s").groupby("window_s"):
         named = {row.estimator: row for _, row in group.iterrows()}
         mean = named[MEAN]
-        cells = {_MEAN_MDPS: f"{mean.test_rmse_dps_all / MDPS:.3f}"}
+        shown = {_MEAN_MDPS: f"{mean.test_rmse_dps_all / MDPS:.3f}"}
         for name in (name for name in names if name in named and name != MEAN):
-            cells[_marked(name)] = _ratio(named[name], "accuracy_gain_pct_all")
-        cells["ceiling"] = _ratio(mean, "ceiling_accuracy_gain_pct_all")
-        table[f"{window_s:g} s"] = cells
+            shown[_marked(named[name])] = _ratio(named[name], "accuracy_gain_pct_all")
+        shown["ceiling"] = _ratio(mean, "ceiling_accuracy_gain_pct_all")
+        table[f"{window_s:g} s"] = shown
     made = pd.DataFrame(table).fillna("–").rename_axis("Estimator").reset_index()
     made.insert(1, "Source", source_of(rows.iloc[0]))
     return made.assign(Split=_split(rows.iloc[0]))
 
 
-def _marked(name: str) -> str:
+def _marked(row: pd.Series) -> str:
     """An estimator's name, and whether it is a recommended one."""
-    known = name in ESTIMATORS and estimator_class(name).recommended
-    return name.replace("_", " ") + (" (recommended)" if known else "")
+    return row.estimator.replace("_", " ") + (" (recommended)" if row.recommended else "")
 
 
 def _ratio(row: pd.Series, gain: str) -> str:
