@@ -510,7 +510,7 @@ class Study(Parameter):
 
 
 class Only(Parameter):
-    """Narrows every study to the cells that match; an absent key matches everything."""
+    """Narrows every study to the rows that match; an absent key matches everything."""
 
     sensor: str | None = None
     real_gyros: Gyroscopes | None = None

@@ -59,7 +59,7 @@ def pool_results(  # noqa: PLR0913, PLR0917 - a node's arguments are its dataset
         Results, a row per estimator, sensor, window and training set, ``missing`` holding the
         command that makes what is missing (else none); running-mean curves with columns
         ``sensor, windows, time_s, rmse_dps``; and the finished runs that no result uses, with
-        columns ``run_id``, the fields of a cell, and ``why``.
+        columns ``run_id``, those of a run's spec, and ``why``.
     """
     runs = [run for name, own in stored.items() if name.endswith("_runs") for run in own]
     settings = Settings(study, training, splits, virtual_gyros, evaluation)

@@ -220,7 +220,7 @@ def find_result(
     match &= results.estimator == estimator
     if not match.any():
         raise InputError(
-            f"published result {published.approach!r} of {published.sensor} is no cell of its "
+            f"published result {published.approach!r} of {published.sensor} is no row of its "
             "study; correct published or studies under conf/base/parameters"
         )
     return results[match].iloc[0]
