@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 import xarray as xr
 import yaml
 from filelock import FileLock
@@ -30,6 +29,7 @@ from mlflow.entities import Run
 
 from gyro_pipeline.conventions import AXES, DIMENSIONS, HOLD_OUT, TEST, TRAIN, VALIDATION
 from gyro_pipeline.datasets.recordings import InspectedRecordings, Recordings
+from gyro_pipeline.datasets.tracked_runs import TrackedRuns
 from gyro_pipeline.fingerprints import data_hash
 from gyro_pipeline.logs import Logs
 from gyro_pipeline.parameters import Execution, Parameters, Quality
@@ -127,14 +127,13 @@ class Project:
         """Where a run keeps them."""
         return Path(run.info.artifact_uri.removeprefix("file://"))
 
-    @staticmethod
-    def weights(run: Run) -> dict[str, bytes] | None:
-        """Of the last epoch, bit by bit; the running mean has none."""
-        path = Project.artifacts(run) / "weights.pt"
-        if not path.exists():
-            return None
-        stored = torch.load(path, weights_only=True)["last"]
-        return {name: value.numpy().tobytes() for name, value in stored.items()}
+    def weights(self, run: Run) -> dict[str, bytes]:
+        """Of the last epoch of a network, bit by bit."""
+        stored = {one.run_id: one for one in TrackedRuns(str(self.store)).load()}
+        network = vars(stored[run.info.run_id].load_fit(HOLD_OUT))
+        return {
+            name: value.numpy().tobytes() for name, value in network["_artifact"]["last"].items()
+        }
 
     def count(self, query: str) -> int:
         """What a counting query finds in the store; cheap enough to poll."""

@@ -154,16 +154,12 @@ def test_serial_and_processes_train_identical_networks():
     from gyro_pipeline.parameters import Training  # noqa: PLC0415
 
     generator = np.random.default_rng(0)
-    bias = generator.normal(size=(1, 8, 3))
+    bias = generator.normal(size=(8, 3))
     rates = (bias[..., None] + generator.normal(size=(1, 8, 3, 90))).astype(np.float32)
     coords = {"imu": [1], "recording": np.arange(8), "axis": list("xyz")}
-    dims = ("imu", "recording", "axis", "sample")
-    device = Device(
-        xr.DataArray(rates, dims=dims, coords=coords),
-        xr.DataArray(bias, dims=dims[:-1], coords=coords),
-        imus=(1,),
-        numbers=tuple(range(8)),
-    )
+    recordings = xr.DataArray(rates, coords, ("imu", "recording", "axis", "sample"))
+    starts = (np.array([0, 30, 60]),) * 8
+    device = Device(recordings, (1,), tuple(range(8)), bias, starts)
     training = Training(
         centring="per_device",
         **{"channels": 4, "kernel": 6, "stride": 5, "pool": 2, "hidden": 8},

@@ -48,65 +48,62 @@ def test_the_configuration_of_this_project_is_accepted(loaded, monkeypatch, tmp_
     assert pipeline_registry._selected == Parameters(**loaded())
 
 
-@pytest.mark.parametrize(
-    ("changes", "place", "said"),
-    [
-        ({"epoch": 5}, "epoch:", "unknown key; see conf/base"),
-        ({"training": {"epoch": 5}}, "training.epoch:", "unknown key"),
-        ({"only": {"gyros": 3}}, "only.gyros:", "unknown key"),
-        (
-            {"sensors": {"dot": {"simulated": {"colour": 1}}}},
-            "sensors.dot.simulated.colour:",
-            "unknown key",
-        ),
-        ({"training": {"epochs": 0}}, "training.epochs:", "greater than or equal to 1"),
-        ({"training": {"centring": "none"}}, "training.centring:", "'per_device' or 'global'"),
-        ({"splits": {"test_fraction": 1.0}}, "splits.test_fraction:", "less than 1"),
-        ({"source": "My Files"}, "source:", "match pattern"),
-        ({"only": {"real_gyros": 4}}, "only.real_gyros:", "multiple of 3"),
-        ({"only": {"sensor": "bosch"}}, "only.sensor:", "sparkfun, dot, ng, memsense"),
-        (
-            {"studies": {"input_channels": {"sensors": {"sparkfun": {"virtual_gyros": [12]}}}}},
-            "studies.input_channels.sensors.sparkfun:",
-            "method 1 has no virtual gyroscopes",
-        ),
-        (
-            {"studies": {"real2real": {"sensors": {"ng": {"real_gyros": [0]}}}}},
-            "studies.real2real.sensors.ng:",
-            "at least one IMU, 3 gyroscopes",
-        ),
-        (
-            {"studies": {"real2real": {"sensors": {"ng": {"real_gyros": []}}}}},
-            "studies.real2real.sensors.ng.real_gyros:",
-            "at least 1 item",
-        ),
-        (
-            {"studies": {"real2real": {"experiment": "all"}}},
-            "studies.real2real.experiment:",
-            "expected 'real2real'",
-        ),
-        ({"windows_s": []}, "windows_s:", "at least 1 item"),
-        (
-            {"studies": {"estimators": {"estimators": ["mean", "mean"]}}},
-            "studies.estimators:",
-            "estimators: ['mean', 'mean'] names one of them twice",
-        ),
-        ({"windows_s": [0]}, "windows_s.0:", "greater than 0"),
-        ({"seeds": []}, "seeds:", "at least 1 item"),
-        ({"leakage": {"strides_s": [1, 0]}}, "leakage.strides_s.1:", "greater than 0"),
-        ({"leakage": {"strides_s": [1, 1]}}, "leakage:", "strides_s: [1.0, 1.0] names one of"),
-        ({"leakage": {"folds": 12}}, "leakage:", "folds: 12 parts of 11 recordings"),
-        ({"leakage": {"epochs": 9}}, "leakage.epochs:", "unknown key"),
-        (
-            {"sensors": {"ng": {"train_recordings": 100}}},
-            "sensors.ng:",
-            "train_recordings must leave at least one recording for testing",
-        ),
-        ({"sensors": {"ng": {"rate_hz": 0}}}, "sensors.ng.rate_hz:", "greater than 0"),
-        ({"logs": 5}, "logs:", "valid string"),
-        ({"reader": {"unit": "deg/s"}}, "reader.unit:", "unknown key; there are format, "),
-    ],
-)
+def of_study(name, **changes):
+    return {"studies": {name: changes}}
+
+
+REFUSED = [
+    ({"epoch": 5}, "epoch:", "unknown key; see conf/base"),
+    ({"training": {"epoch": 5}}, "training.epoch:", "unknown key"),
+    (
+        {"sensors": {"dot": {"simulated": {"colour": 1}}}},
+        "sensors.dot.simulated.colour:",
+        "unknown",
+    ),
+    ({"only": {"fold": 3}}, "only.fold:", "unknown key"),
+    ({"training": {"epochs": 0}}, "training.epochs:", "greater than or equal to 1"),
+    ({"training": {"centring": "none"}}, "training.centring:", "'per_device' or 'global'"),
+    ({"splits": {"test_fraction": 1.0}}, "splits.test_fraction:", "less than 1"),
+    ({"splits": {"training_windows": "some"}}, "splits.training_windows.", "'all' or 'first'"),
+    ({"source": "My Files"}, "source:", "match pattern"),
+    ({"only": {"real_gyros": 4}}, "only.real_gyros:", "multiple of 3"),
+    ({"only": {"sensor": "bosch"}}, "only.sensor:", "sparkfun, dot, ng, memsense"),
+    ({"windows_s": []}, "windows_s:", "at least 1 item"),
+    ({"windows_s": [0]}, "windows_s.0:", "greater than 0"),
+    (
+        of_study("input_channels", sensors={"sparkfun": {"virtual_gyros": [12]}}),
+        "studies.input_channels.sensors.sparkfun:",
+        "method 1 has no virtual gyroscopes",
+    ),
+    (
+        of_study("real2real", sensors={"ng": {"real_gyros": [0]}}),
+        "studies.real2real.sensors.ng:",
+        "at least one IMU, 3 gyroscopes",
+    ),
+    (of_study("real2real", experiment="all"), "studies.real2real.experiment:", "'real2real'"),
+    (
+        of_study("estimators", estimators=["mean", "mean"]),
+        "studies.estimators:",
+        "estimators: ['mean', 'mean'] names one of them twice",
+    ),
+    (
+        of_study("unseen_devices", estimators=["cnn"]),
+        "studies.unseen_devices:",
+        "cnn cannot be judged on unseen devices",
+    ),
+    (of_study("leakage", strides_s=[1, 0]), "studies.leakage.strides_s.1:", "greater than 0"),
+    (of_study("leakage", strides_s=[1, 1]), "studies.leakage:", "names one of them twice"),
+    (of_study("leakage", protocol="peek"), "studies.leakage.protocol:", "'by_recording'"),
+    (
+        {"sensors": {"ng": {"train_recordings": 100}}},
+        "sensors.ng:",
+        "train_recordings must leave at least one recording for testing",
+    ),
+    ({"reader": {"unit": "deg/s"}}, "reader.unit:", "unknown key; there are format, "),
+]
+
+
+@pytest.mark.parametrize(("changes", "place", "said"), REFUSED)
 def test_a_bad_parameter_is_refused_by_its_place(loaded, refusal, changes, place, said):
     message = refusal(loaded(**changes))
     assert place in message
@@ -135,14 +132,14 @@ ASKED = {
         "studies.real2real.dot: 30 s windows asked, longer than a recording of dot, 20 s",
     ),
     "leaking windows": (
-        {"leakage": {"window_s": 53}},
+        {"studies": {"leakage": {"windows_s": [53]}}},
         "leakage",
-        "leakage.memsense: 53 s windows asked, longer than a recording of memsense, 52 s",
+        "studies.leakage.memsense: 53 s windows asked, longer than a recording of memsense, 52 s",
     ),
-    "leaking sensor": (
-        {"leakage": {"sensors": ["bosch"]}},
-        "leakage",
-        "leakage: unknown sensor 'bosch'",
+    "estimator": (
+        {"studies": {"real2real": {"estimators": ["kalman"]}}},
+        "real2real",
+        "unknown estimator 'kalman'; there are mean, median",
     ),
     "nothing": (
         {"only": {"sensor": "ng"}},
@@ -212,22 +209,13 @@ def test_groups_cannot_be_changed_after_loading(parameters):
         parameters("base").training.epochs = 1
 
 
-def test_rates_are_those_that_the_counts_imply(parameters):
-    rates = {name: sensor.rate_hz for name, sensor in parameters("base").sensors.items()}
-    assert rates == pytest.approx(
-        {"sparkfun": 13000 / 87, "dot": 13000 / 120, "ng": 200, "memsense": 250}
-    )
-
-
-@pytest.mark.parametrize(
-    ("windows", "epochs"), [(1, 3000), (44, 3000), (64, 3000), (65, 1500), (4629, 42), (10**6, 1)]
-)
-def test_the_leak_study_takes_the_same_steps_on_any_number_of_windows(parameters, windows, epochs):
+def test_a_number_of_steps_decides_the_epochs_of_any_number_of_windows(parameters):
     p = parameters("base")
-    settings = p.leakage.training(p.training)
-    rates = settings.learning_rates(windows)
-    assert len(rates) == epochs
-    assert set(rates) == {p.training.learning_rate}
-    assert settings.hop == 20
-    kept = {"batch_size", "centring"}
-    assert settings.model_dump(include=kept) == p.training.model_dump(include=kept)
+    settings = p.studies["leakage"].training_of(p.training)
+    epochs = {1: 3000, 64: 3000, 65: 1500, 4629: 42, 10**6: 1}
+    for windows, expected in epochs.items():
+        rates = settings.learning_rates(windows)
+        assert len(rates) == expected
+        assert set(rates) == {p.training.learning_rate}
+    assert settings.batch_size == p.training.batch_size  # what the study does not change
+    assert len(p.training.learning_rates(4629)) == p.training.epochs
