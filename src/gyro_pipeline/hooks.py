@@ -16,10 +16,9 @@ from types import TracebackType
 from typing import Any
 
 import kedro
-from kedro.config import OmegaConfigLoader
+import yaml
 from kedro.framework.context import KedroContext
 from kedro.framework.hooks import hook_impl
-from kedro.framework.project import settings
 from kedro.framework.session import KedroSession
 from kedro.io import CatalogProtocol, DatasetError
 from kedro.pipeline import Node, Pipeline
@@ -136,8 +135,11 @@ class Provenance:
     @hook_impl
     def after_context_created(self, context: KedroContext) -> None:
         """Compare the settings of runs with those of ``conf/base``."""
-        source, arguments = context.config_loader.conf_source, settings.CONFIG_LOADER_ARGS
-        base = OmegaConfigLoader(source, env="base", **arguments)["parameters"]
+        # not by a second loader, whose globals would take the place of the first one's
+        files = Path(context.config_loader.conf_source, "base", "parameters").glob("*.yml")
+        base: dict[str, Any] = {}
+        for path in files:
+            base |= yaml.safe_load(path.read_text())
         self._changed = _changed(base, context.config_loader["parameters"])
 
     @hook_impl
@@ -171,7 +173,7 @@ def _changed(base: Mapping[str, Any], given: Mapping[str, Any]) -> frozenset[str
         key
         for group in ("splits", "virtual_gyros", "training")
         for key, value in (given.get(group) or {}).items()
-        if base[group].get(key) != value
+        if base.get(group, {}).get(key) != value
     )
 
 
