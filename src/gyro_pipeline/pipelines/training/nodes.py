@@ -178,11 +178,10 @@ def _problem(spec: RunSpec, folds: Mapping[str, TrainingSet], settings: Training
     """
     estimator = make_estimator(spec.estimator, settings, spec.seed)
     for fold, training in folds.items():
-        if training.recordings() < estimator.fewest_recordings:
-            return (
-                f"{fold}: {spec.estimator} needs {estimator.fewest_recordings} training "
-                f"recordings, got {training.recordings()}"
-            )
+        try:
+            estimator.check(training.part(estimator.uses))
+        except InputError as error:
+            return f"{fold}: {spec.estimator} cannot be fitted: {error}"
     estimator.work(next(iter(folds.values())))
     return ""
 
