@@ -152,7 +152,7 @@ def _content(spec: RunSpec, sets: TrainingSets, settings: Training) -> list[Any]
     return [
         code_hash("gyro_pipeline.estimators.fitting", entry(spec.estimator)),
         spec.estimator,
-        [sets.recordings.attrs["data_hash"]] if spec.real_imus else [],
+        sets.recordings.attrs["data_hash"],
         [sets.virtual.attrs["data_hash"]] if spec.virtual_imus and sets.virtual else [],
         {fold: _hash(training.windows) for fold, training in sets.of(spec).items()},
         _hash(_tests(sets.table_of(spec))),
