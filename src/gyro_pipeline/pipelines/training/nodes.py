@@ -292,10 +292,11 @@ def _fitted(  # noqa: PLR0917 - what a fit is stored with
 
 def _example(spec: RunSpec, training: TrainingSet, recordings: xr.Dataset) -> np.ndarray:
     """A window as the estimator sees it, (1, gyroscopes, samples), deg/s."""
-    imus = spec.real_imus if spec.method == 1 else 1
-    first = recordings.angular_rate.isel(
-        imu=slice(imus), recording=0, sample=slice(training.size)
-    ).transpose("imu", "axis", "sample")
+    seen = recordings.isel(imu=slice(spec.real_imus if spec.method == 1 else 1))
+    there = (seen["samples"] > 0).all("imu").to_numpy()
+    number = int(there.argmax())  # the first that all of them have
+    window = seen.angular_rate.isel(recording=number, sample=slice(training.size))
+    first = window.transpose("imu", "axis", "sample")
     return fill_masked(first.to_numpy().reshape(1, -1, training.size)).astype(np.float32)
 
 
