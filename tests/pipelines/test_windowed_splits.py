@@ -96,16 +96,21 @@ def test_the_seed_chooses_validation_recordings_and_no_test_ones(parameters):
     assert all(first[n] == other[n] == TEST for n in range(80, 100))
 
 
-@pytest.mark.parametrize(("count", "folds"), [(4, 4), (20, 20), (21, 5), (49, 5)])
-def test_few_recordings_make_a_k_fold_that_tests_each_once(make, table_of, count, folds):
+@pytest.mark.parametrize(
+    ("count", "folds", "validation"), [(4, 4, 0), (5, 5, 2), (20, 20, 2), (21, 5, 2), (49, 5, 2)]
+)
+def test_few_recordings_make_a_k_fold_that_tests_each_once(
+    make, table_of, count, folds, validation
+):
     table = table_of(make(count))
     names = [f"fold {fold}" for fold in range(folds)]
     assert table.fold.unique().tolist() == [*names, ALL_RECORDINGS]
     tested = [number for fold in names for number in numbers(table, TEST, fold)]
     assert sorted(tested) == list(range(1, 1 + count))
-    assert {len(numbers(table, VALIDATION, fold)) for fold in names} == {2}
+    assert {len(numbers(table, VALIDATION, fold)) for fold in names} == {validation}
     of_model = table[table.fold == ALL_RECORDINGS]
     assert set(of_model.role) == {TRAIN, VALIDATION}
+    assert len(numbers(of_model, VALIDATION, ALL_RECORDINGS)) == 2
     assert of_model.recording.nunique() == count
 
 
