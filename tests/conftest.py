@@ -27,7 +27,7 @@ from kedro.framework.startup import bootstrap_project
 from mlflow import MlflowClient
 from mlflow.entities import Run
 
-from gyro_pipeline.conventions import AXES, DIMENSIONS, HOLD_OUT, TEST, TRAIN, VALIDATION
+from gyro_pipeline.conventions import AXES, DIMENSIONS, TEST, TRAIN, VALIDATION
 from gyro_pipeline.datasets.recordings import InspectedRecordings, Recordings
 from gyro_pipeline.datasets.tracked_runs import TrackedRuns
 from gyro_pipeline.fingerprints import data_hash
@@ -38,6 +38,7 @@ from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs, label_recording
 from gyro_pipeline.settings import CONFIG_LOADER_ARGS
 
 ROOT = Path(__file__).parents[1]
+ROLES = (TRAIN, VALIDATION, TEST)
 _TIMEOUT_S = 600
 
 
@@ -248,20 +249,23 @@ def parameters() -> Callable[..., Parameters]:
 
 
 @pytest.fixture(scope="session")
-def read_logs() -> Callable[..., tuple[xr.Dataset, pd.DataFrame]]:
+def read_logs(
+    parameters: Callable[..., Parameters],
+) -> Callable[..., tuple[xr.Dataset, pd.DataFrame]]:
     """The raw-logs stage with its datasets, as ``kedro run`` wires them."""
+    splits = parameters("base").splits
 
     def read(
         files: Logs, quality: Quality, folder: Path, workers: int | None = None
     ) -> tuple[xr.Dataset, pd.DataFrame]:
-        """Recordings, and the table of their quality."""
+        """Recordings, and the table of their quality; few of them have no split."""
         execution = Execution(executor="processes" if workers else "serial", workers=workers)
         path = str(folder / "recordings.nc")
         reading, final = InspectedRecordings(path), Recordings(path)
         for item in inspect_logs(files, reading.load(), quality, execution):
             reading.save(item)
         table = quality_table(files, reading.load())
-        final.save(label_recordings(files, reading.load(), table, quality))
+        final.save(label_recordings(files, reading.load(), table, quality, splits))
         return final.load(), table
 
     return read
@@ -269,10 +273,18 @@ def read_logs() -> Callable[..., tuple[xr.Dataset, pd.DataFrame]]:
 
 @pytest.fixture(scope="session")
 def make_recordings() -> Callable[..., xr.Dataset]:
-    """White noise of known N around known biases, in the layout of the conventions."""
+    """White noise of known N around known biases, in the layout of the conventions.
+
+    ``split``: how many recordings train, validate and test, in this order; none for a k-fold.
+    """
 
     def make(
-        bias: np.ndarray, samples: int, rate_hz: float, noise_dps_rts: float, seed: int = 0
+        bias: np.ndarray,
+        samples: int,
+        rate_hz: float,
+        noise_dps_rts: float,
+        seed: int = 0,
+        split: tuple[int, int, int] | None = None,
     ) -> xr.Dataset:
         generator = np.random.default_rng(seed)
         rates = simulate_noise(generator, (*bias.shape, samples), rate_hz, noise_dps_rts)
@@ -286,7 +298,8 @@ def make_recordings() -> Callable[..., xr.Dataset]:
                 "imu": np.arange(1, 1 + bias.shape[0]),
                 "recording": np.arange(1, 1 + bias.shape[1]),
                 "axis": list(AXES),
-            },
+            }
+            | ({"split": ("recording", np.repeat(ROLES, split))} if split else {}),
             attrs={
                 "sensor": "sparkfun",
                 "source": "test",
@@ -294,23 +307,6 @@ def make_recordings() -> Callable[..., xr.Dataset]:
                 "rate_hz": rate_hz,
                 "data_hash": data_hash(rates, []),
             },
-        )
-
-    return make
-
-
-@pytest.fixture(scope="session")
-def make_roles() -> Callable[..., pd.DataFrame]:
-    """One hold-out fold: the last recordings test, and those before them validate."""
-
-    def make(recordings: int, test: int, validation: int = 0) -> pd.DataFrame:
-        roles = [TRAIN] * (recordings - test - validation) + [VALIDATION] * validation
-        return pd.DataFrame(
-            {
-                "fold": HOLD_OUT,
-                "recording": np.arange(1, 1 + recordings),
-                "role": roles + [TEST] * test,
-            }
         )
 
     return make

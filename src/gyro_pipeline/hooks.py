@@ -8,7 +8,7 @@ import shlex
 import subprocess
 import sys
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from traceback import walk_tb
@@ -16,6 +16,7 @@ from types import TracebackType
 from typing import Any
 
 import kedro
+import yaml
 from kedro.framework.context import KedroContext
 from kedro.framework.hooks import hook_impl
 from kedro.framework.session import KedroSession
@@ -126,7 +127,20 @@ class Preflight:
 
 
 class Provenance:
-    """Marks every new run with the code, packages and command that made it."""
+    """Marks every new run with the code, packages, settings and command that made it."""
+
+    def __init__(self) -> None:
+        self._changed = frozenset[str]()
+
+    @hook_impl
+    def after_context_created(self, context: KedroContext) -> None:
+        """Compare the settings of runs with those of ``conf/base``."""
+        # not by a second loader, whose globals would take the place of the first one's
+        files = Path(context.config_loader.conf_source, "base", "parameters").glob("*.yml")
+        base: dict[str, Any] = {}
+        for path in files:
+            base |= yaml.safe_load(path.read_text())
+        self._changed = _changed(base, context.config_loader["parameters"])
 
     @hook_impl
     def before_pipeline_run(
@@ -150,6 +164,17 @@ class Provenance:
             dataset = catalog.get(name)
             if isinstance(dataset, TrackedRuns):
                 dataset.provenance |= tags
+                dataset.changed = self._changed
+
+
+def _changed(base: Mapping[str, Any], given: Mapping[str, Any]) -> frozenset[str]:
+    """Names of the settings of runs that differ from those of ``conf/base``."""
+    return frozenset(
+        key
+        for group in ("splits", "virtual_gyros", "training")
+        for key, value in (given.get(group) or {}).items()
+        if base.get(group, {}).get(key) != value
+    )
 
 
 def _check_logs_are_read(

@@ -1,7 +1,8 @@
 """A sensor small enough to plan, train and evaluate its whole grid in a second."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,10 +20,13 @@ from gyro_pipeline.parameters import (
     Training,
     VirtualGyros,
 )
+from gyro_pipeline.pipelines.evaluation.nodes import evaluate
 from gyro_pipeline.pipelines.ground_truth.nodes import measure_allan_variance, measure_bias
-from gyro_pipeline.pipelines.training.nodes import plan, train
+from gyro_pipeline.pipelines.training.nodes import plan_runs, train
 from gyro_pipeline.pipelines.virtual_gyros.nodes import synthesise
-from gyro_pipeline.tracking import StoredRun, TrainedRun
+from gyro_pipeline.pipelines.windowed_splits.nodes import cut_to_common_length, split_windows
+from gyro_pipeline.studies import RunSpec, planned
+from gyro_pipeline.tracking import FINGERPRINT, EvaluatedRun, FittedRun, StoredRun
 
 NOISE, SPREAD = 0.003, 0.002
 RATE_HZ, SAMPLES = 20.0, 1040
@@ -31,115 +35,178 @@ SERIAL = Execution(executor="serial", workers=None)
 
 @dataclass(frozen=True)
 class World:
-    """All that the training and evaluation stages take."""
+    """Recordings of one sensor and a study; each stage runs on what the one before it makes."""
 
-    recordings: xr.Dataset
+    raw: xr.Dataset
     allan: xr.Dataset
-    bias: pd.DataFrame
-    roles: pd.DataFrame
-    virtual: xr.Dataset
+    raw_bias: pd.DataFrame
+    study: Study
     training: Training
     splits: Splits
     virtual_gyros: VirtualGyros
     evaluation: Evaluation
-    study: Study
     windows_s: Sequence[float] = (10.0,)
     seeds: Sequence[int] = (0,)
     only: Only = field(default_factory=Only)
 
+    @cached_property
+    def _cut(self) -> tuple[xr.Dataset, pd.DataFrame, pd.DataFrame]:
+        return cut_to_common_length(self.raw, self.raw_bias, quality_of(self.raw))
+
+    @property
+    def recordings(self) -> xr.Dataset:
+        """All of one length."""
+        return self._cut[0]
+
+    @cached_property
+    def virtual(self) -> xr.Dataset | None:
+        """Virtual recordings, where the study uses some."""
+        if not any(self.study.grid_of("sparkfun").virtual_gyros):
+            return None
+        return synthesise(self.raw, self.raw_bias, self.virtual_gyros)
+
+    @cached_property
+    def windows(self) -> pd.DataFrame:
+        given = self.study, self.recordings, self._cut[2], self.splits, list(self.windows_s)
+        return split_windows(*given, self.only, self.virtual)
+
+    @cached_property
     def plan(self) -> pd.DataFrame:
-        names = "study recordings roles windows_s seeds only training virtual".split()
-        return plan(**{name: getattr(self, name) for name in names})
+        given = self.study, self.recordings, self.windows, list(self.windows_s), list(self.seeds)
+        return plan_runs(*given, self.only, self.training, self.virtual)
+
+    @property
+    def specs(self) -> dict[str, RunSpec]:
+        """The runs that can be made, by fingerprint."""
+        return planned(self.plan)
+
+    @property
+    def fingerprints(self) -> dict[tuple[Any, ...], str]:
+        """By estimator, gyroscopes, window, seed and method."""
+        names = ["estimator", "real_gyros", "virtual_gyros", "window_s", "seed", "method"]
+        rows = self.plan[names].itertuples(index=False, name=None)
+        return dict(zip(rows, self.plan[FINGERPRINT], strict=True))
 
     def train(
-        self,
-        tracked: Sequence[StoredRun] = (),
-        cells: Any = None,
-        execution: Execution = SERIAL,
-    ) -> list[TrainedRun]:
-        names = "recordings bias roles training splits virtual_gyros virtual".split()
-        given = {name: getattr(self, name) for name in names}
-        cells = self.plan() if cells is None else cells
-        return list(train(cells=cells, tracked=list(tracked), execution=execution, **given))
+        self, tracked: Sequence[StoredRun] = (), execution: Execution = SERIAL
+    ) -> list[FittedRun]:
+        given = self.study, self.plan, list(tracked), self.recordings, self.windows, self.training
+        settings = self.splits, self.virtual_gyros, execution
+        return list(train(*given, *settings, self.virtual))
+
+    def evaluate(self, runs: Sequence[StoredRun]) -> list[EvaluatedRun]:
+        given = self.plan, list(runs), self.recordings, self.windows, self._cut[1]
+        return list(evaluate(*given, self.allan, self.evaluation))
+
+    def judged(self) -> dict[str, EvaluatedRun]:
+        """All runs, trained and evaluated, by estimator, the last of each."""
+        runs = stored_runs(self.train())
+        names = {run.run_id: run.params["estimator"] for run in runs}
+        return {names[run.run_id]: run for run in self.evaluate(runs)}
 
 
-@pytest.fixture(scope="session")
-def world(
-    make_recordings: Callable[..., xr.Dataset],
-    make_roles: Callable[..., pd.DataFrame],
-    parameters: Callable[..., Any],
-) -> World:
-    """Two IMUs with 14 measured recordings, eight of which train, and eight virtual IMUs."""
-    generator = np.random.default_rng(5)
-    bias = generator.uniform(-1, 1, (2, 1, 3)) + generator.normal(0, SPREAD, (2, 14, 3))
-    recordings = make_recordings(bias, SAMPLES, RATE_HZ, NOISE)
-    roles = make_roles(14, test=4, validation=2)
-    p = parameters(
-        virtual_gyros={"recordings": 6, "train_recordings": 5},
-        training={"epochs": 3, "stride": 5, "pool": 2, "channels": 2, "hidden": 4},
-        evaluation={"resamples": 100},
-    )
-    allan = measure_allan_variance(recordings)
-    table = measure_bias(recordings, allan, p.ground_truth)
-    return World(
-        recordings=recordings,
-        allan=allan,
-        bias=table,
-        roles=roles,
-        virtual=synthesise(recordings, table, roles, p.virtual_gyros),
-        training=p.training,
-        splits=p.splits,
-        virtual_gyros=p.virtual_gyros,
-        evaluation=p.evaluation,
-        study=study_of("augmentation", real_gyros=[3, 6], virtual_gyros=[0, 6]),
-    )
+def quality_of(recordings: xr.Dataset) -> pd.DataFrame:
+    """What the raw-logs stage says of recordings, which it found five rows into their files."""
+    rows = recordings["samples"].to_dataframe().reset_index()
+    stop = rows.samples.where(rows.samples > 0) + 5
+    files = [f"{i}_{n}.csv" for i, n in zip(rows.imu, rows.recording, strict=True)]
+    return rows[["imu", "recording"]].assign(file=files, start=stop * 0 + 5, stop=stop)
 
 
-def study_of(name: str, **grid: Any) -> Study:
-    return Study(experiment=name, sensors={"sparkfun": Grid(**{"method": 2, **grid})})
+def stored_runs(fitted: Sequence[FittedRun], **changes: Any) -> list[StoredRun]:
+    """What a store gives back of some fits: each run with those of its folds that are there."""
+    by_run: dict[str, dict[str, FittedRun]] = {}
+    for fit in fitted:
+        by_run.setdefault(fit.run.fingerprint, {})[fit.fold] = fit
+    runs = []
+    for number, (key, fits) in enumerate(by_run.items()):
+        identity = next(iter(fits.values())).run
+        estimators = {fold: fit.estimator for fold, fit in fits.items()}
+        history = [fit.estimator.history for fit in fits.values() if fit.is_model]
+        run = StoredRun(
+            run_id=f"run{number}",
+            experiment_id="1",
+            study=identity.study,
+            finished=False,
+            trained=set(fits) == set(identity.folds),
+            started_ms=0,
+            params={name: str(value) for name, value in identity.params.items()},
+            tags={**identity.tags, FINGERPRINT: key, "mlflow.runName": identity.name},
+            metrics={"train_loss": 0.0} if history and history[0] is not None else {},
+            fits=frozenset(fits),
+            load={"history.csv": history[0] if history else None}.__getitem__,
+            load_fit=estimators.__getitem__,
+        )
+        runs.append(replace(run, **changes))
+    return runs
+
+
+def study_of(name: str, estimators: Sequence[str] = ("cnn",), **grid: Any) -> Study:
+    settings = Grid(**{"method": 2, "real_gyros": [3], **grid})
+    return Study(experiment=name, estimators=list(estimators), sensors={"sparkfun": settings})
 
 
 @pytest.fixture(scope="session")
 def make_study() -> Callable[..., Study]:
-    """A study of one sensor: ``make_study(name, real_gyros=[...])``."""
+    """A study of one sensor: ``make_study(name, estimators, real_gyros=[...])``."""
     return study_of
 
 
 @pytest.fixture(scope="session")
-def as_stored() -> Callable[..., StoredRun]:
-    """What a store gives back of a trained run."""
-
-    def make(trained: TrainedRun, run_id: str, **changes: Any) -> StoredRun:
-        artifacts: Mapping[str, Any] = trained.artifacts
-        given: dict[str, Any] = {
-            "run_id": run_id,
-            "experiment_id": "1",
-            "study": trained.study,
-            "finished": False,
-            "started_ms": trained.started_ms,
-            "params": {key: str(value) for key, value in trained.params.items()},
-            "tags": {**trained.tags, "mlflow.runName": run_id},
-            "metrics": {},
-            "load": artifacts.__getitem__,
-        }
-        return StoredRun(**given | changes)
-
-    return make
+def as_stored() -> Callable[..., list[StoredRun]]:
+    """What a store gives back of some fits."""
+    return stored_runs
 
 
 @pytest.fixture(scope="session")
-def trained(world: World) -> list[TrainedRun]:
-    """The whole grid of the small world, trained."""
-    return world.train()
-
-
-@pytest.fixture(scope="session")
-def stored(trained: list[TrainedRun], as_stored: Callable[..., StoredRun]) -> list[StoredRun]:
-    """The same as the store gives it, waiting for its evaluation."""
-    return [as_stored(run, f"run{number}") for number, run in enumerate(trained)]
+def make_quality() -> Callable[[xr.Dataset], pd.DataFrame]:
+    """What the raw-logs stage says of recordings."""
+    return quality_of
 
 
 @pytest.fixture(scope="session")
 def make_bias(parameters: Callable[..., Any]) -> Callable[..., pd.DataFrame]:
     """The ground truth of recordings, from their Allan variances."""
     return lambda recordings, allan: measure_bias(recordings, allan, parameters().ground_truth)
+
+
+@pytest.fixture(scope="session")
+def make_world(
+    parameters: Callable[..., Any], make_bias: Callable[..., pd.DataFrame]
+) -> Callable[..., World]:
+    """A world of some recordings: ``make_world(recordings, study=...)``."""
+    p = parameters(
+        virtual_gyros={"recordings": 6, "train_recordings": 5},
+        training={"epochs": 3, "stride": 5, "pool": 2, "channels": 2, "hidden": 4},
+        evaluation={"resamples": 100},
+    )
+    settings = ("training", "splits", "virtual_gyros", "evaluation")
+
+    def make(recordings: xr.Dataset, **changes: Any) -> World:
+        allan = measure_allan_variance(recordings)
+        given = {name: getattr(p, name) for name in settings} | {"study": study_of("some")}
+        return World(recordings, allan, make_bias(recordings, allan), **given | changes)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def world(make_recordings: Callable[..., xr.Dataset], make_world: Callable[..., World]) -> World:
+    """Two IMUs with 14 measured recordings, of which 8 train and 4 test, and 8 virtual IMUs."""
+    generator = np.random.default_rng(5)
+    bias = generator.uniform(-1, 1, (2, 1, 3)) + generator.normal(0, SPREAD, (2, 14, 3))
+    recordings = make_recordings(bias, SAMPLES, RATE_HZ, NOISE, split=(8, 2, 4))
+    study = study_of("augmentation", real_gyros=[3, 6], virtual_gyros=[0, 6])
+    return make_world(recordings, study=study)
+
+
+@pytest.fixture(scope="session")
+def fitted(world: World) -> list[FittedRun]:
+    """The whole grid of the small world."""
+    return world.train()
+
+
+@pytest.fixture(scope="session")
+def stored(fitted: list[FittedRun]) -> list[StoredRun]:
+    """The same as the store gives it, waiting for its evaluation."""
+    return stored_runs(fitted)

@@ -223,16 +223,32 @@ def test_temperature_and_acceleration_are_kept_with_their_recording(inspected):
 
 
 def test_splits_and_what_was_drawn_go_with_the_recordings(inspected, make_recordings):
-    drawn = make_recordings(np.zeros((2, 2, 3)), 20, 10, 0.1)[["angular_rate"]].drop_attrs()
+    drawn = make_recordings(np.zeros((2, 4, 3)), 20, 10, 0.1)[["angular_rate"]].drop_attrs()
     drawn = drawn.rename(angular_rate="true_bias").isel(sample=0)
-    logs = listed(four(log_11=DEAD, log_21=DEAD))
-    entries = [
-        replace(one, split="train" if one.recording == 1 else "test") for one in logs.entries
-    ]
-    recordings, _ = inspected(replace(logs, entries=entries, simulated=True, drawn=drawn))
+    logs = {(imu, n): Log(noise(10 * imu + n)) for imu in (1, 2) for n in (1, 2, 3, 4)}
+    logs[1, 1] = logs[2, 1] = DEAD
+    files = listed(logs, simulated=True, drawn=drawn)
+    of_source = {1: "train", 2: "test", 3: "train", 4: "test"}
+    entries = [replace(one, split=of_source[one.recording]) for one in files.entries]
+    recordings, _ = inspected(replace(files, entries=entries))
     assert recordings.simulated == 1
-    assert recordings.given_split.values.tolist() == ["test"]
-    np.testing.assert_array_equal(recordings.true_bias, drawn.true_bias.sel(recording=[2]))
+    assert recordings.split.values.tolist() == ["test", "train", "test"]
+    np.testing.assert_array_equal(recordings.true_bias, drawn.true_bias.sel(recording=[2, 3, 4]))
+
+
+def test_a_source_without_a_split_gets_one_where_there_are_many_recordings(inspected):
+    recordings, _ = inspected(listed(four()))
+    assert "split" not in recordings.coords  # a k-fold
+    many = {(imu, n): Log(noise(100 * imu + n, 1100)) for imu in (1, 2) for n in range(1, 51)}
+    del many[1, 50]  # which the tested IMU lacks, so it cannot test
+    many[2, 50] = Log(noise(5))
+    del many[1, 49]
+    many[1, 51], many[1, 52] = Log(noise(6)), Log(noise(7))
+    recordings, _ = inspected(listed(many))
+    roles = dict(zip(recordings.recording.values, recordings.split.values, strict=True))
+    tested = [number for number, role in roles.items() if role == "test"]
+    assert tested == [*range(41, 49), 51, 52]
+    assert roles[50] == "train"
 
 
 def test_without_timestamps_and_a_stated_rate_a_recording_is_rejected(inspected):

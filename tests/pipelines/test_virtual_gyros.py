@@ -4,7 +4,7 @@ import xarray as xr
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.parameters import VirtualGyros
-from gyro_pipeline.pipelines.ground_truth.nodes import measure_allan_variance, measure_bias
+from gyro_pipeline.pipelines.ground_truth.nodes import measure_allan_variance
 from gyro_pipeline.pipelines.virtual_gyros.nodes import synthesise
 
 RATE_HZ, SAMPLES = 10.0, 600
@@ -19,24 +19,20 @@ def real(make_recordings):
     """Ten recordings that train, two that validate and four that test, these of wild gyroscopes."""
     bias = np.random.default_rng(3).uniform(-1, 1, (2, 16, 3))
     bias[:, 10:] *= 50
-    recordings = make_recordings(bias, SAMPLES, RATE_HZ, SIGMA / np.sqrt(RATE_HZ))
+    noise = SIGMA / np.sqrt(RATE_HZ)
+    recordings = make_recordings(bias, SAMPLES, RATE_HZ, noise, split=(10, 2, 4))
     recordings.angular_rate[:, 10:] *= 7
     return recordings
 
 
 @pytest.fixture(scope="module")
-def bias(real, parameters):
-    return measure_bias(real, measure_allan_variance(real), parameters().ground_truth)
+def bias(real, make_bias):
+    return make_bias(real, measure_allan_variance(real))
 
 
 @pytest.fixture(scope="module")
-def roles(make_roles):
-    return make_roles(16, test=4, validation=2)
-
-
-@pytest.fixture(scope="module")
-def virtual(real, bias, roles):
-    return synthesise(real, bias, roles, SETTINGS)
+def virtual(real, bias):
+    return synthesise(real, bias, SETTINGS)
 
 
 def test_biases_fill_the_range_of_training_recordings_and_no_more(virtual, bias):
@@ -62,9 +58,9 @@ def test_a_gyroscope_keeps_one_bias_over_its_recordings(virtual):
     assert np.unique(virtual.recording_mean.mean("recording").round(2)).size > 15
 
 
-def test_jitter_moves_it_from_one_power_on_to_the_next(real, bias, roles):
+def test_jitter_moves_it_from_one_power_on_to_the_next(real, bias):
     jittery = SETTINGS.model_copy(update={"turn_on_jitter_mdps": 50.0})
-    moved = synthesise(real, bias, roles, jittery)
+    moved = synthesise(real, bias, jittery)
     over_recordings = moved.recording_mean.std("recording", ddof=1)
     assert float(np.sqrt((over_recordings**2).mean())) == pytest.approx(0.05, rel=0.1)
 
@@ -77,18 +73,27 @@ def test_counts_layout_and_means(virtual, real):
     np.testing.assert_allclose(virtual.recording_mean, expected, rtol=1e-12)
 
 
-def test_the_seed_and_the_sensor_decide(virtual, real, bias, roles):
-    again = synthesise(real, bias, roles, SETTINGS)
+def test_the_seed_and_the_sensor_decide(virtual, real, bias):
+    again = synthesise(real, bias, SETTINGS)
     xr.testing.assert_identical(again, virtual)
     others = [
-        synthesise(real, bias, roles, SETTINGS.model_copy(update={"seed": 1})),
-        synthesise(real.assign_attrs(sensor="dot"), bias, roles, SETTINGS),
+        synthesise(real, bias, SETTINGS.model_copy(update={"seed": 1})),
+        synthesise(real.assign_attrs(sensor="dot"), bias, SETTINGS),
     ]
     assert len({one.data_hash for one in [virtual, *others]}) == 3
     for other in others:
         assert not np.allclose(other.recording_mean, virtual.recording_mean, atol=0.01)
 
 
-def test_a_k_fold_is_refused(real, bias, roles):
-    with pytest.raises(InputError, match=r"sparkfun: virtual gyroscopes need a hold-out split"):
-        synthesise(real, bias, roles.assign(fold=0), SETTINGS)
+def test_a_k_fold_is_refused(real, bias):
+    with pytest.raises(InputError, match=r"sparkfun: virtual gyroscopes need a hold-out, got 16"):
+        synthesise(real.drop_vars("split"), bias, SETTINGS)
+
+
+def test_they_are_as_long_as_studies_cut_recordings_and_say_where_they_come_from(real, bias):
+    uneven = real.assign(samples=real["samples"].copy(deep=True))
+    uneven["samples"][:, 3] = 100
+    uneven["samples"][0, 0] = SAMPLES - 50
+    made = synthesise(uneven, bias, SETTINGS)
+    assert made.sizes["sample"] == SAMPLES
+    assert made.drawn_from.tolist() == list(range(1, 11))

@@ -15,19 +15,20 @@ from gyro_pipeline.parameters import Only
 from gyro_pipeline.pipelines.ground_truth.nodes import measure_allan_variance
 from gyro_pipeline.pipelines.virtual_gyros.nodes import synthesise
 from gyro_pipeline.pipelines.windowed_splits.nodes import cut_to_common_length, split_windows
+from gyro_pipeline.pipelines.windowed_splits.protocols import check_table
 from gyro_pipeline.protocol.splits import split_recordings
 
 RATE_HZ = 20.0
 
 
 @pytest.fixture(scope="module")
-def make(make_recordings):
+def make(make_recordings, parameters):
     """Recordings of two IMUs, of 30 s, with the split of as many."""
 
-    def made(count, splits, imus=2, given=None):
+    def made(count, imus=2):
         recordings = make_recordings(np.zeros((imus, count, 3)), 600, RATE_HZ, 0.005)
         numbers = list(range(1, 1 + count))
-        split = split_recordings(numbers, numbers, splits, given)
+        split = split_recordings(numbers, numbers, parameters("base").splits)
         if split is not None:
             recordings = recordings.assign_coords(split=("recording", [split[n] for n in numbers]))
         return recordings
@@ -35,25 +36,22 @@ def make(make_recordings):
     return made
 
 
-def table_of(recordings, parameters, make_study, virtual=None, **changes):
-    p = parameters("base", **{name: changes.pop(name) for name in ("splits",) if name in changes})
-    study = make_study("augmentation", **changes.pop("grid", {"real_gyros": [3]}))
-    study = study.model_copy(update={"windows_s": [10.0]} | changes)
-    rows = [(i, n) for i in recordings.imu.values for n in recordings.recording.values]
-    means = pd.DataFrame(
-        [(i, n, axis, 0.0) for i, n in rows for axis in "xyz"],
-        columns=["imu", "recording", "axis", "bias_dps"],
-    )
-    cut, _, contents = cut_to_common_length(recordings, means, quality_of(recordings))
-    return split_windows(study, cut, contents, p.splits, [10.0], Only(), virtual)
+@pytest.fixture(scope="module")
+def table_of(parameters, make_study, make_quality):
+    """The windows table of a study of 10 s windows, changed as one likes."""
 
+    def made(made_of, /, virtual=None, splits=None, **changes):
+        settings = parameters("base", splits=splits or {}).splits
+        study = make_study("augmentation").model_copy(update={"windows_s": [10.0]} | changes)
+        places = [(i, n) for i in made_of.imu.values for n in made_of.recording.values]
+        means = pd.DataFrame(
+            [(*place, axis, 0.0) for place in places for axis in "xyz"],
+            columns=["imu", "recording", "axis", "bias_dps"],
+        )
+        cut, _, contents = cut_to_common_length(made_of, means, make_quality(made_of))
+        return split_windows(study, cut, contents, settings, [10.0], Only(), virtual)
 
-def quality_of(recordings):
-    """What the raw-logs stage says of them."""
-    rows = recordings["samples"].to_dataframe().reset_index()
-    stop = rows.samples.where(rows.samples > 0) + 5
-    files = [f"{i}_{n}.csv" for i, n in zip(rows.imu, rows.recording, strict=True)]
-    return rows[["imu", "recording"]].assign(file=files, start=stop * 0 + 5, stop=stop)
+    return made
 
 
 def numbers(table, role, fold=HOLD_OUT, imu=1):
@@ -64,9 +62,8 @@ def numbers(table, role, fold=HOLD_OUT, imu=1):
 # which recordings
 
 
-def test_the_papers_split_of_100_recordings(make, parameters, make_study):
-    splits = parameters("base").splits
-    table = table_of(make(100, splits), parameters, make_study)
+def test_the_papers_split_of_100_recordings(make, table_of):
+    table = table_of(make(100))
     assert numbers(table, TEST) == list(range(81, 101))
     assert len(numbers(table, VALIDATION)) == 8
     assert len(numbers(table, TRAIN)) == 72
@@ -74,6 +71,7 @@ def test_the_papers_split_of_100_recordings(make, parameters, make_study):
     assert numbers(table, TEST, imu=2) == []
     assert table.fold.unique().tolist() == [HOLD_OUT]
     assert sorted(table.start.unique()) == [0, 200, 400]
+    assert set(table.window_s) == set(table.window_stride_s) == {10.0}
 
 
 def test_a_split_that_the_source_gives_is_used(parameters):
@@ -88,10 +86,8 @@ def test_a_split_that_the_source_gives_is_used(parameters):
 
 def test_the_seed_chooses_validation_recordings_and_no_test_ones(parameters):
     first, other = (
-        split_recordings(
-            range(100), range(100), parameters("base", splits={"split_seed": s}).splits
-        )
-        for s in (1, 2)
+        split_recordings(range(100), range(100), parameters("base", splits=seed).splits)
+        for seed in ({"split_seed": 1}, {"split_seed": 2})
     )
     validation = [
         {n for n, role in roles.items() if role == VALIDATION} for roles in (first, other)
@@ -100,44 +96,52 @@ def test_the_seed_chooses_validation_recordings_and_no_test_ones(parameters):
     assert all(first[n] == other[n] == TEST for n in range(80, 100))
 
 
-@pytest.mark.parametrize(("count", "folds"), [(4, 4), (20, 20), (21, 5), (49, 5)])
+@pytest.mark.parametrize(
+    ("count", "folds", "validation"), [(4, 4, 0), (5, 5, 2), (20, 20, 2), (21, 5, 2), (49, 5, 2)]
+)
 def test_few_recordings_make_a_k_fold_that_tests_each_once(
-    make, parameters, make_study, count, folds
+    make, table_of, count, folds, validation
 ):
-    table = table_of(make(count, parameters("base").splits), parameters, make_study)
+    table = table_of(make(count))
     names = [f"fold {fold}" for fold in range(folds)]
     assert table.fold.unique().tolist() == [*names, ALL_RECORDINGS]
     tested = [number for fold in names for number in numbers(table, TEST, fold)]
     assert sorted(tested) == list(range(1, 1 + count))
-    assert {len(numbers(table, VALIDATION, fold)) for fold in names} == {2}
+    assert {len(numbers(table, VALIDATION, fold)) for fold in names} == {validation}
     of_model = table[table.fold == ALL_RECORDINGS]
     assert set(of_model.role) == {TRAIN, VALIDATION}
+    assert len(numbers(of_model, VALIDATION, ALL_RECORDINGS)) == 2
     assert of_model.recording.nunique() == count
 
 
-def test_two_recordings_are_enough_for_a_table(make, parameters, make_study):
-    table = table_of(make(2, parameters("base").splits), parameters, make_study)
+def test_two_recordings_are_enough_for_a_table(make, table_of):
+    table = table_of(make(2))
     assert numbers(table, TRAIN, "fold 0") == [2]
     assert numbers(table, VALIDATION, "fold 0") == []
 
 
-def test_every_device_in_turn_is_unseen(make, parameters, make_study):
-    splits = parameters("base").splits
-    table = table_of(
-        make(100, splits, imus=3), parameters, make_study, protocol="leave_one_device_out"
-    )
-    assert table.fold.unique().tolist() == [f"without IMU {i}" for i in (1, 2, 3)] + [
-        ALL_RECORDINGS
-    ]
+def test_in_a_k_fold_recordings_that_the_tested_imu_lacks_train_in_every_fold(make, table_of):
+    recordings = make(5).copy(deep=True)
+    recordings["samples"][0, 2], recordings.angular_rate[0, 2] = 0, np.nan
+    table = table_of(recordings)
+    assert table.fold.unique().tolist() == [*(f"fold {fold}" for fold in range(4)), ALL_RECORDINGS]
+    for fold, tested in enumerate((1, 2, 4, 5)):
+        assert numbers(table, TEST, f"fold {fold}") == [tested]
+        assert 3 in numbers(table, TRAIN, f"fold {fold}", imu=2)
+
+
+def test_every_device_in_turn_is_unseen(make, table_of):
+    table = table_of(make(100, imus=3), protocol="leave_one_device_out")
+    folds = [*(f"without IMU {imu}" for imu in (1, 2, 3)), ALL_RECORDINGS]
+    assert table.fold.unique().tolist() == folds
     assert numbers(table, TEST, "without IMU 2", imu=2) == list(range(81, 101))
     for imu in (1, 3):
         assert numbers(table, TRAIN, "without IMU 2", imu) == list(range(1, 81))
-    few = table_of(make(3, splits), parameters, make_study, protocol="leave_one_device_out")
-    assert (
-        numbers(few, TEST, "without IMU 1") == numbers(few, TRAIN, "without IMU 1", 2) == [1, 2, 3]
-    )
+    few = table_of(make(3), protocol="leave_one_device_out")
+    assert numbers(few, TEST, "without IMU 1") == [1, 2, 3]
+    assert numbers(few, TRAIN, "without IMU 1", imu=2) == [1, 2, 3]
     with pytest.raises(InputError, match="expected at least 2 IMUs, got 1; bring recordings"):
-        table_of(make(3, splits, imus=1), parameters, make_study, protocol="leave_one_device_out")
+        table_of(make(3, imus=1), protocol="leave_one_device_out")
 
 
 # which windows
@@ -148,24 +152,40 @@ def test_every_device_in_turn_is_unseen(make, parameters, make_study):
     [("all", [0, 200, 400]), ("first", [0]), (5.0, range(0, 401, 100))],
 )
 def test_training_windows_are_all_the_first_or_at_a_stride(
-    make, parameters, make_study, training_windows, starts
+    make, table_of, training_windows, starts
 ):
-    splits = {"training_windows": training_windows}
-    table = table_of(make(100, parameters("base").splits), parameters, make_study, splits=splits)
+    table = table_of(make(100), splits={"training_windows": training_windows})
     assert sorted(table[table.role == TRAIN].start.unique()) == list(starts)
     assert sorted(table[table.role == TEST].start.unique()) == [0, 200, 400]
 
 
+def test_a_window_that_lost_its_samples_moves_no_recording_to_another_fold(make, table_of, caplog):
+    recordings = make(5).copy(deep=True)
+    recordings.angular_rate[0, 1, :, 10:50] = np.nan  # the first window of recording 2
+    whole = table_of(make(5), splits={"training_windows": "first"})
+    table = table_of(recordings, splits={"training_windows": "first"})
+    assert (
+        "1 of 30 lost more than 10% of their samples and are left out; the first one used of "
+        in (caplog.text)
+    )
+    for fold in range(5):
+        tested = numbers(table, TEST, f"fold {fold}")
+        assert tested == numbers(whole, TEST, f"fold {fold}") == [fold + 1]
+        train = numbers(table, TRAIN, f"fold {fold}") + numbers(table, VALIDATION, f"fold {fold}")
+        assert sorted(train) == [n for n in (1, 3, 4, 5) if n not in tested]
+    tests = table[(table.role == TEST) & (table.recording == 2)]
+    assert tests.start.tolist() == [200, 400]
+
+
 @pytest.mark.parametrize("protocol", ["k_fold", "window_split", "best_epoch_on_test"])
-def test_the_leak_studys_windows_test_once_each(make, parameters, make_study, protocol):
-    grid = {"protocol": protocol, "recordings": 6, "folds": 3, "strides_s": [5.0]}
-    table = table_of(make(100, parameters("base").splits), parameters, make_study, **grid)
+def test_the_leak_studys_windows_test_once_each(make, table_of, protocol):
+    table = table_of(make(100), protocol=protocol, recordings=6, folds=3, strides_s=[5.0])
     tests = table[table.role == TEST]
     assert len(tests) == len(tests.drop_duplicates(["recording", "start"])) == 6 * 5
     assert set(tests.imu) == {1}
-    for _, rows in table.groupby("fold", observed=True):
+    for fold, rows in table.groupby("fold", observed=True):
         train, test = (set(rows.recording[rows.role == role]) for role in (TRAIN, TEST))
-        assert bool(train & test) == (protocol == "window_split")
+        assert bool(train & test) == (protocol == "window_split"), fold
         if protocol == "best_epoch_on_test":
             places = [
                 rows[rows.role == role][["recording", "start"]] for role in (VALIDATION, TEST)
@@ -173,43 +193,85 @@ def test_the_leak_studys_windows_test_once_each(make, parameters, make_study, pr
             assert places[0].to_numpy().tolist() == places[1].to_numpy().tolist()
 
 
-def test_all_windows_train_and_test_where_the_test_set_is_in_training(make, parameters, make_study):
-    grid = {"protocol": "test_in_training", "recordings": 6, "folds": 3}
-    table = table_of(make(100, parameters("base").splits), parameters, make_study, **grid)
+def test_all_windows_train_and_test_where_the_test_set_is_in_training(make, table_of):
+    table = table_of(make(100), protocol="test_in_training", recordings=6, folds=3)
     assert numbers(table, TRAIN) == numbers(table, TEST) == list(range(1, 7))
 
 
 # what is refused
 
 
-def test_a_copy_with_another_role_is_refused(make, parameters, make_study):
-    recordings = make(100, parameters("base").splits).copy(deep=True)
-    recordings.angular_rate.loc[{"imu": 2, "recording": 3}] = recordings.angular_rate.sel(
-        imu=1, recording=90
-    )
+def test_a_copy_with_another_role_is_refused(make, table_of):
+    recordings = make(100).copy(deep=True)
+    copied = recordings.angular_rate.sel(imu=1, recording=90)
+    recordings.angular_rate.loc[{"imu": 2, "recording": 3}] = copied
     with pytest.raises(
-        InputError,
-        match=r"IMU 1 recording 90 \(test\) holds the same samples as|"
-        r"IMU 2 recording 3 \(train\) holds",
+        InputError, match=r"(90 \(test\)|3 \(train\)) holds the same samples as IMU"
     ):
-        table_of(recordings, parameters, make_study)
+        table_of(recordings)
+
+
+ROWS = [
+    ("a fold", TRAIN, "real", 1, 1),
+    ("a fold", TRAIN, "real", 2, 1),
+    ("a fold", TEST, "real", 1, 2),
+    ("a fold", TRAIN, "virtual", 1, 2),
+]
+
+
+@pytest.mark.parametrize(
+    ("apart", "row", "message"),
+    [
+        ("recording", (TEST, "real", 1, 1), r"recording 1 .*test \(IMU 1\), train \(IMU 1, 2\)"),
+        (
+            "recording",
+            (VALIDATION, "real", 2, 2),
+            r"recording 2 .*test \(IMU 1\), validation \(IMU",
+        ),
+        ("imu", (TEST, "real", 2, 3), r"imu 2 has more than one role"),
+    ],
+)
+def test_what_has_two_roles_in_a_fold_is_refused(apart, row, message):
+    rows = [one for one in ROWS if apart == "recording" or one[3] != 1 or one[1] == TEST]
+    contents = {(imu, number): f"{imu} {number}" for imu in (1, 2) for number in (1, 2, 3)}
+
+    def check(rows):
+        columns = ["fold", "role", "origin", "imu", "recording"]
+        check_table(pd.DataFrame(rows, columns=columns), apart, contents, [1])
+
+    check(rows)
+    check([*rows, ("another fold", TRAIN, "real", 1, 3), ("another fold", TEST, "real", 2, 1)])
+    with pytest.raises(InputError, match=f"a fold: {message}"):
+        check([*rows, ("a fold", *row)])
 
 
 def test_virtual_recordings_train_and_come_from_recordings_that_train(
-    make, parameters, make_study, make_bias
+    make, table_of, make_bias, parameters
 ):
     p = parameters(virtual_gyros={"recordings": 4, "train_recordings": 3})
-    recordings = make(100, p.splits)
+    recordings = make(100)
     bias = make_bias(recordings, measure_allan_variance(recordings))
     virtual = synthesise(recordings, bias, p.virtual_gyros)
-    table = table_of(recordings, parameters, make_study, virtual)
+    table = table_of(recordings, virtual)
     drawn = table[table.origin == ORIGIN_VIRTUAL]
     assert set(drawn.role) == {TRAIN}
     assert sorted(drawn.recording.unique()) == [1, 2, 3]
     assert len(drawn) == 8 * 3 * 3
     leaking = virtual.assign_attrs(drawn_from=np.array([1, 90]))
     with pytest.raises(InputError, match="were drawn from recordings 90, which test"):
-        table_of(recordings, parameters, make_study, leaking)
+        table_of(recordings, leaking)
+
+
+def test_without_a_window_that_tests_a_study_says_so(make, table_of):
+    recordings = make(4).copy(deep=True)
+    recordings.angular_rate[..., ::5] = np.nan
+    message = "augmentation sparkfun, 10 s windows: no test recording has one .* lower windows_s"
+    with pytest.raises(InputError, match=message):
+        table_of(recordings, protocol="test_in_training")
+    with pytest.raises(InputError, match=r"window of 60 s is 1200 samples .* has 600"):
+        table_of(make(4), windows_s=[60.0])
+    with pytest.raises(InputError, match="stride of 0.01 s is less than half a sample"):
+        table_of(make(4), strides_s=[0.01])
 
 
 # one length
@@ -217,9 +279,9 @@ def test_virtual_recordings_train_and_come_from_recordings_that_train(
 
 @pytest.fixture
 def uneven(make_recordings):
-    """Of 60, 40 and 50 s; IMU 2 lacks the second, and four samples are masked."""
+    """Of 60, 35 and 50 s; IMU 2 lacks the second, and four samples are masked."""
     made = make_recordings(np.full((2, 3, 3), 3.0), 1200, RATE_HZ, 0.005)
-    for number, length in ((1, 800), (2, 1000)):
+    for number, length in ((1, 700), (2, 1000)):
         made["samples"][:, number] = length
         made.angular_rate[:, number, :, length:] = np.nan
     made["samples"][1, 1], made.angular_rate[1, 1] = 0, np.nan
@@ -227,12 +289,12 @@ def uneven(make_recordings):
     return made
 
 
-def test_recordings_are_cut_to_the_length_that_keeps_most(uneven, make_bias, caplog):
+def test_recordings_are_cut_to_the_length_that_keeps_most(uneven, make_bias, make_quality, caplog):
     bias = make_bias(uneven, measure_allan_variance(uneven))
     with caplog.at_level("INFO", "gyro_pipeline"):
-        cut, biases, contents = cut_to_common_length(uneven, bias, quality_of(uneven))
+        cut, biases, contents = cut_to_common_length(uneven, bias, make_quality(uneven))
     assert caplog.messages == [
-        "sparkfun: recordings are 40.0 to 60.0 s; studies use the first 50.0 s of each, the length "
+        "sparkfun: recordings are 35.0 to 60.0 s; studies use the first 50.0 s of each, the length "
         "of IMU 1 recording 3, 1_3.csv, which keeps most samples, and leave out IMU 1 recording 2 "
         "(1_2.csv). quality.length_s sets another length"
     ]
@@ -246,14 +308,16 @@ def test_recordings_are_cut_to_the_length_that_keeps_most(uneven, make_bias, cap
         place = {"imu": row.imu, "recording": row.recording, "axis": row.axis}
         assert float(cut.recording_mean.sel(place)) == row.bias_dps
     assert contents.masked[0].tolist() == [3, 4, 900, 901]
-    assert uneven["samples"].values.tolist() == [[1200, 800, 1000], [1200, 0, 1000]]
+    assert uneven["samples"].values.tolist() == [[1200, 700, 1000], [1200, 0, 1000]]
 
 
-def test_recordings_of_one_length_stay_as_they_are(make_recordings, make_bias, caplog):
+def test_recordings_of_one_length_stay_as_they_are(
+    make_recordings, make_bias, make_quality, caplog
+):
     alike = make_recordings(np.zeros((1, 2, 3)), 1200, RATE_HZ, 0.005)
     bias = make_bias(alike, measure_allan_variance(alike))
     with caplog.at_level("INFO", "gyro_pipeline"):
-        cut, same, _ = cut_to_common_length(alike, bias, quality_of(alike))
+        cut, same, _ = cut_to_common_length(alike, bias, make_quality(alike))
     assert cut.angular_rate.identical(alike.angular_rate)
     assert cut.attrs["data_hash"] == alike.attrs["data_hash"]
     assert same is bias

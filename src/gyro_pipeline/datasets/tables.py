@@ -9,6 +9,7 @@ from kedro_datasets._typing import TablePreview
 
 from gyro_pipeline.conventions import Missing
 from gyro_pipeline.datasets.atomic import replacing
+from gyro_pipeline.tracking import FINGERPRINT
 
 
 class Table(AbstractDataset[pd.DataFrame, pd.DataFrame | Missing]):
@@ -66,4 +67,5 @@ def read_table(path: Path) -> pd.DataFrame:
     """Read a table that :class:`Table` wrote."""
     if path.suffix == ".parquet":
         return pd.read_parquet(path)
-    return pd.read_csv(path, keep_default_na=False, na_values=[""])
+    texts = {FINGERPRINT: str}  # some look like numbers
+    return pd.read_csv(path, keep_default_na=False, na_values=[""], dtype=texts)

@@ -7,6 +7,9 @@ import numpy as np
 from gyro_pipeline.conventions import TEST, TRAIN, VALIDATION, InputError
 from gyro_pipeline.parameters import Splits
 
+FEWEST_TRAINING = 2
+"""Recordings, without which none validates: a network centres each device on its own mean."""
+
 
 def split_recordings(
     recordings: Sequence[int],
@@ -59,7 +62,7 @@ def choose_validation(
         split_seed: Of the choice.
         number: Of the fold, from 1; 0 of a hold-out.
     """
-    if wanted >= len(recordings):
+    if len(recordings) - wanted < FEWEST_TRAINING:
         return []
     generator = np.random.default_rng([split_seed, number])
     return sorted(generator.choice(recordings, wanted, replace=False).tolist())

@@ -152,7 +152,7 @@ def _content(spec: RunSpec, sets: TrainingSets, settings: Training) -> list[Any]
     return [
         code_hash("gyro_pipeline.estimators.fitting", entry(spec.estimator)),
         spec.estimator,
-        [sets.recordings.attrs["data_hash"]] if spec.real_imus else [],
+        sets.recordings.attrs["data_hash"],
         [sets.virtual.attrs["data_hash"]] if spec.virtual_imus and sets.virtual else [],
         {fold: _hash(training.windows) for fold, training in sets.of(spec).items()},
         _hash(_tests(sets.table_of(spec))),
@@ -178,11 +178,10 @@ def _problem(spec: RunSpec, folds: Mapping[str, TrainingSet], settings: Training
     """
     estimator = make_estimator(spec.estimator, settings, spec.seed)
     for fold, training in folds.items():
-        if training.recordings() < estimator.fewest_recordings:
-            return (
-                f"{fold}: {spec.estimator} needs {estimator.fewest_recordings} training "
-                f"recordings, got {training.recordings()}"
-            )
+        try:
+            estimator.check(training.part(estimator.uses))
+        except InputError as error:
+            return f"{fold}: {spec.estimator} cannot be fitted: {error}"
     estimator.work(next(iter(folds.values())))
     return ""
 
@@ -293,10 +292,11 @@ def _fitted(  # noqa: PLR0917 - what a fit is stored with
 
 def _example(spec: RunSpec, training: TrainingSet, recordings: xr.Dataset) -> np.ndarray:
     """A window as the estimator sees it, (1, gyroscopes, samples), deg/s."""
-    imus = spec.real_imus if spec.method == 1 else 1
-    first = recordings.angular_rate.isel(
-        imu=slice(imus), recording=0, sample=slice(training.size)
-    ).transpose("imu", "axis", "sample")
+    seen = recordings.isel(imu=slice(spec.real_imus if spec.method == 1 else 1))
+    there = (seen["samples"] > 0).all("imu").to_numpy()
+    number = int(there.argmax())  # the first that all of them have
+    window = seen.angular_rate.isel(recording=number, sample=slice(training.size))
+    first = window.transpose("imu", "axis", "sample")
     return fill_masked(first.to_numpy().reshape(1, -1, training.size)).astype(np.float32)
 
 

@@ -204,10 +204,10 @@ def _real_windows(  # noqa: PLR0917 - what a table depends on
     label = f"{study.experiment} {recordings.attrs['sensor']}, {size / rate_hz:g} s windows"
     if losses := describe_losses(contents, samples, size):
         logger.warning("%s: %s", label, losses)
-    split = _split(recordings) if study.recordings is None else None
+    split, imu = _split(recordings) if study.recordings is None else None, tested_imu(recordings)
 
     def table(windows: pd.DataFrame) -> pd.DataFrame:
-        candidates = Candidates(windows, split, tested_imu(recordings), splits)
+        candidates = Candidates(windows, split, imu, numbers, splits)
         folds = [
             windows[roles != UNUSED].assign(fold=fold, role=roles[roles != UNUSED])
             for fold, roles in PROTOCOLS[protocol](candidates)
@@ -215,8 +215,10 @@ def _real_windows(  # noqa: PLR0917 - what a table depends on
         return pd.concat(folds, ignore_index=True).assign(origin=ORIGIN_REAL)
 
     if study.recordings is not None:
-        contents = _first_recordings(contents, samples, size, tested_imu(recordings), study)
-    tested = table(usable_windows(contents, samples, size, stride))
+        contents = _first_recordings(contents, samples, size, imu, study)
+    windows = usable_windows(contents, samples, size, stride)
+    numbers = sorted(windows.recording[windows.imu == imu].unique().tolist())
+    tested = table(windows)
     if not (tested.role == TEST).any():
         raise InputError(
             f"{label}: no test recording has one that can be used; lower windows_s of the study, "

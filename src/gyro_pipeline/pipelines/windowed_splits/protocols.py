@@ -43,19 +43,15 @@ class Candidates:
         windows: A row per usable window of a real recording: ``imu, recording, start``.
         split: Role of each recording in a hold-out; None where few recordings make a k-fold.
         tested: The IMU whose recordings test.
+        numbers: Its recordings that can test, in order, whichever windows these are.
         splits: Counts, and the seed of every deal.
     """
 
     windows: pd.DataFrame
     split: Mapping[int, str] | None
     tested: int
+    numbers: Sequence[int]
     splits: Splits
-
-    @property
-    def numbers(self) -> list[int]:
-        """Recordings of the tested IMU that have a window, in order."""
-        of_tested = self.windows.recording[self.windows.imu == self.tested]
-        return sorted(of_tested.unique().tolist())
 
     def roles(self, of_recordings: Mapping[int, str]) -> Texts:
         """Roles of windows by their recordings; only the tested IMU tests."""
