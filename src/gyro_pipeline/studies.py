@@ -235,7 +235,7 @@ def run_params(
         splits: How recordings are split, and which windows train.
         virtual_gyros: Their turn-on jitter is recorded where the run has some.
     """
-    params: dict[str, Any] = asdict(spec) | study.splits(splits).model_dump(include=_RECORDED)
+    params: dict[str, Any] = asdict(spec) | split_params(study, splits)
     if spec.virtual_gyros:
         params["turn_on_jitter_mdps"] = virtual_gyros.turn_on_jitter_mdps
     if estimator_class(spec.estimator).seeded:
@@ -243,10 +243,12 @@ def run_params(
     return params
 
 
-_RECORDED = {
-    "split_seed",
-    "training_windows",
-    "validation_recordings",
-    "fold_validation_recordings",
-}
-"""Settings of the splits that a run's parameters name."""
+def split_params(study: Study, splits: Splits) -> dict[str, Any]:
+    """Settings of the splits that a run's parameters name."""
+    named = {
+        "split_seed",
+        "training_windows",
+        "validation_recordings",
+        "fold_validation_recordings",
+    }
+    return study.splits(splits).model_dump(include=named)

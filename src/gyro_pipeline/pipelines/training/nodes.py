@@ -26,7 +26,15 @@ from gyro_pipeline.fingerprints import code_hash, data_hash, fingerprint
 from gyro_pipeline.parameters import Execution, Only, Splits, Study, Training, VirtualGyros
 from gyro_pipeline.physics.bias import fill_masked
 from gyro_pipeline.protocol.windows import window_size
-from gyro_pipeline.studies import LEFT_OUT, RunSpec, planned, run_params, run_specs, study_rows
+from gyro_pipeline.studies import (
+    LEFT_OUT,
+    RunSpec,
+    planned,
+    run_params,
+    run_specs,
+    split_params,
+    study_rows,
+)
 from gyro_pipeline.tracking import FINGERPRINT, FittedRun, RunIdentity, StoredRun
 
 logger = logging.getLogger(__name__)
@@ -111,6 +119,7 @@ def plan_runs(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     seeds: list[int],
     only: Only,
     training: Training,
+    splits: Splits,
     virtual: xr.Dataset | None = None,
 ) -> pd.DataFrame:
     """List the runs that a study needs on a sensor, before anything is trained.
@@ -123,6 +132,7 @@ def plan_runs(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
         seeds: Of estimators that draw at random.
         only: Narrows the grid.
         training: Hyper-parameters; part of the fingerprints of estimators that have some.
+        splits: Settings that runs carry.
         virtual: Virtual recordings, where the study uses some.
 
     Returns:
@@ -138,7 +148,8 @@ def plan_runs(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     runs = []
     for spec in run_specs(rows, study.unseen_devices):
         folds = sets.of(spec)
-        content = _content(spec, sets, settings)
+        # what a report finds runs by, also where it makes no difference
+        content = [*_content(spec, sets, settings), split_params(study, splits)]
         problem = _problem(spec, folds, settings)
         if problem:
             logger.warning("%s is left out: %s", _name(spec), problem)
