@@ -27,7 +27,7 @@ from kedro.framework.startup import bootstrap_project
 from mlflow import MlflowClient
 from mlflow.entities import Run
 
-from gyro_pipeline.conventions import AXES, DIMENSIONS, TEST, TRAIN, VALIDATION
+from gyro_pipeline.conventions import AXES, DIMENSIONS, HOLD_OUT, TEST, TRAIN, VALIDATION
 from gyro_pipeline.datasets.recordings import InspectedRecordings, Recordings
 from gyro_pipeline.datasets.tracked_runs import TrackedRuns
 from gyro_pipeline.fingerprints import data_hash
