@@ -14,16 +14,26 @@ all non-overlapping windows. What each part shows, and its last results: benchma
 import argparse
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
-from gyro_pipeline.conventions import AXES, DIMENSIONS, MDPS, PAPER, RECORDING_MEAN
-from gyro_pipeline.estimators import ESTIMATORS, FittedEstimator
-from gyro_pipeline.learning.examples import Device
-from gyro_pipeline.learning.jobs import NetworkEstimator, TrainingJob, run_training
+from gyro_pipeline.conventions import (
+    AXES,
+    DIMENSIONS,
+    MDPS,
+    ORIGIN_REAL,
+    PAPER,
+    RECORDING_MEAN,
+    TRAIN,
+    VALIDATION,
+)
+from gyro_pipeline.estimators import ESTIMATORS, estimator_class, make_estimator
+from gyro_pipeline.estimators.base import Estimator
+from gyro_pipeline.estimators.training import TrainingSet
 from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.noise import simulate_noise, warm_up
 from gyro_pipeline.physics.recording_model import RecordingModel, best_linear
@@ -91,7 +101,8 @@ def labelled(data: dict[str, tuple], count: int, rate_hz: float) -> xr.Dataset:
     """Recordings of IMU 1 in the layout of the conventions."""
     coords = {"imu": [1], "recording": np.arange(1, 1 + count), "axis": list(AXES)}
     lengths = np.full((1, count), data["angular_rate"][1].shape[-1])
-    data["samples"] = (DIMENSIONS[:2], lengths)
+    means = data["angular_rate"][1].mean(axis=-1, dtype=np.float64)
+    data |= {"samples": (DIMENSIONS[:2], lengths), "recording_mean": (DIMENSIONS[:3], means)}
     return xr.Dataset(data, coords, {"rate_hz": rate_hz, "sensor": "benchmark"})
 
 
@@ -115,8 +126,20 @@ def windows_of(recordings: xr.Dataset, window_s: float) -> Iterator[tuple]:
         yield int(number), windows, starts, samples.mean(axis=-1, dtype=np.float64)
 
 
+def fitted(name: str, recordings: xr.Dataset, window_s: float, validate: int = 0) -> Estimator:
+    """An estimator, fitted to all windows of a length; the last recordings validate."""
+    size = round(window_s * recordings.attrs["rate_hz"])
+    numbers = recordings.recording.to_numpy()
+    starts = np.arange(0, recordings.sizes["sample"] - size + 1, size)
+    rows = pd.MultiIndex.from_product([numbers, starts], names=["recording", "start"])
+    windows = rows.to_frame(index=False).assign(role=TRAIN, origin=ORIGIN_REAL, imu=1)
+    windows.loc[windows.recording.isin(numbers[len(numbers) - validate :]), "role"] = VALIDATION
+    training = TrainingSet(recordings, None, windows, size, 1)
+    return make_estimator(name, base_parameters().training, 0).fit(training)
+
+
 def judged(
-    estimator: FittedEstimator, tested: xr.Dataset, window_s: float
+    estimator: Estimator, tested: xr.Dataset, window_s: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Errors against the mean of the recording, and sigmas, both (windows, axes)."""
     errors, sigmas = [], []
@@ -166,7 +189,7 @@ def to_the_oracle(model: str, names: list[str], counts: list[int], seeds: int) -
         oracle = rms(judged(Oracle(MODELS[model], made.unit_bias.to_numpy()), tested, 10)[0])
         for count in counts:
             for name in names:
-                estimator = ESTIMATORS[name]().fit(split(made, count)[0])
+                estimator = fitted(name, split(made, count)[0], 10)
                 error = rms(judged(estimator, tested, 10)[0])
                 ratios.setdefault((name, count), []).append(error / oracle)
     for (name, count), values in ratios.items():
@@ -183,39 +206,19 @@ def white(quick: bool) -> None:
     to_the_oracle("white", names, [80, 10], 4 if quick else 20)
 
 
-class PaperNetwork:
-    """The paper's network with the settings of conf/base, the last 8 recordings for validation."""
-
-    def __init__(self, window_s: float, weights: str) -> None:
-        self._window_s, self._weights = window_s, weights
-
-    def fit(self, recordings: xr.Dataset) -> NetworkEstimator:
-        rates, numbers = recordings.angular_rate, recordings.recording.to_numpy().tolist()
-        bias = rates.astype(np.float64).mean("sample")
-        kept = -base_parameters().splits.validation_recordings
-        job = TrainingJob(
-            name="cnn",
-            devices=[Device(rates, bias, (1,), tuple(numbers[:kept]))],
-            validation=Device(rates, bias, (1,), tuple(numbers[kept:])),
-            window=round(self._window_s * recordings.attrs["rate_hz"]),
-            settings=base_parameters().training,
-            seed=0,
-        )
-        return NetworkEstimator(run_training(job, lambda work: None).artifact, self._weights)
-
-
 def cnn(quick: bool) -> None:
     seeds = 2 if quick else 20
     print("\nThe paper's network on the same white noise, 80 recordings, 10 s: last and best epoch")
-    for weights in ("last", "best"):
-        ratios = []
-        for seed in range(seeds):
-            made = simulate(np.random.default_rng([7, seed]), MODELS["white"], 80 + TESTED)
-            training, tested = split(made, 80)
-            oracle = rms(judged(Oracle(MODELS["white"], made.unit_bias.to_numpy()), tested, 10)[0])
-            network = PaperNetwork(10, weights).fit(training)
-            ratios.append(rms(judged(network, tested, 10)[0]) / oracle)
-        print(f"  {weights:24} {np.mean(ratios):6.3f} (largest {np.max(ratios):.3f}, n={seeds})")
+    ratios: dict[str, list[float]] = {}
+    for seed in range(seeds):
+        made = simulate(np.random.default_rng([7, seed]), MODELS["white"], 80 + TESTED)
+        training, tested = split(made, 80)
+        oracle = rms(judged(Oracle(MODELS["white"], made.unit_bias.to_numpy()), tested, 10)[0])
+        network = fitted("cnn", training, 10, base_parameters().splits.validation_recordings)
+        for weights, variant in network.variants().items():
+            ratios.setdefault(weights, []).append(rms(judged(variant, tested, 10)[0]) / oracle)
+    for weights, found in ratios.items():
+        print(f"  {weights:24} {np.mean(found):6.3f} (largest {np.max(found):.3f}, n={seeds})")
 
 
 def warming(quick: bool) -> None:
@@ -262,23 +265,22 @@ def drifts(quick: bool) -> None:
         ratios = []
         for seed in range(seeds):
             training, tested = split(make(np.random.default_rng([8, seed]), 80 + TESTED), 80)
-            fitted = [
-                ESTIMATORS[one]().fit(training)
+            network, linear = (
+                rms(judged(fitted(one, training, 10), tested, 10)[0])
                 for one in ("residual_network", "best_linear_warm_up")
-            ]
-            network, linear = (rms(judged(one, tested, 10)[0]) for one in fitted)
+            )
             ratios.append(network / linear)
         error = np.std(ratios, ddof=1) / np.sqrt(seeds)
         print(f"  {name:26} {np.mean(ratios):.3f} +- {error:.3f} (largest {np.max(ratios):.3f})")
 
 
-def leave_one_out(recordings: xr.Dataset, make: Callable[[], FittedEstimator]) -> dict:
+def leave_one_out(recordings: xr.Dataset, name: str) -> dict:
     """Errors and sigmas by window length, every recording judged by what the others taught."""
     found: dict[float, list] = {window_s: [] for window_s in WINDOWS_S}
     for i in range(recordings.sizes["recording"]):
         others = np.delete(np.arange(recordings.sizes["recording"]), i)
-        estimator = make().fit(recordings.isel(recording=others))
         for window_s in WINDOWS_S:
+            estimator = fitted(name, recordings.isel(recording=others), window_s)
             found[window_s].append(judged(estimator, recordings.isel(recording=[i]), window_s))
     return {
         w: [np.concatenate(part) for part in zip(*all_, strict=True)] for w, all_ in found.items()
@@ -294,7 +296,8 @@ def real(quick: bool) -> None:
         "\nMemsense, leave-one-recording-out: RMSE over that of the running mean at 1 2 5 10 30 s;"
     )
     print("share of errors within 1 and 2 sigma, over all of these windows' lengths from to")
-    results = {name: leave_one_out(recordings, make) for name, make in ESTIMATORS.items()}
+    tried = [name for name in ESTIMATORS if not estimator_class(name).seeded]
+    results = {name: leave_one_out(recordings, name) for name in tried}
     for name, found in results.items():
         ratios = [rms(found[w][0]) / rms(results["mean"][w][0]) for w in WINDOWS_S]
         shares = [
@@ -329,10 +332,9 @@ def few(quick: bool) -> None:
             order = np.random.default_rng([11, resample]).permutation(recordings.sizes["recording"])
             training = recordings.isel(recording=np.sort(order[:5]))
             tested = recordings.isel(recording=np.sort(order[5 : 5 + TESTED]))
-            mean = [rms(judged(ESTIMATORS["mean"](), tested, w)[0]) for w in WINDOWS_S]
+            mean = [rms(judged(fitted("mean", training, w), tested, w)[0]) for w in WINDOWS_S]
             for name, values in ratios.items():
-                estimator = ESTIMATORS[name]().fit(training)
-                own = [rms(judged(estimator, tested, w)[0]) for w in WINDOWS_S]
+                own = [rms(judged(fitted(name, training, w), tested, w)[0]) for w in WINDOWS_S]
                 values.append(np.divide(own, mean))
         for name, values in ratios.items():
             text = " ".join(f"{value:.3f}" for value in np.mean(values, axis=0))
@@ -356,9 +358,10 @@ def coverage(quick: bool) -> None:
             generator = np.random.default_rng([13, len(source), device])
             made = simulate(generator, MODELS[source], 80 + tested)
             for name, found in shares.items():
-                estimator = ESTIMATORS[name]().fit(made.isel(recording=slice(80)))
-                rest = made.isel(recording=slice(80, None))
-                pairs = [judged(estimator, rest, window_s) for window_s in WINDOWS_S]
+                training, rest = (
+                    made.isel(recording=part) for part in (slice(80), slice(80, None))
+                )
+                pairs = [judged(fitted(name, training, w), rest, w) for w in WINDOWS_S]
                 found.append([[np.mean(np.abs(e) < k * s) for e, s in pairs] for k in (1, 2)])
         for name, found in shares.items():
             rows = ["  ".join(f"{x:.3f}" for x in row) for row in np.mean(found, axis=0)]
@@ -377,7 +380,7 @@ def history(quick: bool) -> None:
         walk = np.cumsum(generator.normal(0, 1 * MDPS, (1, 41, len(AXES))), axis=1)
         made["angular_rate"] = made.angular_rate + walk[..., None].astype(np.float32)
         for name in names:
-            estimator = ESTIMATORS[name]().fit(made.isel(recording=slice(40)))
+            estimator = fitted(name, made.isel(recording=slice(40)), 10)
             errors[name].append(judged(estimator, made.isel(recording=[40]), 10)[0])
     for name in names:
         print(f"  {name:24} {rms(errors[name]) / rms(errors['mean']):.3f}")

@@ -37,10 +37,10 @@ from gyro_pipeline.learning.trainer import TorchEngine
 from gyro_pipeline.learning.trainings import TrainingBatch, free_memory, in_batches
 from gyro_pipeline.parameters import Parameters
 from gyro_pipeline.settings import CONFIG_LOADER_ARGS
-from gyro_pipeline.studies import Cell
+from gyro_pipeline.studies import RunSpec
 
 SENSOR, WINDOW_S = "sparkfun", 10
-"""Of the comparison: its augmentation study, six cells of equal sizes."""
+"""Of the comparison: its augmentation study, six training sets of equal sizes."""
 FEW, MORE = 4, 20
 """Epochs that are timed for the studies; the difference is what an epoch costs."""
 
@@ -67,7 +67,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         jobs = study_jobs(parameters, Path(folder))
         batch = compared_batch(jobs, device)
-        print(f"\n{len(batch.cells)} cells x {STUDY_SEEDS} seeds, {batch.jobs[0].architecture}")
+        print(
+            f"\n{len(batch.cells)} training sets x {STUDY_SEEDS} seeds, "
+            f"{batch.jobs[0].architecture}"
+        )
         compare(batch, options.repetitions, options.epochs)
         extrapolate(jobs, device)
 
@@ -88,7 +91,7 @@ def seconds() -> float:
 
 
 def seeded(jobs: list[TrainingJob]) -> list[TrainingJob]:
-    """Every job with every seed, of one cell."""
+    """Every job with every seed; these share its examples."""
     return [
         replace(job, seed=seed, cell=job.name, name=f"{job.name}, seed {seed}")
         for job in jobs
@@ -99,11 +102,11 @@ def seeded(jobs: list[TrainingJob]) -> list[TrainingJob]:
 # ----------------------------------------------------------------- against loops on the same GPU
 
 
-def compared_batch(jobs: dict[Cell, TrainingJob], device: torch.device) -> TrainingBatch:
+def compared_batch(jobs: dict[RunSpec, TrainingJob], device: torch.device) -> TrainingBatch:
     wanted = [
         job
-        for cell, job in jobs.items()
-        if (cell.study, cell.sensor, cell.window_s) == ("augmentation", SENSOR, WINDOW_S)
+        for spec, job in jobs.items()
+        if (spec.study, spec.sensor, spec.window_s) == ("augmentation", SENSOR, WINDOW_S)
     ]
     return TrainingBatch(seeded(wanted), device)
 
@@ -139,7 +142,7 @@ def compare(batch: TrainingBatch, repetitions: int, epochs: int) -> None:
 
 
 def prepared_cells(batch: TrainingBatch) -> Cells:
-    """Training and validation examples of each cell, in memory."""
+    """Training and validation examples of each training set, in memory."""
     return {name: prepared(job, lambda: None)[:2] for name, job in batch.cells.items()}
 
 
@@ -223,12 +226,12 @@ def loss_of(network: CalibrationNetwork, examples: Examples, device: torch.devic
 # ------------------------------------------------------------------------------- the studies
 
 
-def extrapolate(jobs: dict[Cell, TrainingJob], device: torch.device) -> None:
+def extrapolate(jobs: dict[RunSpec, TrainingJob], device: torch.device) -> None:
     """Prepare every batch, and time few and some more epochs of it."""
     rows = []
-    for study, sensor in dict.fromkeys((cell.study, cell.sensor) for cell in jobs):
+    for study, sensor in dict.fromkeys((spec.study, spec.sensor) for spec in jobs):
         of_node = [
-            job for cell, job in jobs.items() if (cell.study, cell.sensor) == (study, sensor)
+            job for spec, job in jobs.items() if (spec.study, spec.sensor) == (study, sensor)
         ]
         for batch in in_batches(seeded(of_node), device, free_memory(device)):
             started = seconds()

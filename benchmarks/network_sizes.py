@@ -11,6 +11,7 @@ recording is read.
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +20,13 @@ from kedro.framework.session import KedroSession
 from kedro.framework.startup import bootstrap_project
 
 from gyro_pipeline.conventions import HOLD_OUT
+from gyro_pipeline.estimators.paper_network import PaperNetwork
 from gyro_pipeline.executors import run_jobs
 from gyro_pipeline.learning.jobs import TrainingJob, run_training
-from gyro_pipeline.parameters import Parameters
-from gyro_pipeline.pipelines.training.nodes import Devices
-from gyro_pipeline.studies import CNN, Cell
+from gyro_pipeline.parameters import Only, Parameters
+from gyro_pipeline.pipelines.training.nodes import TrainingSets
+from gyro_pipeline.pipelines.windowed_splits.nodes import cut_to_common_length, split_windows
+from gyro_pipeline.studies import CNN, study_rows
 
 CANDIDATES = [  # channels, kernel, stride, pool, hidden
     (8, 10, 5, 4, 32),
@@ -35,6 +38,7 @@ CANDIDATES = [  # channels, kernel, stride, pool, hidden
     (16, 20, 20, 4, 64),
     (32, 10, 10, 4, 64),
 ]
+DATA = ("raw_logs.recordings", "ground_truth.bias")
 NAMES = ("channels", "kernel", "stride", "pool", "hidden")
 
 
@@ -50,22 +54,22 @@ def main() -> None:
         context = session.load_context()
         parameters = Parameters(**context.config_loader["parameters"])
         load = context.catalog.load
-        bias = load("sparkfun.ground_truth.bias").set_index(["imu", "recording", "axis"])
-        devices = Devices(
-            load("sparkfun.raw_logs.recordings"),
-            bias.bias_dps.to_xarray(),
-            load("sparkfun.windowed_splits.roles"),
-            None,
-            parameters.virtual_gyros,
+        recordings, bias = (load(f"sparkfun.{name}") for name in DATA)
+        alike, _, contents = cut_to_common_length(
+            recordings, bias, load("sparkfun.raw_logs.quality")
         )
+    study = parameters.studies["real2real"]
+    windows = split_windows(study, alike, contents, parameters.splits, [10.0], Only())
+    sets = TrainingSets(windows, alike, None)
+    rows = study_rows(study, "sparkfun", parameters.source, [10.0], [0], Only())
     jobs = []
     for number, sizes in enumerate(CANDIDATES):
         changes = dict(zip(NAMES, sizes, strict=True)) | {"epochs": options.epochs}
         training = parameters.training.model_copy(update=changes)
-        for real in (3, 12):
+        for row in (row for row in rows if row.estimator == CNN and row.real_gyros in (3, 12)):
             for seed in range(options.seeds):
-                cell = Cell("", 2, "sparkfun", "", real, 0, 10.0, seed, HOLD_OUT, CNN)
-                jobs.append(devices.job(f"{number} {real}", cell, training))
+                job = PaperNetwork(training, seed).job(sets.of(row)[HOLD_OUT])
+                jobs.append(replace(job, name=f"{number} {row.real_gyros}"))
     rows = [
         _row(job, result) for job, result in run_jobs(jobs, timed, parameters.execution, "sizes")
     ]
@@ -81,9 +85,7 @@ def timed(job: TrainingJob, report):  # noqa: ANN001, ANN201, D103
 def _row(job: TrainingJob, result: tuple) -> dict[str, float]:
     network, seconds = result
     losses = network.history.val_loss
-    windows = sum(len(device.numbers) for device in job.devices)
-    windows *= job.devices[0].recordings.sizes["sample"] // job.window
-    steps = job.settings.epochs * -(-windows // job.settings.batch_size)
+    steps = job.settings.epochs * -(-job.windows // job.settings.batch_size)
     sizes = {name: getattr(job.settings, name) for name in NAMES}
     return sizes | {
         "real": int(job.name.split()[1]),

@@ -3,7 +3,8 @@
     pip install -e .[bench]                   # the peers; without them they are left out
     python benchmarks/training.py             # one core: ratios to Lightning, fraction of peak
     python benchmarks/training.py --scaling   # two processes against one
-    python benchmarks/training.py --study     # the whole study, extrapolated from every cell
+    python benchmarks/training.py --against COMMIT  # the step in C, and that of another commit
+    python benchmarks/training.py --study     # the three studies, extrapolated from every network
     python benchmarks/training.py --memory    # peak memory and time against N and S
     python benchmarks/training.py --agreement # results of our paths over the whole schedule
 
@@ -41,8 +42,10 @@ from torch import Tensor
 from torch.nn import functional
 from torch.utils.data import DataLoader, Sampler, TensorDataset
 
-from gyro_pipeline.conventions import AXES, DIMENSIONS, TEST, TRAIN
+from gyro_pipeline.conventions import AXES, DIMENSIONS, HOLD_OUT, TEST, TRAIN
 from gyro_pipeline.datasets.recordings import Recordings
+from gyro_pipeline.estimators.paper_network import PaperNetwork
+from gyro_pipeline.estimators.training import TrainingSet
 from gyro_pipeline.executors import available_cores, run_jobs
 from gyro_pipeline.learning import fused
 from gyro_pipeline.learning.examples import Device, Examples
@@ -57,11 +60,12 @@ from gyro_pipeline.learning.jobs import (
 from gyro_pipeline.learning.network import Architecture, CalibrationNetwork
 from gyro_pipeline.learning.packing import pack
 from gyro_pipeline.learning.trainer import Engine, TorchEngine, predict, train
-from gyro_pipeline.parameters import Execution, Parameters
-from gyro_pipeline.pipelines.training.nodes import Devices
-from gyro_pipeline.protocol.splits import assign_roles
+from gyro_pipeline.parameters import Execution, Only, Parameters, Study
+from gyro_pipeline.pipelines.training.nodes import TrainingSets
+from gyro_pipeline.pipelines.windowed_splits.nodes import split_windows
+from gyro_pipeline.protocol.splits import split_recordings
 from gyro_pipeline.settings import CONFIG_LOADER_ARGS
-from gyro_pipeline.studies import CNN, Cell, study_cells
+from gyro_pipeline.studies import CNN, RunSpec, run_specs, study_rows
 
 BATCH, RATE = 64, 1e-4
 STEPS_PER_EPOCH = 10
@@ -102,6 +106,7 @@ def main() -> None:
         ("agreement", "results of our paths over the whole schedule"),
     ):
         parts.add_argument(f"--{part}", action="store_true", help=meaning)
+    parts.add_argument("--against", metavar="COMMIT", help="the step in C of another commit")
     arguments.add_argument("--sizes", nargs="+", choices=SIZES, default=list(SIZES))
     arguments.add_argument("--repetitions", type=int, default=5)
     arguments.add_argument("--steps", type=int, default=40, help="per repetition, on one core")
@@ -112,7 +117,9 @@ def main() -> None:
     print(machine())
     fused.available()  # compiled now, not while the clock runs
     with tempfile.TemporaryDirectory() as folder:
-        if options.scaling:
+        if options.against:
+            against(parameters, options.against, Path(folder), options.sizes, options.repetitions)
+        elif options.scaling:
             scaling(parameters, Path(folder), options.repetitions)
         elif options.study:
             study(parameters, Path(folder))
@@ -478,6 +485,89 @@ def lightning_way(network: CalibrationNetwork, x: Tensor, y: Tensor) -> Run:
     return run
 
 
+# ------------------------------------------------------------------ the step in C, then and now
+
+STEP_PROGRAM = """
+import sys, time
+import numpy as np, torch
+from gyro_pipeline.learning.fused import FusedEngine
+from gyro_pipeline.learning.jobs import initial_network, shuffling
+from gyro_pipeline.learning.network import Architecture
+from gyro_pipeline.learning.packing import pack
+
+torch.set_num_threads(1)
+n, batch, *sizes = map(int, sys.argv[1:])
+a = Architecture(*sizes)
+random = np.random.default_rng(0)
+windows = random.standard_normal((n, a.gyroscopes, a.window), np.float32)
+targets = random.standard_normal((n, a.gyroscopes), np.float32)
+packed = pack(windows.transpose(1, 0, 2), a)
+engine, order = FusedEngine(initial_network(a, 0), packed, targets, batch), shuffling(0)
+for line in sys.stdin:
+    started = time.process_time()
+    for _ in range(int(line)):
+        loss = engine.epoch(torch.randperm(n, generator=order).numpy(), 1e-4)
+    print(time.process_time() - started, loss, flush=True)
+"""
+"""Of any commit: trains as many epochs as each line says, and prints the seconds and the loss."""
+
+
+def against(  # noqa: PLR0917 - what the part is asked for
+    parameters: Parameters, commit: str, folder: Path, sizes: list[str], repetitions: int
+) -> None:
+    """The same steps by this package and by that of a commit, in turns on one core."""
+    project = Path(__file__).parents[1]
+    archive = ["git", "-C", str(project), "archive", commit, "src"]
+    files = subprocess.run(archive, capture_output=True, check=True).stdout
+    subprocess.run(["tar", "-x", "-C", str(folder)], input=files, check=True)
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    sources = {commit: folder / "src", "here": project / "src"}
+    for name in sizes:
+        changes, gyroscopes, window = SIZES[name]
+        a = sized(parameters.training.model_copy(update=changes), gyroscopes, window)
+        programs = {way: _step_program(source, a) for way, source in sources.items()}
+        once = [_asked(program, 1)[0] for program in programs.values()]
+        epochs = max(3, int(MEASURE_S / max(once)))
+        ratios, losses = [], {}
+        for _ in range(repetitions):
+            seconds = {}
+            for way, program in programs.items():
+                seconds[way], losses[way] = _asked(program, epochs)
+            ratios.append(seconds[commit] / seconds["here"])
+        for program in programs.values():
+            program.stdin.close()
+            program.wait()
+        ms = 1e3 * seconds["here"] / (epochs * STEPS_PER_EPOCH)
+        reached = ", ".join(f"{loss:.6f}" for loss in losses.values())
+        print(
+            f"{name:16} {ms:6.3f} ms a step here, {np.median(ratios):.3f} times as fast as "
+            f"{commit} ({min(ratios):.3f} to {max(ratios):.3f}); losses {reached}",
+            flush=True,
+        )
+
+
+def _step_program(source: Path, a: Architecture) -> subprocess.Popen[str]:
+    sizes = (a.gyroscopes, a.window, a.channels, a.kernel, a.stride, a.pool, a.hidden)
+    numbers = map(str, (BATCH * STEPS_PER_EPOCH, BATCH, *sizes))
+    program = subprocess.Popen(
+        [sys.executable, "-c", STEP_PROGRAM, *numbers],
+        env=os.environ | {"PYTHONPATH": str(source)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    _asked(program, 1)  # compiled now, not while the clock runs
+    return program
+
+
+def _asked(program: subprocess.Popen[str], epochs: int) -> tuple[float, float]:
+    program.stdin.write(f"{epochs}\n")
+    program.stdin.flush()
+    seconds, loss = program.stdout.readline().split()
+    return float(seconds), float(loss)
+
+
 # ----------------------------------------------------------------- trainings of the whole study
 
 
@@ -524,46 +614,67 @@ def recorded(path: Path, imus: int, recordings: int, samples: int) -> xr.Dataset
     return Recordings(str(path)).load()
 
 
-def study_jobs(parameters: Parameters, folder: Path) -> dict[Cell, TrainingJob]:
+def study_jobs(parameters: Parameters, folder: Path) -> dict[RunSpec, TrainingJob]:
     """Every distinct training of the three studies, one seed each, longest first."""
-    p, jobs, seen = parameters, {}, []
+    p, jobs, seen = parameters, {}, set()
     samples = max(sensor.samples for sensor in p.sensors.values())
-    virtual = recorded(
-        folder / "virtual.nc", p.virtual_gyros.imus, p.virtual_gyros.train_recordings, samples
-    )
+    trained = p.virtual_gyros.train_recordings
+    virtual = recorded(folder / "virtual.nc", p.virtual_gyros.imus, trained, samples)
     for name, sensor in p.sensors.items():
         real = recorded(folder / f"{name}.nc", sensor.imus, sensor.recordings, sensor.samples)
-        real = real.assign_attrs(sensor=name, rate_hz=sensor.rate_hz)
-        numbers = range(1, sensor.recordings + 1)
-        given = {n: TRAIN if n <= sensor.train_recordings else TEST for n in numbers}
-        roles = assign_roles(numbers, p.splits, given)
-        devices = Devices(real, real.recording_mean.load(), roles, virtual, p.virtual_gyros)
+        given = {"sensor": name, "source": p.source, "rate_hz": sensor.rate_hz}
+        real = real.assign_attrs(given)
+        drawn = virtual.isel(sample=slice(sensor.samples)).assign_attrs(
+            given | {"train_recordings": trained, "drawn_from": []}
+        )
         for asked in p.studies.values():
-            if name not in asked.sensors:
+            if not asked.default or name not in asked.sensors:
                 continue
-            for cell in study_cells(asked, name, p.source, p.windows_s, [0], p.only):
-                if cell.estimator == CNN and cell.content not in seen:
-                    seen.append(cell.content)
-                    jobs[cell] = devices.job(str(len(seen)), cell, p.training)
+            for spec, training in _training_sets(p, asked, real, drawn):
+                alike = spec.method, spec.sensor, spec.real_gyros, spec.virtual_gyros, spec.window_s
+                if alike not in seen:
+                    seen.add(alike)
+                    job = PaperNetwork(p.training, seed=0).job(training)
+                    jobs[spec] = replace(job, name=str(len(seen)))
     return dict(sorted(jobs.items(), key=lambda item: item[1].work, reverse=True))
 
 
+def _training_sets(
+    p: Parameters, asked: Study, real: xr.Dataset, drawn: xr.Dataset
+) -> Iterator[tuple[RunSpec, TrainingSet]]:
+    """What each network of a study trains on, as the pipeline's stages make it."""
+    sensor, numbers = real.attrs["sensor"], real.recording.to_numpy().tolist()
+    trained = p.sensors[sensor].train_recordings
+    given = {n: TRAIN if n <= trained else TEST for n in numbers}
+    roles = split_recordings(numbers, numbers, p.splits, given) or {}
+    real = real.assign_coords(split=("recording", [roles[n] for n in numbers]))
+    places = [(imu, n) for imu in real.imu.to_numpy().tolist() for n in numbers]
+    contents = pd.DataFrame(places, columns=["imu", "recording"])
+    contents = contents.assign(content=[str(place) for place in places], masked=[[]] * len(places))
+    virtual = drawn if any(asked.grid_of(sensor).virtual_gyros) else None
+    windows = split_windows(asked, real, contents, p.splits, p.windows_s, Only(), virtual)
+    sets = TrainingSets(windows, real, virtual)
+    rows = study_rows(asked, sensor, p.source, p.windows_s, [0], Only())
+    for spec in run_specs([row for row in rows if row.estimator == CNN], unseen_devices=False):
+        yield spec, sets.of(spec)[HOLD_OUT]
+
+
 def study(parameters: Parameters, folder: Path) -> None:
-    """Measure a few epochs of every cell with all cores busy; extrapolate to all epochs, seeds."""
+    """Measure a few epochs of each with all cores busy; extrapolate to all epochs and seeds."""
     top, jobs = peaks(), study_jobs(parameters, folder)
-    cells = {job.name: cell for cell, job in jobs.items()}
+    specs = {job.name: spec for spec, job in jobs.items()}
     execution = Execution(executor="processes", workers=None)
     rows = []
     for job, (preparation_s, epoch_s, share) in run_jobs(
-        list(jobs.values()), timed_training, execution, "cells"
+        list(jobs.values()), timed_training, execution, "networks"
     ):
         n, steps = job.windows, -(-job.windows // BATCH)
         minutes = (preparation_s + job.settings.epochs * epoch_s) / 60
         rows.append(
             {
-                "study": cells[job.name].study,
-                "sensor": cells[job.name].sensor,
-                "gyros": f"{cells[job.name].real_gyros}+{cells[job.name].virtual_gyros}",
+                "study": specs[job.name].study,
+                "sensor": specs[job.name].sensor,
+                "gyros": f"{specs[job.name].real_gyros}+{specs[job.name].virtual_gyros}",
                 "S": job.window,
                 "windows": n,
                 "preparation_s": preparation_s,
@@ -577,8 +688,8 @@ def study(parameters: Parameters, folder: Path) -> None:
     table = pd.DataFrame(rows).sort_values("minutes", ascending=False)
     print(table.drop(columns=["busy", "steps", "GFLOP"]).round(2).to_string(index=False))
     augmentation = table[table.study == "augmentation"]
-    _total(f"augmentation, {len(augmentation)} cells, 1 seed (make run)", augmentation, 1, top)
-    _total(f"all studies, {len(table)} cells, {STUDY_SEEDS} seeds", table, STUDY_SEEDS, top)
+    _total(f"augmentation, {len(augmentation)} networks, 1 seed (make run)", augmentation, 1, top)
+    _total(f"all studies, {len(table)} networks, {STUDY_SEEDS} seeds", table, STUDY_SEEDS, top)
 
 
 def _total(what: str, table: pd.DataFrame, seeds: int, top: dict[str, float]) -> None:
@@ -631,9 +742,10 @@ def scaling(parameters: Parameters, folder: Path, repetitions: int) -> None:
         print("one core only: scaling is not measured")
         return
     jobs = study_jobs(parameters, folder)
-    cell = next(c for c in jobs if (c.sensor, c.real_gyros, c.virtual_gyros) == ("sparkfun", 12, 0))
-    endless = jobs[cell].settings.model_copy(update={"epochs": 10**6, "decay_every": 10**6})
-    job = replace(jobs[cell], settings=endless)
+    wanted = ("sparkfun", 12, 0)
+    spec = next(s for s in jobs if (s.sensor, s.real_gyros, s.virtual_gyros) == wanted)
+    endless = jobs[spec].settings.model_copy(update={"epochs": 10**6, "decay_every": 10**6})
+    job = replace(jobs[spec], settings=endless)
     print(f"epochs per second of {job.windows} windows of {job.window} samples")
     ratios = []
     for _ in range(repetitions):
