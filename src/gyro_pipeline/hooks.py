@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from traceback import walk_tb
-from types import TracebackType
+from types import NoneType, TracebackType
 from typing import TYPE_CHECKING, Any
 
 import kedro
@@ -38,8 +38,12 @@ _OTHER_ARGUMENTS = "must only contain arguments valid for the constructor"
 """In Kedro's words: a key of a catalog entry is unknown, or lacking."""
 
 
+_NAMES_NODES = ("node_names", "from_nodes", "to_nodes", "from_inputs", "to_outputs", "tags")
+"""Options that name nodes: these are run, whether they are up to date or not."""
+
+
 class Session(KedroSession):
-    """A session that refuses ways to run which cannot end well, before anything is loaded."""
+    """A session that runs what changed, and refuses ways to run which cannot end well."""
 
     def run(self, *arguments: Any, **options: Any) -> dict[str, Any]:
         """Run pipelines, as :meth:`kedro.framework.session.KedroSession.run` does.
@@ -48,7 +52,7 @@ class Session(KedroSession):
             InputError: The runner or an option is of no use here.
         """
         sys.excepthook = _explain
-        from kedro.runner import ParallelRunner  # noqa: PLC0415
+        from kedro.runner import ParallelRunner, SequentialRunner  # noqa: PLC0415
 
         runner = options.get("runner")
         if options.get("only_missing_outputs"):
@@ -66,6 +70,10 @@ class Session(KedroSession):
                 "--async: results are saved one by one as they are made, which Kedro cannot do in "
                 "the background; type kedro run without it"
             )
+        if type(runner) in (SequentialRunner, NoneType) and not any(map(options.get, _NAMES_NODES)):
+            from gyro_pipeline.runner import ChangedNodesRunner  # noqa: PLC0415
+
+            options["runner"] = ChangedNodesRunner(self._project_path / "data" / "ended_nodes.json")
         return super().run(*arguments, **options)
 
 
