@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 _DIGITS = 16
-_C_SOURCES = (".c", ".h")
+_SOURCES = (".c", ".h", ".j2")
 _THIS = __name__.partition(".")[0]
 
 
@@ -34,7 +34,8 @@ def code_hash(*entries: str) -> str:
     """Hash of what modules do, with all modules that they import, directly or not.
 
     Imports inside functions count; modules of Python and of installed packages do not. Neither do
-    comments, docstrings and layout. C sources that lie beside a module count as they are.
+    comments, docstrings and layout. C sources and templates that lie beside a module count as they
+    are.
 
     Args:
         entries: ``package.module`` or ``package.module:Class``; of a package, all its modules.
@@ -52,7 +53,7 @@ def code_hash(*entries: str) -> str:
         package = name if path.name == "__init__.py" else name.rpartition(".")[0]
         contents[name], imported = _parsed(path, package)
         waiting += [package, *imported]
-        beside = [file for file in path.parent.iterdir() if file.suffix in _C_SOURCES]
+        beside = [file for file in path.parent.iterdir() if file.suffix in _SOURCES]
         contents |= {f"{package}/{file.name}": file.read_bytes() for file in beside}
     digest = hashlib.sha256()
     for name in sorted(contents):

@@ -8,6 +8,7 @@ from kedro.io import AbstractDataset, DatasetError
 from pydantic import ValidationError
 
 from gyro_pipeline.conventions import InputError
+from gyro_pipeline.fingerprints import fingerprint
 from gyro_pipeline.logs import Logs
 from gyro_pipeline.parameters import Sensor
 
@@ -43,6 +44,12 @@ class LogSource(AbstractDataset[Logs, Logs]):
         self._source = source
         self._path = Path(path)
         self.metadata = metadata
+
+    def state(self) -> str:
+        """A hash of what is listed: recordings, and the files that they are in."""
+        return fingerprint(
+            [(entry.imu, entry.recording, entry.key) for entry in self.load().entries]
+        )
 
     def save(self, data: Logs) -> None:
         """Refuse: logs are read only."""

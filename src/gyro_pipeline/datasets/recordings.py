@@ -126,6 +126,11 @@ class InspectedRecordings(AbstractDataset[Listing | Recording, list[Recording]])
                 writer.add(recording)
             writer.close()
 
+    @staticmethod
+    def state() -> str:
+        """Nothing: it is what a reading goes on from, and decides no result."""
+        return ""
+
     def _source(self) -> Path:
         return self._path if self._path.is_file() else self._final
 

@@ -87,6 +87,11 @@ class ReportFolder(AbstractDataset[Any, dict[str, pd.DataFrame | Path]]):
         """Refuse: its tables and figures are datasets of their own."""
         raise DatasetError(f"{self._path}: tables and figures are saved one by one")
 
+    @staticmethod
+    def state() -> str:
+        """Nothing: whoever puts something there makes the report anew."""
+        return ""
+
     def _exists(self) -> bool:
         return self._path.is_dir()
 

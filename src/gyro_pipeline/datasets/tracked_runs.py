@@ -161,6 +161,15 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
         ]
         return sorted(stored, key=lambda run: run.started_ms, reverse=True)
 
+    def state(self) -> Any:
+        """How many runs of the study are FINISHED; nothing of all studies, which decides no result.
+
+        What a server holds is not asked for: it always counts as changed.
+        """
+        if self.study is None:
+            return ""
+        return sum(run.finished for run in self.load()) if self._is_own_file else time.time()
+
     def save(self, data: FittedRun | EvaluatedRun) -> None:
         """Add a fit to its run, or complete an evaluated run."""
         if isinstance(data, FittedRun):

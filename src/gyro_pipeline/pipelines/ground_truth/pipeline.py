@@ -8,6 +8,7 @@ from gyro_pipeline.pipelines.ground_truth.nodes import (
     measure_noise,
 )
 from gyro_pipeline.pipelines.ground_truth.report import report_biases
+from gyro_pipeline.runner import ALWAYS
 
 
 def create_report(sensor: str) -> Pipeline:
@@ -21,7 +22,7 @@ def create_report(sensor: str) -> Pipeline:
                 None,
                 name=f"report_biases_{sensor}",
                 namespace="ground_truth",
-                tags=[sensor],
+                tags=[sensor, ALWAYS],
             )
         ]
     )
