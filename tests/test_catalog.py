@@ -19,18 +19,8 @@ CONF = ROOT / "conf"
 ENVS = sorted(
     path.name for path in CONF.iterdir() if path.is_dir() and path.name not in ("base", "local")
 )
-PIPELINES = {
-    "__default__",
-    "augmentation",
-    "estimators",
-    "ground_truth",
-    "input_channels",
-    "leakage",
-    "real2real",
-    "reporting",
-    "unseen_devices",
-    "virtual_gyros",
-}
+STUDIES = {"augmentation", "estimators", "input_channels", "leakage", "real2real", "unseen_devices"}
+PIPELINES = STUDIES | {"__default__", "ground_truth", "reporting", "virtual_gyros"}
 MEMORY = "kedro.io.MemoryDataset"
 SHARED = {"mlflow.db", "data/08_reporting/report"}  # by all sources
 PUBLISHED = "data/01_raw/published"  # files to read only, of two sources
@@ -57,14 +47,20 @@ def entry_name(env, name):
     return name if name in found.config else found.match_dataset_pattern(name)
 
 
-@pytest.fixture
-def pipelines(monkeypatch, parameters):
-    def register(env="base"):
-        bootstrap_project(ROOT)
-        monkeypatch.setattr(pipeline_registry, "_selected", parameters(env))
-        return pipeline_registry.register_pipelines()
+def entry(name, env="base"):
+    return resolver(env).resolve_pattern(name)
 
-    return register
+
+@pytest.fixture(scope="module")
+def registered(parameters):
+    """Pipelines by environment."""
+    bootstrap_project(ROOT)
+    found = {}
+    with pytest.MonkeyPatch.context() as patch:
+        for env in ("base", *ENVS):
+            patch.setattr(pipeline_registry, "_selected", parameters(env))
+            found[env] = pipeline_registry.register_pipelines()
+    return found
 
 
 def datasets_of(pipelines):
@@ -76,7 +72,7 @@ def paths(env, names):
     """Where each dataset is stored."""
     found = {}
     for name in names:
-        config = resolver(env).resolve_pattern(name)
+        config = entry(name, env)
         path = config.get("filepath") or config.get("path")
         if path is not None:
             found[name] = path
@@ -87,48 +83,50 @@ def paths(env, names):
 
 
 @pytest.mark.parametrize("env", ["base", *ENVS])
-def test_every_dataset_of_every_pipeline_has_an_entry(pipelines, env):
-    registered = pipelines(env)
-    assert set(registered) == PIPELINES
-    names = datasets_of(registered)
-    assert len(names) > 10
+def test_every_dataset_has_an_entry_and_a_path_of_its_own_with_the_source(registered, env):
+    assert set(registered[env]) == PIPELINES
+    names = datasets_of(registered[env])
     assert [name for name in names if entry_name(env, name) is None] == []
+    source = configuration(env)["globals"]["source"]
+    stored = paths(env, names)
+    elsewhere = {path for path in stored.values() if source not in Path(path).parts}
+    assert elsewhere == SHARED | ({PUBLISHED} if env == "published" else set())
+    # what is read, and is there already, becomes the recordings in the end
+    begun = (".raw_logs.files", ".raw_logs.earlier", ".raw_logs.inspected")
+    files = [
+        path for name, path in stored.items() if path != "mlflow.db" and not name.endswith(begun)
+    ]
+    assert len(files) == len(set(files)) > 5
+    # only messages between nodes stay in memory, and the reference to the recordings
+    kept = [name for name in names if entry(name, env)["type"] == MEMORY]
+    assert all(".windowed_splits." in name or ".reporting.gaps." in f".{name}" for name in kept)
+    for name in configuration(env)["catalog"] if env != "base" else ():  # it overrides entries
+        assert name in names or name in configuration("base")["catalog"]
 
 
 @pytest.mark.parametrize(
     "typo",
     [
         "sparkfun.ground_thruth.bias",
-        "sparkfun.raw_logs.recording",
         "augmentation.sparkfun.training.run",
+        "augmentation.sparkfun.windowed_splits.window",
         "augmentation.reporting.result",
         "reporting.table.dataset_hours",
-        "augmentation.sparkfun.windowed_splits.window",
-        "recordings",
     ],
 )
 def test_a_typo_has_none(typo):
     assert entry_name("base", typo) is None
 
 
-def test_every_parameter_that_a_node_asks_for_is_there(pipelines):
+def test_every_parameter_and_every_pattern_is_used(registered):
     given = configuration("base")["parameters"]
-    wanted = {
-        name.removeprefix("params:")
-        for pipeline in pipelines().values()
-        for name in pipeline.inputs()
-        if name.startswith("params:")
-    }
-    assert "splits" in wanted
-    for name in wanted:
-        found = given
-        for key in name.split("."):
-            assert key in found, name
-            found = found[key]
-
-
-def test_every_pattern_is_used(pipelines):
-    names = datasets_of(pipelines())
+    for pipeline in registered["base"].values():
+        for name in pipeline.inputs():
+            found = given
+            for key in name.removeprefix("params:").split(".") if "params:" in name else ():
+                assert key in found, name
+                found = found[key]
+    names = datasets_of(registered["base"])
     assert {entry_name("base", name) for name in names} == set(configuration("base")["catalog"])
 
 
@@ -136,7 +134,6 @@ def test_every_pattern_is_used(pipelines):
     ("name", "kind"),
     [
         ("dot.raw_logs.files", "simulated_logs.SimulatedLogs"),
-        ("dot.raw_logs.quality", "tables.Table"),
         ("dot.ground_truth.allan", "recordings.Recordings"),
         ("dot.ground_truth.bias", "tables.Table"),
         ("augmentation.dot.windowed_splits.windows", "tables.Table"),
@@ -145,88 +142,57 @@ def test_every_pattern_is_used(pipelines):
         ("augmentation.reporting.tables.results", "reports.ReportTable"),
         ("estimators.reporting.figures.ng", "reports.ReportFigure"),
         ("reporting.folder", "report_page.ReportFolder"),
-        ("reporting.tables.dataset_hours", "reports.ReportTable"),
         ("reporting.figures.allan_deviation", "reports.ReportFigure"),
     ],
 )
 def test_names_get_their_own_kind_of_dataset(name, kind):
-    assert resolver("base").resolve_pattern(name)["type"] == f"gyro_pipeline.datasets.{kind}"
+    assert entry(name)["type"] == f"gyro_pipeline.datasets.{kind}"
 
 
-def test_kedro_viz_shows_every_dataset_in_the_layer_of_its_stage(pipelines):
-    for name in datasets_of(pipelines()):
-        layer = resolver("base").resolve_pattern(name)["metadata"]["kedro-viz"]["layer"]
-        assert layer in name.split("."), name
+def test_kedro_viz_shows_every_dataset_in_the_layer_of_its_stage(registered):
+    for name in datasets_of(registered["base"]):
+        assert entry(name)["metadata"]["kedro-viz"]["layer"] in name.split("."), name
 
 
-def test_data_that_a_report_may_lack_name_the_pipeline_that_makes_them(pipelines):
-    registered = pipelines()
-    reports = registered["reporting"].inputs()
+def test_data_that_a_report_may_lack_name_the_pipeline_that_makes_them(registered):
     kinds = (".training.plan", ".raw_logs.recordings", ".ground_truth.allan", ".quality")
-    stored = [name for name in reports if name.endswith(kinds)]
+    stored = [name for name in registered["base"]["reporting"].inputs() if name.endswith(kinds)]
     assert {"ng.ground_truth.allan", "augmentation.dot.training.plan"} <= set(stored)
     for name in stored:
-        sensor = name.split(".")[-3]
-        made_by = resolver("base").resolve_pattern(name)["made_by"]
-        pipeline, only = made_by.removeprefix("kedro run --pipeline=").split(" --params=")
-        assert only == f"only.sensor={sensor}"
-        assert name in registered[pipeline].all_outputs()
+        pipeline, only = (
+            entry(name)["made_by"].removeprefix("kedro run --pipeline=").split(" --params=")
+        )
+        assert only == f"only.sensor={name.split('.')[-3]}"
+        assert name in registered["base"][pipeline].all_outputs()
 
 
-def test_the_estimators_are_a_pipeline_of_their_own(pipelines):
-    registered = pipelines()
-    study = "estimators.sparkfun.evaluation.runs"
-    assert study in registered["estimators"].all_outputs()
-    for name in ("__default__", "reporting"):
-        assert not {one for one in datasets_of({name: registered[name]}) if "estimators." in one}
+def test_studies_that_take_long_are_pipelines_of_their_own(registered):
+    pipelines = registered["base"]
+    for study in ("estimators", "unseen_devices", "leakage"):
+        assert f"{study}.memsense.evaluation.runs" in pipelines[study].all_outputs()
+        for name in ("__default__", "reporting"):
+            assert not [one for one in datasets_of({name: pipelines[name]}) if f"{study}." in one]
 
 
 def test_a_studys_runs_are_narrowed_to_it_and_tracked_ones_are_not():
-    runs = resolver("base").resolve_pattern("real2real.ng.evaluation.runs")
+    runs = entry("real2real.ng.evaluation.runs")
     assert (runs["study"], runs["sensor"], runs["source"]) == ("real2real", "ng", "simulated")
-    tracked = resolver("base").resolve_pattern("ng.training.tracked")
-    assert "study" not in tracked
-    assert tracked["sensor"] == "ng"
-    everywhere = resolver("base").resolve_pattern("real2real.reporting.all_runs")
+    assert "study" not in entry("ng.training.tracked")
+    everywhere = entry("real2real.reporting.all_runs")
     assert everywhere["study"] == "real2real"
     assert not {"sensor", "source"} & set(everywhere)
 
 
-@pytest.mark.parametrize("env", ["base", *ENVS])
-def test_every_stored_path_has_the_source_and_a_name_of_its_own(pipelines, env):
-    source = configuration(env)["globals"]["source"]
-    stored = paths(env, datasets_of(pipelines(env)))
-    elsewhere = {path for path in stored.values() if source not in Path(path).parts}
-    assert elsewhere == SHARED | ({PUBLISHED} if env == "published" else set())
-    # what is read, and is there already, becomes the recordings in the end
-    begun = (".raw_logs.files", ".raw_logs.earlier", ".raw_logs.inspected")
-    files = [
-        path for name, path in stored.items() if path != "mlflow.db" and not name.endswith(begun)
-    ]
-    assert len(files) > 5
-    assert len(files) == len(set(files))
-    for name, path in stored.items():
-        assert path == "mlflow.db" or path.startswith("data/0"), name
-
-
-def test_sources_never_share_a_path(pipelines):
+def test_sources_never_share_a_path(registered):
+    names = datasets_of(registered["base"])
     by_source = {
-        configuration(env)["globals"]["source"]: set(paths(env, datasets_of(pipelines())).values())
+        configuration(env)["globals"]["source"]: set(paths(env, names).values())
         for env in ("base", "smoke", "memsense_real", "published")
     }
     assert set(by_source) == {"simulated", "simulated_smoke", "published", "published_all"}
     for (one, theirs), (other, others) in combinations(by_source.items(), 2):
         both_published = one.startswith("published") and other.startswith("published")
         assert theirs & others == SHARED | ({PUBLISHED} if both_published else set())
-
-
-@pytest.mark.parametrize("env", ["base", *ENVS])
-def test_only_messages_between_nodes_stay_in_memory(pipelines, env):
-    names = datasets_of(pipelines(env))
-    kept = {name for name in names if resolver(env).resolve_pattern(name)["type"] == MEMORY}
-    assert kept
-    cut = {name for name in kept if ".windowed_splits." in name}  # a reference to the recordings
-    assert all(".reporting.gaps." in f".{name}" for name in kept - cut)
 
 
 # environments
@@ -246,33 +212,14 @@ def additions(tree, base):
     return {place for place in leaves(tree) if place not in known}
 
 
-def files_of(env, kind):
-    """Everything that an environment says, its files merged; as it is written."""
-    merged = {}
-    for path in [*(CONF / env).glob(f"{kind}*.yml"), *(CONF / env).glob(f"{kind}*/**/*.yml")]:
-        merged |= yaml.safe_load(path.read_text()) or {}
-    return merged
-
-
-def test_the_environments_are_there():
-    assert set(ENVS) >= {"smoke", "full", "memsense_real", "published"}
-
-
-@pytest.mark.parametrize("kind", ["parameters", "globals"])
 @pytest.mark.parametrize("env", ENVS)
-def test_an_environment_adds_no_key_that_base_lacks(env, kind):
-    given, base = files_of(env, kind), dict(configuration("base")[kind])
-    assert additions(given, base) == set()
-
-
-@pytest.mark.parametrize("env", ENVS)
-def test_an_environment_says_something_in_files_that_are_read(env):
-    assert {path.name for path in (CONF / env).iterdir()} <= {
-        "parameters.yml",
-        "globals.yml",
-        "catalog.yml",
-    }
-    assert files_of(env, "parameters")
+def test_an_environment_adds_no_key_that_base_lacks_and_no_file_that_is_not_read(env, parameters):
+    assert {path.stem for path in (CONF / env).iterdir()} <= {"parameters", "globals", "catalog"}
+    for kind in ("parameters", "globals"):
+        path = CONF / env / f"{kind}.yml"
+        given = yaml.safe_load(path.read_text()) if path.exists() else {}
+        assert additions(given, dict(configuration("base")[kind])) == set()
+    assert parameters(env).source == configuration(env)["globals"]["source"]
 
 
 def test_an_added_key_is_seen():
@@ -280,15 +227,3 @@ def test_an_added_key_is_seen():
     assert additions({"training": {"epoch": 3}}, base) == {("training", "epoch")}
     assert additions({"only": {"sensor": "dot", "gyros": 3}}, base) == {("only", "gyros")}
     assert additions({"training": {"epochs": 3}, "seeds": [1]}, base) == set()
-
-
-def test_an_environments_catalog_overrides_entries_of_its_pipelines(pipelines):
-    for env in ENVS:
-        names = datasets_of(pipelines(env))
-        for entry in files_of(env, "catalog"):
-            assert entry in names or entry in configuration("base")["catalog"], entry
-
-
-@pytest.mark.parametrize("env", ["base", *ENVS])
-def test_every_environment_is_a_usable_configuration(parameters, env):
-    assert parameters(env).source == configuration(env)["globals"]["source"]
