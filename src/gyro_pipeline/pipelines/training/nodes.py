@@ -139,7 +139,7 @@ def plan_runs(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     for spec in run_specs(rows, study.unseen_devices):
         folds = sets.of(spec)
         content = _content(spec, sets, settings)
-        problem = _problem(spec, folds, settings)
+        problem = _lacking(spec, sets) or _problem(spec, folds, settings)
         if problem:
             logger.warning("%s is left out: %s", _name(spec), problem)
         runs.append(vars(spec) | {FINGERPRINT: fingerprint(content), LEFT_OUT: problem})
@@ -184,6 +184,18 @@ def _problem(spec: RunSpec, folds: Mapping[str, TrainingSet], settings: Training
             return f"{fold}: {spec.estimator} cannot be fitted: {error}"
     estimator.work(next(iter(folds.values())))
     return ""
+
+
+def _lacking(spec: RunSpec, sets: TrainingSets) -> str:
+    """Which recording cannot test, as an IMU lacks it that is seen beside the tested one."""
+    if spec.method != 1:
+        return ""
+    tests = _tests(sets.table_of(spec)).recording.unique()
+    seen = sets.recordings["samples"].isel(imu=slice(spec.real_imus)).sel(recording=tests)
+    lacking = tests[(seen == 0).any("imu").to_numpy()]
+    if not len(lacking):
+        return ""
+    return f"recording {lacking[0]} tests: expected {spec.real_imus} IMUs side by side to have it"
 
 
 def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
