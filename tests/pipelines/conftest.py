@@ -58,6 +58,11 @@ class World:
         """All of one length."""
         return self._cut[0]
 
+    @property
+    def bias(self) -> pd.DataFrame:
+        """The ground truth of these."""
+        return self._cut[1]
+
     @cached_property
     def virtual(self) -> xr.Dataset | None:
         """Virtual recordings, where the study uses some."""
@@ -95,7 +100,7 @@ class World:
         return list(train(*given, *settings, self.virtual))
 
     def evaluate(self, runs: Sequence[StoredRun]) -> list[EvaluatedRun]:
-        given = self.plan, list(runs), self.recordings, self.windows, self._cut[1]
+        given = self.plan, list(runs), self.recordings, self.windows, self.bias
         return list(evaluate(*given, self.allan, self.evaluation))
 
     def judged(self) -> dict[str, EvaluatedRun]:
