@@ -20,6 +20,7 @@ from gyro_pipeline.conventions import (
     InputError,
 )
 from gyro_pipeline.estimators import entry, estimator_class, make_estimator
+from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.estimators.fitting import FitJob, run_fits
 from gyro_pipeline.estimators.training import TrainingSet
 from gyro_pipeline.fingerprints import code_hash, data_hash, fingerprint
@@ -27,7 +28,7 @@ from gyro_pipeline.parameters import Execution, Only, Splits, Study, Training, V
 from gyro_pipeline.physics.bias import fill_masked
 from gyro_pipeline.protocol.windows import window_size
 from gyro_pipeline.studies import LEFT_OUT, RunSpec, planned, run_params, run_specs, study_rows
-from gyro_pipeline.tracking import FINGERPRINT, FittedRun, RunIdentity, StoredRun
+from gyro_pipeline.tracking import FINGERPRINT, HISTORY, FittedRun, RunIdentity, StoredRun
 
 logger = logging.getLogger(__name__)
 
@@ -251,7 +252,7 @@ def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     for key in shared:
         for fold in missing[key]:
             now = time.time()
-            yield fitted(key, fold, elsewhere[key].load_fit(fold), now, now)
+            yield fitted(key, fold, _loaded(elsewhere[key], fold), now, now)
     jobs = [
         FitJob(
             key, fold, specs[key].estimator, settings, specs[key].seed, sets.of(specs[key])[fold]
@@ -262,6 +263,14 @@ def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     ]
     for job, fit in run_fits(jobs, execution, label):
         yield fitted(job.name, job.fold, fit.estimator, fit.started, fit.ended)
+
+
+def _loaded(run: StoredRun, fold: str) -> Estimator:
+    """A fit of another study's run; of a network with its losses, which are stored beside it."""
+    estimator = run.load_fit(fold)
+    if "train_loss" in run.metrics:
+        estimator.history = run.load(HISTORY)
+    return estimator
 
 
 def _fitted(  # noqa: PLR0917 - what a fit is stored with
