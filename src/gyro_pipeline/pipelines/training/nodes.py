@@ -4,6 +4,7 @@ import logging
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -66,6 +67,11 @@ class TrainingSets:
             }
         return self._made[key, counts]
 
+    @cached_property
+    def _seen(self) -> xr.Dataset:
+        """Real recordings without what was drawn."""
+        return self.recordings[["angular_rate", "samples", "recording_mean"]]
+
     def table_of(self, spec: RunSpec) -> pd.DataFrame:
         """Rows of the windows table that are of the run's protocol, window and stride."""
         w = self.windows
@@ -95,7 +101,7 @@ class TrainingSets:
         used = [(learned.origin == origin) & learned.imu.isin(of) for origin, of in imus.items()]
         attributes, samples = self.recordings.attrs, self.recordings.sizes["sample"]
         return TrainingSet(
-            self.recordings,
+            self._seen,
             self.virtual if spec.virtual_imus else None,
             learned[used[0] | used[1]],
             window_size(spec.window_s, attributes["rate_hz"], samples, spec.sensor),
