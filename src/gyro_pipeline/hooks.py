@@ -1,4 +1,7 @@
-"""What happens around a run: checks before it, provenance for its runs, directions after it."""
+"""What happens around a run: checks before it, provenance for its runs, directions after it.
+
+Every ``kedro`` command imports this file, so it imports what is large only where it is used.
+"""
 
 import getpass
 import hashlib
@@ -8,28 +11,26 @@ import shlex
 import subprocess
 import sys
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from traceback import walk_tb
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import kedro
-from kedro.framework.context import KedroContext
 from kedro.framework.hooks import hook_impl
 from kedro.framework.session import KedroSession
-from kedro.io import CatalogProtocol, DatasetError
-from kedro.pipeline import Node, Pipeline
-from kedro.runner import ParallelRunner
-from pydantic import ValidationError
 
-from gyro_pipeline import pipeline_registry
 from gyro_pipeline.conventions import InputError, Missing
-from gyro_pipeline.datasets.atomic import check_writable
-from gyro_pipeline.datasets.tracked_runs import USER_INTERFACE, TrackedRuns, run_link
-from gyro_pipeline.parameters import Parameters, ReaderOptions
-from gyro_pipeline.studies import DEFAULT, check_possible
+
+if TYPE_CHECKING:
+    from kedro.framework.context import KedroContext
+    from kedro.io import CatalogProtocol
+    from kedro.pipeline import Node, Pipeline
+    from pydantic import ValidationError
+
+    from gyro_pipeline.parameters import Parameters
 
 logger = logging.getLogger(__name__)
 
@@ -47,6 +48,8 @@ class Session(KedroSession):
             InputError: The runner or an option is of no use here.
         """
         sys.excepthook = _explain
+        from kedro.runner import ParallelRunner  # noqa: PLC0415
+
         runner = options.get("runner")
         if options.get("only_missing_outputs"):
             raise InputError(
@@ -74,8 +77,13 @@ class Preflight:
         self._project = Path()
 
     @hook_impl
-    def after_context_created(self, context: KedroContext) -> None:
+    def after_context_created(self, context: "KedroContext") -> None:
         """Check all parameters, and register pipelines for what they leave to do."""
+        from pydantic import ValidationError  # noqa: PLC0415
+
+        from gyro_pipeline import pipeline_registry  # noqa: PLC0415
+        from gyro_pipeline.parameters import Parameters  # noqa: PLC0415
+
         self._project = Path(context.project_path)
         sys.excepthook = _explain
         given = context.config_loader["parameters"]
@@ -87,9 +95,12 @@ class Preflight:
 
     @hook_impl(tryfirst=True)  # before any dataset is made
     def before_pipeline_run(
-        self, run_params: dict[str, Any], pipeline: Pipeline, catalog: CatalogProtocol
+        self, run_params: dict[str, Any], pipeline: "Pipeline", catalog: "CatalogProtocol"
     ) -> None:
         """Check what these pipelines ask for, and that every result can be written."""
+        from gyro_pipeline.datasets.atomic import check_writable  # noqa: PLC0415
+        from gyro_pipeline.studies import DEFAULT, check_possible  # noqa: PLC0415
+
         if self._parameters is not None:
             check_possible(self._parameters, run_params["pipeline_names"] or [DEFAULT])
             _check_logs_are_read(self._parameters, self._project, pipeline, catalog)
@@ -98,15 +109,17 @@ class Preflight:
                 check_writable(path)
 
     @hook_impl
-    def before_node_run(self, node: Node, inputs: dict[str, Any]) -> None:
+    def before_node_run(self, node: "Node", inputs: dict[str, Any]) -> None:
         """Refuse data that are not there; only the report goes on, to say what it lacks."""
         for name, value in inputs.items():
             if isinstance(value, Missing) and node.namespace != "reporting":
                 raise InputError(f"{name} is not there; make it: {', '.join(value.reasons)}")
 
     @hook_impl
-    def after_pipeline_run(self, pipeline: Pipeline, catalog: CatalogProtocol) -> None:
+    def after_pipeline_run(self, pipeline: "Pipeline", catalog: "CatalogProtocol") -> None:
         """Say where the results are and how to look at them."""
+        from gyro_pipeline.datasets.tracked_runs import USER_INTERFACE  # noqa: PLC0415
+
         tables = [name for name in pipeline.all_outputs() if "reporting.tables." in name]
         folders = {path.parent.parent for name in tables for path in _paths(catalog.get(name))}
         for folder in sorted(folders):
@@ -126,13 +139,30 @@ class Preflight:
 
 
 class Provenance:
-    """Marks every new run with the code, packages and command that made it."""
+    """Marks every new run with the code, packages, settings and command that made it."""
+
+    def __init__(self) -> None:
+        self._changed = frozenset[str]()
+
+    @hook_impl
+    def after_context_created(self, context: "KedroContext") -> None:
+        """Compare the settings of runs with those of ``conf/base``."""
+        import yaml  # noqa: PLC0415
+
+        # not by a second loader, whose globals would take the place of the first one's
+        files = Path(context.config_loader.conf_source, "base", "parameters").glob("*.yml")
+        base: dict[str, Any] = {}
+        for path in files:
+            base |= yaml.safe_load(path.read_text())
+        self._changed = _changed(base, context.config_loader["parameters"])
 
     @hook_impl
     def before_pipeline_run(
-        self, run_params: dict[str, Any], pipeline: Pipeline, catalog: CatalogProtocol
+        self, run_params: dict[str, Any], pipeline: "Pipeline", catalog: "CatalogProtocol"
     ) -> None:
         """Hand the tags to the datasets that create runs."""
+        from gyro_pipeline.datasets.tracked_runs import TrackedRuns  # noqa: PLC0415
+
         project = Path(run_params["project_path"])
         tags = {
             "kedro_run": run_params["run_id"],
@@ -150,10 +180,21 @@ class Provenance:
             dataset = catalog.get(name)
             if isinstance(dataset, TrackedRuns):
                 dataset.provenance |= tags
+                dataset.changed = self._changed
+
+
+def _changed(base: Mapping[str, Any], given: Mapping[str, Any]) -> frozenset[str]:
+    """Names of the settings of runs that differ from those of ``conf/base``."""
+    return frozenset(
+        key
+        for group in ("splits", "virtual_gyros", "training")
+        for key, value in (given.get(group) or {}).items()
+        if base.get(group, {}).get(key) != value
+    )
 
 
 def _check_logs_are_read(
-    parameters: Parameters, project: Path, pipeline: Pipeline, catalog: CatalogProtocol
+    parameters: "Parameters", project: Path, pipeline: "Pipeline", catalog: "CatalogProtocol"
 ) -> None:
     """Refuse a folder of logs that nothing reads, rather than to run on other recordings."""
     asked: dict[str, Any] = {}
@@ -174,6 +215,8 @@ def _check_logs_are_read(
 
 def _run_links(datasets: Iterable[Any]) -> list[str]:
     """Where to look at the runs of each study."""
+    from gyro_pipeline.datasets.tracked_runs import TrackedRuns, run_link  # noqa: PLC0415
+
     by_study = defaultdict(list)
     for dataset in datasets:
         if isinstance(dataset, TrackedRuns) and dataset.study is not None:
@@ -190,6 +233,8 @@ def _user() -> str:
 
 def _explain(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     """Print what is wrong with an input or a command, without the way Kedro took to find it."""
+    from kedro.io import DatasetError  # noqa: PLC0415
+
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, InputError):
         cause = cause.__cause__
@@ -211,7 +256,9 @@ def _is_about_the_command(trace: TracebackType | None) -> bool:
     return bool(files) and files[-1].is_relative_to(kedros) and not in_runner
 
 
-def _explained(error: ValidationError) -> str:
+def _explained(error: "ValidationError") -> str:
+    from gyro_pipeline.parameters import ReaderOptions  # noqa: PLC0415
+
     lines = []
     for problem in error.errors():
         where = ".".join(str(part) for part in problem["loc"]) or "parameters"

@@ -131,6 +131,8 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
         self.metadata = metadata
         self.provenance: dict[str, str] = {}
         """Tags that every new run gets; set once per ``kedro run``."""
+        self.changed: frozenset[str] = frozenset()
+        """Names of settings that differ from those of ``conf/base``; their values are in names."""
         self._begun: dict[tuple[str, str], tuple[str, set[str]]] = {}
         """Runs that fits are added to, by study and fingerprint: the id, and the folds so far."""
 
@@ -283,7 +285,9 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
         run = next((run for run in left if _is_left(run)), None)
         if run is None:
             tags = self._tags_of(fitted)
-            run = self._client.create_run(experiment_id, fitted.started_ms, tags, wanted.name)
+            differs = [f"{key} {wanted.params[key]}" for key in self.changed & wanted.params.keys()]
+            name = ", ".join([wanted.name, *sorted(differs)])
+            run = self._client.create_run(experiment_id, fitted.started_ms, tags, name)
         else:
             self._client.update_run(run.info.run_id, "RUNNING")
             self._client.set_tag(run.info.run_id, _OWNER, _this_process())
@@ -458,7 +462,7 @@ def _thinned(history: pd.DataFrame, ended_ms: int) -> list[Metric]:
     rows = history.iloc[::-step].iloc[::-1]  # the last epoch is always among them
     return [
         Metric(name, float(value), ended_ms, int(epoch))
-        for name in rows.columns.drop("epoch")
+        for name in rows.columns.intersection(["train_loss", "val_loss"])
         for epoch, value in zip(rows["epoch"], rows[name], strict=True)
     ]
 

@@ -13,7 +13,6 @@ as successive samples are correlated.
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import allantools
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
@@ -139,6 +138,8 @@ def _overlapping(
     samples: NDArray[np.floating], factors: NDArray[np.integer], rate_hz: float
 ) -> NDArray[np.float64]:
     """Overlapping Allan variance at averages of so many samples, in any order."""
+    import allantools  # noqa: PLC0415 - it imports matplotlib
+
     if not factors.size:
         return np.empty(0)
     unique, position = np.unique(factors, return_inverse=True)  # allantools sorts as well

@@ -9,10 +9,9 @@ from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
-from numpy.lib.stride_tricks import sliding_window_view
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.physics.bias import fill_masked
+from gyro_pipeline.physics.bias import windows_at
 
 LARGEST_MASKED_SHARE = 0.1
 """Of a window's samples: where more are masked, the window is left out."""
@@ -82,11 +81,6 @@ def cut_windows(samples: np.ndarray, size: int, starts: np.ndarray | None = None
         return windows_at(samples, size, starts)
     count = samples.shape[-1] // size
     return samples[..., : count * size].reshape(*samples.shape[:-1], count, size)
-
-
-def windows_at(samples: np.ndarray, size: int, starts: np.ndarray) -> np.ndarray:
-    """Windows (..., windows, size) of samples (..., n), none dropped, without NaN."""
-    return fill_masked(sliding_window_view(samples, size, axis=-1)[..., starts, :])
 
 
 def usable_windows(contents: pd.DataFrame, samples: int, size: int, stride: int) -> pd.DataFrame:

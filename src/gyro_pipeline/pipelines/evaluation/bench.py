@@ -24,6 +24,7 @@ from gyro_pipeline.conventions import (
 from gyro_pipeline.estimators.averages import RunningMean
 from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.parameters import Evaluation
+from gyro_pipeline.physics.bias import windows_at
 from gyro_pipeline.physics.ceiling import (
     best_gain,
     best_saving,
@@ -59,7 +60,7 @@ from gyro_pipeline.protocol.truths import (
     running_mean_curve,
     stacked,
 )
-from gyro_pipeline.protocol.windows import cut_windows, window_size, windows_at
+from gyro_pipeline.protocol.windows import cut_windows, window_size
 
 SCORES = ["weights", "truth", "windows", "score", "value", "lo", "hi"]
 """Columns of a table of scores."""
