@@ -1,5 +1,6 @@
 """A sensor small enough to plan, train and evaluate its whole grid in a second."""
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -58,6 +59,11 @@ class World:
         """All of one length."""
         return self._cut[0]
 
+    @property
+    def bias(self) -> pd.DataFrame:
+        """The ground truth of these."""
+        return self._cut[1]
+
     @cached_property
     def virtual(self) -> xr.Dataset | None:
         """Virtual recordings, where the study uses some."""
@@ -95,7 +101,7 @@ class World:
         return list(train(*given, *settings, self.virtual))
 
     def evaluate(self, runs: Sequence[StoredRun]) -> list[EvaluatedRun]:
-        given = self.plan, list(runs), self.recordings, self.windows, self._cut[1]
+        given = self.plan, list(runs), self.recordings, self.windows, self.bias
         return list(evaluate(*given, self.allan, self.evaluation))
 
     def judged(self) -> dict[str, EvaluatedRun]:
@@ -121,7 +127,9 @@ def stored_runs(fitted: Sequence[FittedRun], **changes: Any) -> list[StoredRun]:
     runs = []
     for number, (key, fits) in enumerate(by_run.items()):
         identity = next(iter(fits.values())).run
-        estimators = {fold: fit.estimator for fold, fit in fits.items()}
+        estimators = {fold: copy.copy(fit.estimator) for fold, fit in fits.items()}
+        for estimator in estimators.values():
+            estimator.history = None  # which is an artifact of its own
         history = [fit.estimator.history for fit in fits.values() if fit.is_model]
         run = StoredRun(
             run_id=f"run{number}",

@@ -4,6 +4,7 @@ import logging
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from gyro_pipeline.conventions import (
     InputError,
 )
 from gyro_pipeline.estimators import entry, estimator_class, make_estimator
+from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.estimators.fitting import FitJob, run_fits
 from gyro_pipeline.estimators.training import TrainingSet
 from gyro_pipeline.fingerprints import code_hash, data_hash, fingerprint
@@ -35,7 +37,7 @@ from gyro_pipeline.studies import (
     split_params,
     study_rows,
 )
-from gyro_pipeline.tracking import FINGERPRINT, FittedRun, RunIdentity, StoredRun
+from gyro_pipeline.tracking import FINGERPRINT, HISTORY, FittedRun, RunIdentity, StoredRun
 
 logger = logging.getLogger(__name__)
 
@@ -73,6 +75,11 @@ class TrainingSets:
             }
         return self._made[key, counts]
 
+    @cached_property
+    def _seen(self) -> xr.Dataset:
+        """Real recordings without what was drawn."""
+        return self.recordings[["angular_rate", "samples", "recording_mean"]]
+
     def table_of(self, spec: RunSpec) -> pd.DataFrame:
         """Rows of the windows table that are of the run's protocol, window and stride."""
         w = self.windows
@@ -102,7 +109,7 @@ class TrainingSets:
         used = [(learned.origin == origin) & learned.imu.isin(of) for origin, of in imus.items()]
         attributes, samples = self.recordings.attrs, self.recordings.sizes["sample"]
         return TrainingSet(
-            self.recordings,
+            self._seen,
             self.virtual if spec.virtual_imus else None,
             learned[used[0] | used[1]],
             window_size(spec.window_s, attributes["rate_hz"], samples, spec.sensor),
@@ -150,7 +157,7 @@ def plan_runs(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
         folds = sets.of(spec)
         # what a report finds runs by, also where it makes no difference
         content = [*_content(spec, sets, settings), split_params(study, splits)]
-        problem = _problem(spec, folds, settings)
+        problem = _lacking(spec, sets) or _problem(spec, folds, settings)
         if problem:
             logger.warning("%s is left out: %s", _name(spec), problem)
         runs.append(vars(spec) | {FINGERPRINT: fingerprint(content), LEFT_OUT: problem})
@@ -195,6 +202,18 @@ def _problem(spec: RunSpec, folds: Mapping[str, TrainingSet], settings: Training
             return f"{fold}: {spec.estimator} cannot be fitted: {error}"
     estimator.work(next(iter(folds.values())))
     return ""
+
+
+def _lacking(spec: RunSpec, sets: TrainingSets) -> str:
+    """Which recording cannot test, as an IMU lacks it that is seen beside the tested one."""
+    if spec.method != 1:
+        return ""
+    tests = _tests(sets.table_of(spec)).recording.unique()
+    seen = sets.recordings["samples"].isel(imu=slice(spec.real_imus)).sel(recording=tests)
+    lacking = tests[(seen == 0).any("imu").to_numpy()]
+    if not len(lacking):
+        return ""
+    return f"recording {lacking[0]} tests: expected {spec.real_imus} IMUs side by side to have it"
 
 
 def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
@@ -250,7 +269,7 @@ def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     for key in shared:
         for fold in missing[key]:
             now = time.time()
-            yield fitted(key, fold, elsewhere[key].load_fit(fold), now, now)
+            yield fitted(key, fold, _loaded(elsewhere[key], fold), now, now)
     jobs = [
         FitJob(
             key, fold, specs[key].estimator, settings, specs[key].seed, sets.of(specs[key])[fold]
@@ -261,6 +280,14 @@ def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     ]
     for job, fit in run_fits(jobs, execution, label):
         yield fitted(job.name, job.fold, fit.estimator, fit.started, fit.ended)
+
+
+def _loaded(run: StoredRun, fold: str) -> Estimator:
+    """A fit of another study's run; of a network with its losses, which are stored beside it."""
+    estimator = run.load_fit(fold)
+    if "train_loss" in run.metrics:
+        estimator.history = run.load(HISTORY)
+    return estimator
 
 
 def _fitted(  # noqa: PLR0917 - what a fit is stored with
