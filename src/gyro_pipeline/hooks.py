@@ -124,10 +124,10 @@ class Preflight:
                 raise InputError(f"{name} is not there; make it: {', '.join(value.reasons)}")
 
     @hook_impl
-    def after_pipeline_run(self, pipeline: "Pipeline", catalog: "CatalogProtocol") -> None:
+    def after_pipeline_run(
+        self, run_result: dict[str, Any], pipeline: "Pipeline", catalog: "CatalogProtocol"
+    ) -> None:
         """Say where the results are and how to look at them."""
-        from gyro_pipeline.datasets.tracked_runs import USER_INTERFACE  # noqa: PLC0415
-
         tables = [name for name in pipeline.all_outputs() if "reporting.tables." in name]
         folders = {path.parent.parent for name in tables for path in _paths(catalog.get(name))}
         for folder in sorted(folders):
@@ -140,9 +140,9 @@ class Preflight:
         for name in pipeline.all_outputs() & {"reporting.report"}:
             for path in _paths(catalog.get(name)):
                 logger.info("report:             %s", _relative(path, self._project))
-        for link in _run_links(catalog.get(name) for name in sorted(pipeline.datasets())):
-            start = "mlflow ui, then " if link.startswith(USER_INTERFACE) else ""
-            logger.info("compare runs:       %s%s", start, link)
+        if run_result:  # where nothing was run, nothing is new
+            for link in _run_links(catalog.get(name) for name in sorted(pipeline.datasets())):
+                logger.info("compare runs:       %s", link)
         logger.info("see the lineage:    kedro viz")
 
 
@@ -223,13 +223,18 @@ def _check_logs_are_read(
 
 def _run_links(datasets: Iterable[Any]) -> list[str]:
     """Where to look at the runs of each study."""
-    from gyro_pipeline.datasets.tracked_runs import TrackedRuns, run_link  # noqa: PLC0415
+    from gyro_pipeline.datasets.tracked_runs import (  # noqa: PLC0415
+        USER_INTERFACE,
+        TrackedRuns,
+        run_link,
+    )
 
     by_study = defaultdict(list)
     for dataset in datasets:
         if isinstance(dataset, TrackedRuns) and dataset.study is not None:
             by_study[dataset.study].append(dataset)
-    return [link for runs in by_study.values() if (link := run_link(runs)) is not None]
+    links = [link for runs in by_study.values() if (link := run_link(runs)) is not None]
+    return ["mlflow ui, then " * link.startswith(USER_INTERFACE) + link for link in links]
 
 
 def _user() -> str:

@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 
 from gyro_pipeline.conventions import AXES, NOTHING, OWN, REAL, InputError
-from gyro_pipeline.estimators import estimator_class
+from gyro_pipeline.estimators import ESTIMATORS, estimator_class
 from gyro_pipeline.parameters import Only, Parameters, Splits, Study, Training, VirtualGyros
 
 CNN, CNN_SHUFFLED, MEAN, CONSTANT = "cnn", "cnn_shuffled", "mean", "training_mean"
@@ -205,7 +205,8 @@ def _check_rows(p: Parameters, study: str, name: str) -> None:
     asked_study = p.studies[study]
     rows = study_rows(asked_study, name, p.source, p.windows_s, p.seeds, p.only)
     for estimator in dict.fromkeys(row.estimator for row in rows):
-        estimator_class(estimator)  # an unknown one is refused here
+        if estimator not in ESTIMATORS:
+            estimator_class(estimator)  # an unknown one is refused here
     imus, length_s = p.sensors[name].imus, p.sensors[name].recording_s
     has, makes = len(AXES) * (imus or 0), len(AXES) * p.virtual_gyros.imus
     for asked, limit, words in (

@@ -1,6 +1,7 @@
 """The file of a run store: made complete or not at all, and refused where it cannot be used."""
 
 import sqlite3
+from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 
@@ -41,6 +42,22 @@ def check_store(path: Path) -> None:
             f"{path}: expected an MLflow store, got an SQLite file with tables "
             f"{', '.join(sorted(tables)[:5])}; {advice}"
         )
+
+
+def count_finished(path: Path, study: str, params: Mapping[str, str]) -> int:
+    """How many runs of a study, with these parameters, are FINISHED and not deleted.
+
+    It asks the file itself, as MLflow takes seconds to open a store.
+    """
+    query = (
+        "select count(*) from runs join experiments using (experiment_id) where "
+        "runs.status = 'FINISHED' and runs.lifecycle_stage = 'active' and experiments.name = ?"
+    )
+    for _ in params:
+        query += " and run_uuid in (select run_uuid from params where key = ? and value = ?)"
+    values = [study, *(part for pair in params.items() for part in pair)]
+    with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as connection:
+        return int(connection.execute(query, values).fetchone()[0])
 
 
 def check_not_moved(experiment: Experiment, store: Path) -> None:

@@ -34,7 +34,12 @@ from mlflow.exceptions import MlflowException
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.atomic import check_writable
-from gyro_pipeline.datasets.run_store import check_not_moved, check_store, make_store
+from gyro_pipeline.datasets.run_store import (
+    check_not_moved,
+    check_store,
+    count_finished,
+    make_store,
+)
 from gyro_pipeline.datasets.tracked_models import log_model, model_fit_uri, model_of
 from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.tracking import (
@@ -168,7 +173,9 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
         """
         if self.study is None:
             return ""
-        return sum(run.finished for run in self.load()) if self._is_own_file else time.time()
+        if not self._is_own_file:
+            return time.time()
+        return count_finished(self._path, self.study, self.only) if self._path.exists() else 0
 
     def save(self, data: FittedRun | EvaluatedRun) -> None:
         """Add a fit to its run, or complete an evaluated run."""

@@ -4,7 +4,6 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 
 from gyro_pipeline.conventions import NOTHING, RECORDING_MEAN
 from gyro_pipeline.estimators.base import Estimator, Windows
@@ -48,4 +47,6 @@ class TrimmedMean(Estimator):
     cut: ClassVar[float] = 0.1
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
+        from scipy import stats  # noqa: PLC0415 - it starts slowly
+
         return stats.trim_mean(windows.samples.astype(np.float64), self.cut, axis=-1), np.nan

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from scipy import stats
 
 from gyro_pipeline.conventions import FIRST
 
@@ -285,6 +284,8 @@ def beats_oracle(errors: SquaredErrors, oracle: SquaredErrors) -> float:
     difference = errors.sums / errors.counts - oracle.sums / oracle.counts
     if np.ptp(difference) == 0:
         return 1.0
+    from scipy import stats  # noqa: PLC0415 - it starts slowly
+
     return float(stats.ttest_1samp(difference, 0.0, alternative="less").pvalue)
 
 
