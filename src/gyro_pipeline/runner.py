@@ -41,6 +41,7 @@ class ChangedNodesRunner(SequentialRunner):
         self._path, self._ended = ended, _read(ended)
         self._fingerprints: dict[str, str] = {}
         self._catalog: Any = None
+        self._storing: Node | None = None
 
     def run(
         self,
@@ -71,8 +72,15 @@ class ChangedNodesRunner(SequentialRunner):
 
     @hook_impl
     def after_node_run(self, node: Node) -> None:
-        """Remember a node that ended, whatever becomes of the rest of the run."""
-        self._remember(node)
+        """Note a node whose results are stored next: those of a generator as it makes them."""
+        self._storing = node
+
+    @hook_impl
+    def before_node_run(self) -> None:
+        """Remember the node before, which has ended, whatever becomes of the rest of the run."""
+        if self._storing is not None:
+            self._remember(self._storing)
+        self._storing = None
 
     def _remember(self, node: Node) -> None:
         content = [self._fingerprints[node.name], _states(node, self._catalog)]
@@ -145,7 +153,10 @@ def _states(node: Node, catalog: CatalogProtocol) -> list[Any]:
 
 
 def _in_memory(name: str, catalog: CatalogProtocol) -> bool:
-    return isinstance(catalog.get(name), MemoryDataset) or name.startswith(_PARAMETERS)
+    """Whether a dataset holds what another node makes only until it was used."""
+    dataset = catalog.get(name)
+    passing = isinstance(dataset, MemoryDataset) or getattr(dataset, "used_up", False)
+    return passing or name.startswith(_PARAMETERS)
 
 
 def _key(node: Node, catalog: Any) -> str:

@@ -101,6 +101,9 @@ class InspectedRecordings(AbstractDataset[Listing | Recording, list[Recording]])
         metadata: For other tools, such as Kedro-Viz.
     """
 
+    used_up = True
+    """:class:`Recordings` takes the file over: whoever labels recordings anew begins another."""
+
     def __init__(self, filepath: str, metadata: dict[str, Any] | None = None) -> None:
         self._final = Path(filepath)
         self._path = path_in_progress(self._final)
