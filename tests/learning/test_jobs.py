@@ -22,14 +22,6 @@ WINDOW = 40
 STARTS = np.array([0, WINDOW])
 
 
-@pytest.fixture(autouse=True)
-def torch_settings_restored():
-    threads = torch.get_num_threads()
-    yield
-    torch.set_num_threads(threads)
-    torch.use_deterministic_algorithms(False)
-
-
 def settings(**changes):
     given = {
         "centring": "per_device",

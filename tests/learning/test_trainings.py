@@ -26,15 +26,6 @@ SETTINGS = Training(
 )
 
 
-@pytest.fixture(autouse=True)
-def torch_settings_restored():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-    torch.use_deterministic_algorithms(False)
-
-
 def recorded():
     generator = np.random.default_rng(0)
     bias = generator.normal(size=(3, 12, 3))

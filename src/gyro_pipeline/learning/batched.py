@@ -56,10 +56,10 @@ def train_together(
     Raises:
         FloatingPointError: If a loss is no longer finite.
     """
-    stack = _Stack([learner.network for learner in learners], device)
-    training = _Stacked([learner.training for learner in learners], device)
+    stack = _StackedNetworks([learner.network for learner in learners], device)
+    training = _SharedExamples([learner.training for learner in learners], device)
     watched = [learner.validation for learner in learners if learner.validation is not None]
-    validation = _Stacked(watched, device) if watched else None
+    validation = _SharedExamples(watched, device) if watched else None
     losses = [Losses() for _ in learners]
     for rate in schedule.learning_rates(training.size).tolist():
         orders = [torch.randperm(training.size, generator=one.shuffling) for one in learners]
@@ -76,25 +76,30 @@ def train_together(
 def obstacle(network: nn.Module, shape: Sequence[int], device: torch.device) -> str | None:
     """Why networks of this kind cannot be trained at once; None if they can.
 
-    A step of two of them is tried: ``vmap`` must know all their operations, and these must neither
-    be random nor add up in an order that changes.
+    A step of two of them is tried. ``vmap`` must know all their operations, and these must neither
+    be random nor add up in an order that changes. Each window must be seen on its own.
 
     Args:
         network: Initialised; it is not changed.
         shape: Of its input for one window.
         device: Where to train.
     """
-    inputs = torch.zeros((2, 2, *shape), device=device)
+    inputs = torch.rand((2, 2, *shape), generator=torch.Generator().manual_seed(0)).to(device)
+    stack = _StackedNetworks([network] * 2, device)
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("error", message=".*batching rule")
-            _Stack([network] * 2, device).outputs(inputs).sum().backward()
+            outputs = stack.outputs(inputs)
+            outputs.sum().backward()
+            first = stack.outputs(inputs[:, :1])
     except (RuntimeError, UserWarning) as reason:
         return str(reason).split(". ")[0]
+    if not torch.allclose(outputs[:, :1], first, rtol=1e-3, atol=1e-5):
+        return "what it says to a window depends on the others of the batch"
     return None
 
 
-class _Stacked:
+class _SharedExamples:
     """Examples of equal numbers on the device; those of several networks are there once."""
 
     def __init__(self, parts: Sequence[Examples], device: torch.device) -> None:
@@ -102,10 +107,8 @@ class _Stacked:
         numbers = {key: number for number, key in enumerate(distinct)}
         inputs = [torch.from_numpy(part.inputs) for part in distinct.values()]
         targets = [torch.from_numpy(part.targets) for part in distinct.values()]
-        self._inputs, self._targets = (
-            torch.stack(inputs).to(device),
-            torch.stack(targets).to(device),
-        )
+        self._inputs = torch.stack(inputs).to(device)
+        self._targets = torch.stack(targets).to(device)
         self._own = torch.tensor([[numbers[id(part)]] for part in parts], device=device)
         self.size = len(parts[0].inputs)
 
@@ -114,7 +117,7 @@ class _Stacked:
         return self._inputs[self._own, rows], self._targets[self._own, rows]
 
 
-class _Stack:
+class _StackedNetworks:
     """Networks as one model. Every tensor has a row for each of them."""
 
     def __init__(self, networks: Sequence[nn.Module], device: torch.device) -> None:
@@ -128,15 +131,12 @@ class _Stack:
         self._called.forward = forward_of(self._called)
 
     def train(
-        self, examples: _Stacked, orders: Tensor, rate: float, batch_size: int
+        self, examples: _SharedExamples, orders: Tensor, rate: float, batch_size: int
     ) -> list[float]:
-        """Make the steps of an epoch; the mean loss of each network on the way.
+        """Make the steps of an epoch, in the order of each network, (networks, n).
 
-        Args:
-            examples: To train on.
-            orders: Shape (networks, n), the order of each network's examples.
-            rate: Learning rate.
-            batch_size: Examples per step.
+        Returns:
+            The mean loss of each network on the way.
         """
         self._optimizer.param_groups[0]["lr"] = rate
         total = torch.zeros(len(orders), device=self._device)
@@ -146,10 +146,10 @@ class _Stack:
             losses.sum().backward()
             self._optimizer.step()
             total += losses.detach() * rows.shape[1]
-        return [loss / orders.shape[1] for loss in total.tolist()]
+        return (total / orders.shape[1]).tolist()
 
     @torch.no_grad()
-    def validate(self, examples: _Stacked, batch_size: int) -> list[float]:
+    def validate(self, examples: _SharedExamples, batch_size: int) -> list[float]:
         """The mean loss of each network."""
         rows = torch.arange(examples.size, device=self._device)[None].split(batch_size, 1)
         parts = [self._losses(*examples[batch]) * batch.shape[1] for batch in rows]
