@@ -66,7 +66,7 @@ def grid(windows=(40, 60), imus=(1, 2), seeds=(0, 1)):
 
 def results_of(jobs):
     """Trained in batches."""
-    return {jobs[number].name: trained for number, trained in run_trainings(jobs, DEVICE, "all")}
+    return {jobs[number].name: trained for number, trained in run_trainings(jobs, "batched", "all")}
 
 
 def assert_those_one_by_one(jobs, results):

@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.estimators import estimator_class, make_estimator
@@ -13,9 +12,6 @@ from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.estimators.training import TrainingSet
 from gyro_pipeline.executors import run_jobs
 from gyro_pipeline.parameters import Execution, Training
-
-if TYPE_CHECKING:
-    import torch
 
 
 @dataclass(frozen=True)
@@ -79,11 +75,10 @@ def run_fits(
     if networks:
         from gyro_pipeline.learning import fused, trainings  # noqa: PLC0415 - take PyTorch
 
-        device = trainings.batch_device(execution.executor)
-        if device is None:
+        if trainings.batch_device(execution.executor) is None:
             fused.available()  # compiled, or said why not, before the workers need it
         else:
-            yield from _run_batched(networks, device, label)
+            yield from _run_batched(networks, execution, label)
             jobs = [job for job in jobs if not _is_paper_network(job)]
     groups = _groups(jobs)
     for group, fits in run_jobs(groups, _fit_group, execution, label, "fits"):
@@ -115,7 +110,7 @@ def _explained(job: FitJob) -> Iterator[None]:
 
 
 def _run_batched(
-    jobs: Sequence[FitJob], device: "torch.device", label: str
+    jobs: Sequence[FitJob], execution: Execution, label: str
 ) -> Iterator[tuple[FitJob, Fit]]:
     """Train networks of the paper many at once."""
     from gyro_pipeline.estimators.paper_network import PaperNetwork  # noqa: PLC0415
@@ -129,7 +124,7 @@ def _run_batched(
             network.check(job.training)
         networks.append(network)
         trainings.append(network.job(job.training))
-    for number, trained in run_trainings(trainings, device, label):
+    for number, trained in run_trainings(trainings, execution.executor, label):
         network = networks[number].trained(trained)
         yield jobs[number], Fit(network, trained.started, time.time(), trained.engine)
 

@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 _SHARE = 0.5
 """Of the free memory that is planned for."""
 _STEP = 20
-"""What a step keeps of a window, in sizes of that window: more than the paper's network does."""
+"""What a step keeps of a window, in sizes of that window. The paper's network needs 5 to 10."""
 
 
 @dataclass(frozen=True)
@@ -59,18 +59,20 @@ def batch_device(executor: str) -> torch.device | None:
 
 
 def run_trainings(
-    jobs: Sequence[TrainingJob], device: torch.device, label: str
+    jobs: Sequence[TrainingJob], executor: str, label: str
 ) -> Iterator[tuple[int, TrainedNetwork]]:
     """Train networks in batches, in this process.
 
     Args:
         jobs: Independent of each other.
-        device: Where to train.
+        executor: As for :func:`batch_device`, which must have a device for it.
         label: Names the work in progress lines.
 
     Yields:
         The number of a job and its result, when its batch is finished.
     """
+    device = batch_device(executor)
+    assert device is not None
     numbers = {id(job): number for number, job in enumerate(jobs)}
     batches = in_batches(jobs, device, _SHARE * free_memory(device))
     serial = Execution(executor="serial", workers=1)
@@ -106,7 +108,7 @@ def in_batches(
 def train_batch(batch: TrainingBatch, report: Callable[[float], None]) -> list[TrainedNetwork]:
     """Train the networks of a batch; the examples of a cell are prepared once for all its seeds.
 
-    Networks that cannot be trained at once are trained one by one, and the log says why.
+    Networks that cannot be trained at once are trained one by one; the log says why.
 
     Args:
         batch: What to train, and where.
