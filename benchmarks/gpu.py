@@ -10,7 +10,7 @@ import argparse
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,10 +37,10 @@ from gyro_pipeline.learning.trainer import TorchEngine
 from gyro_pipeline.learning.trainings import TrainingBatch, free_memory, in_batches
 from gyro_pipeline.parameters import Parameters
 from gyro_pipeline.settings import CONFIG_LOADER_ARGS
-from gyro_pipeline.studies import RunSpec
+from gyro_pipeline.studies import Cell
 
 SENSOR, WINDOW_S = "sparkfun", 10
-"""Of the comparison: its augmentation study, six training sets of equal sizes."""
+"""Of the comparison: its augmentation study, six cells of equal sizes."""
 FEW, MORE = 4, 20
 """Epochs that are timed for the studies; the difference is what an epoch costs."""
 
@@ -66,12 +66,9 @@ def main() -> None:
     print(f"device:    {described(device)}")
     with tempfile.TemporaryDirectory() as folder:
         jobs = study_jobs(parameters, Path(folder))
-        batch = compared_batch(jobs, device)
-        print(
-            f"\n{len(batch.cells)} training sets x {STUDY_SEEDS} seeds, "
-            f"{batch.jobs[0].architecture}"
-        )
-        compare(batch, options.repetitions, options.epochs)
+        batches = compared_batches(jobs, device)
+        print(f"\n{len(batches)} batches, {batches[0].jobs[0].architecture}")
+        compare(batches, device, options.repetitions, options.epochs)
         extrapolate(jobs, device)
 
 
@@ -91,7 +88,7 @@ def seconds() -> float:
 
 
 def seeded(jobs: list[TrainingJob]) -> list[TrainingJob]:
-    """Every job with every seed; these share its examples."""
+    """Every job with every seed, of one cell."""
     return [
         replace(job, seed=seed, cell=job.name, name=f"{job.name}, seed {seed}")
         for job in jobs
@@ -102,22 +99,25 @@ def seeded(jobs: list[TrainingJob]) -> list[TrainingJob]:
 # ----------------------------------------------------------------- against loops on the same GPU
 
 
-def compared_batch(jobs: dict[RunSpec, TrainingJob], device: torch.device) -> TrainingBatch:
+def compared_batches(jobs: dict[Cell, TrainingJob], device: torch.device) -> list[TrainingBatch]:
     wanted = [
         job
-        for spec, job in jobs.items()
-        if (spec.study, spec.sensor, spec.window_s) == ("augmentation", SENSOR, WINDOW_S)
+        for cell, job in jobs.items()
+        if (cell.study, cell.sensor, cell.window_s) == ("augmentation", SENSOR, WINDOW_S)
     ]
-    return TrainingBatch(seeded(wanted), device)
+    return in_batches(seeded(wanted), device, free_memory(device) / 2)
 
 
-def compare(batch: TrainingBatch, repetitions: int, epochs: int) -> None:
+def compare(
+    batches: list[TrainingBatch], device: torch.device, repetitions: int, epochs: int
+) -> None:
     """Ways take turns within a repetition; all train the same networks in the same orders."""
-    cells = prepared_cells(batch)
+    jobs = [job for batch in batches for job in batch.jobs]
+    cells = prepared_cells(jobs)
     ways = {
-        "plain loop": looping(batch, cells, epochs, plain_run),
-        "packed loop": looping(batch, cells, epochs, packed_run),
-        "batched": at_once(batch, cells, epochs),
+        "plain loop": looping(jobs, device, cells, epochs, plain_run),
+        "packed loop": looping(jobs, device, cells, epochs, packed_run),
+        "batched": at_once(batches, cells, epochs),
     }
     for trial in ways.values():
         trial()
@@ -127,7 +127,7 @@ def compare(batch: TrainingBatch, repetitions: int, epochs: int) -> None:
         for way, trial in ways.items():
             timed[way], reached[way] = trial()
         rows.append(timed)
-    steps = epochs * sum(-(-job.windows // BATCH) for job in batch.jobs)
+    steps = epochs * sum(-(-job.windows // BATCH) for job in jobs)
     table = pd.DataFrame(rows)
     ratios = table.rdiv(table["plain loop"], axis=0)
     for way, times in table.items():
@@ -141,13 +141,15 @@ def compare(batch: TrainingBatch, repetitions: int, epochs: int) -> None:
         )
 
 
-def prepared_cells(batch: TrainingBatch) -> Cells:
-    """Training and validation examples of each training set, in memory."""
-    return {name: prepared(job, lambda: None)[:2] for name, job in batch.cells.items()}
+def prepared_cells(jobs: Sequence[TrainingJob]) -> Cells:
+    """Training and validation examples of each cell, in memory."""
+    cells = {job.cell: job for job in jobs}
+    return {cell: prepared(job)[:2] for cell, job in cells.items()}
 
 
 def looping(
-    batch: TrainingBatch,
+    jobs: list[TrainingJob],
+    device: torch.device,
     cells: Cells,
     epochs: int,
     run: Callable[[CalibrationNetwork, Examples, TrainingJob, int], float],
@@ -156,11 +158,11 @@ def looping(
 
     def trial() -> tuple[float, list[float]]:
         total, reached = 0.0, []
-        for job in batch.jobs:
+        for job in jobs:
             examples = cells[job.cell][0]
-            network = initial_network(job.architecture, job.seed).to(batch.device)
+            network = initial_network(job.architecture, job.seed).to(device)
             total += run(network, examples, job, epochs)
-            reached.append(loss_of(network, examples, batch.device))
+            reached.append(loss_of(network, examples, device))
         return total, reached
 
     return trial
@@ -180,27 +182,29 @@ def packed_run(
     return engine_way(network, TorchEngine, *arrays, job.seed, seconds)(epochs)
 
 
-def at_once(batch: TrainingBatch, cells: Cells, epochs: int) -> Trial:
-    """Copying to the device, capture, validation and the dropping of networks are timed as well."""
-    schedule = batch.jobs[0].settings.model_copy(update={"epochs": epochs})
-    places = {name: place for place, name in enumerate(cells)}
+def at_once(batches: Sequence[TrainingBatch], cells: Cells, epochs: int) -> Trial:
+    """Copying to the device and validation are timed as well."""
 
     def trial() -> tuple[float, list[float]]:
-        learners = [
-            Learner(
-                initial_network(job.architecture, job.seed), places[job.cell], shuffling(job.seed)
-            )
-            for job in batch.jobs
-        ]
-        started = seconds()
-        results = dict(
-            train_together(learners, cells.values(), schedule, batch.device, lambda steps: None)
-        )
-        total, reached = seconds() - started, []
-        for number, job in enumerate(batch.jobs):
-            network = CalibrationNetwork(job.architecture)
-            network.load_state_dict(results[number].last)
-            reached.append(loss_of(network.to(batch.device), cells[job.cell][0], batch.device))
+        total, reached = 0.0, []
+        for batch in batches:
+            schedule = batch.jobs[0].settings.model_copy(update={"epochs": epochs})
+            learners = [
+                Learner(
+                    initial_network(job.architecture, job.seed),
+                    *cells[job.cell],
+                    shuffling(job.seed),
+                )
+                for job in batch.jobs
+            ]
+            started = seconds()
+            results = train_together(learners, schedule, batch.device, lambda: None)
+            total += seconds() - started
+            for job, trained in zip(batch.jobs, results, strict=True):
+                network = CalibrationNetwork(job.architecture)
+                network.load_state_dict(trained.last)
+                examples = cells[job.cell][0]
+                reached.append(loss_of(network.to(batch.device), examples, batch.device))
         return total, reached
 
     return trial
@@ -226,18 +230,18 @@ def loss_of(network: CalibrationNetwork, examples: Examples, device: torch.devic
 # ------------------------------------------------------------------------------- the studies
 
 
-def extrapolate(jobs: dict[RunSpec, TrainingJob], device: torch.device) -> None:
+def extrapolate(jobs: dict[Cell, TrainingJob], device: torch.device) -> None:
     """Prepare every batch, and time few and some more epochs of it."""
     rows = []
-    for study, sensor in dict.fromkeys((spec.study, spec.sensor) for spec in jobs):
+    for study, sensor in dict.fromkeys((cell.study, cell.sensor) for cell in jobs):
         of_node = [
-            job for spec, job in jobs.items() if (spec.study, spec.sensor) == (study, sensor)
+            job for cell, job in jobs.items() if (cell.study, cell.sensor) == (study, sensor)
         ]
-        for batch in in_batches(seeded(of_node), device, free_memory(device)):
+        for batch in in_batches(seeded(of_node), device, free_memory(device) / 2):
             started = seconds()
-            cells = prepared_cells(batch)
+            cells = prepared_cells(batch.jobs)
             preparation_s = seconds() - started
-            few, more = (at_once(batch, cells, epochs)()[0] for epochs in (FEW, MORE))
+            few, more = (at_once([batch], cells, epochs)()[0] for epochs in (FEW, MORE))
             epoch_s, epochs = (more - few) / (MORE - FEW), batch.jobs[0].settings.epochs
             once_s = preparation_s + few - FEW * epoch_s
             rows.append(
@@ -245,7 +249,7 @@ def extrapolate(jobs: dict[RunSpec, TrainingJob], device: torch.device) -> None:
                     "study": study,
                     "sensor": sensor,
                     "S": batch.jobs[0].window,
-                    "networks": batch.size,
+                    "networks": len(batch.jobs),
                     "once_s": once_s,
                     "epoch_ms": 1e3 * epoch_s,
                     "minutes": (once_s + epochs * epoch_s) / 60,

@@ -1,4 +1,4 @@
-"""Running pure jobs one after the other, in one process per core, or many at once."""
+"""Running pure jobs one after the other, or in one process per core."""
 
 import heapq
 import logging
@@ -38,16 +38,7 @@ class Job(Protocol):
         """Estimated cost, in the unit that the job reports."""
 
 
-class Batch(Job, Protocol):
-    """Jobs that are run at once; the work is that of all of them."""
-
-    @property
-    def size(self) -> int:
-        """How many."""
-
-
 J = TypeVar("J", bound=Job)
-B = TypeVar("B", bound=Batch)
 R = TypeVar("R")
 
 
@@ -89,32 +80,6 @@ def run_jobs(
         results = _run_serially(ordered, function, progress)
     else:
         results = _run_in_processes(ordered, function, workers, progress, at_once)
-    yield from _watched(results, progress)
-
-
-def run_batches(
-    batches: Sequence[B],
-    function: Callable[[B, Report], Iterator[R]],
-    label: str,
-    what: str = "jobs",
-) -> Iterator[R]:
-    """Run ``function(batch, report)`` for one batch after the other, in this process.
-
-    Args:
-        batches: Each of ``size`` jobs that are done at once.
-        function: Yields the batch's results as they finish; calls ``report`` like a job's.
-        label: Names the work in progress lines.
-        what: What the jobs are, for the same lines.
-
-    Yields:
-        What the function yields.
-    """
-    if not batches:
-        return
-    size = sum(batch.size for batch in batches)
-    progress = _Progress(label, size, [batch.work for batch in batches], 1, what)
-    logger.info("%s: %d %s, %d at once", label, size, what, max(b.size for b in batches))
-    results = (result for batch in batches for result in function(batch, progress.advance))
     yield from _watched(results, progress)
 
 

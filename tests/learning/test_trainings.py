@@ -1,5 +1,6 @@
 """Which trainings are made together, and that it does not matter."""
 
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -7,20 +8,17 @@ import pandas as pd
 import pytest
 import torch
 import xarray as xr
+from torch import nn
 
 from gyro_pipeline.learning import jobs as jobs_module
 from gyro_pipeline.learning import trainings
 from gyro_pipeline.learning.examples import Device
 from gyro_pipeline.learning.jobs import StoredNetwork, TrainingJob, run_training
-from gyro_pipeline.learning.trainings import (
-    batch_device,
-    estimated_bytes,
-    in_batches,
-    train_batch,
-)
+from gyro_pipeline.learning.network import CalibrationNetwork
+from gyro_pipeline.learning.trainings import batch_device, in_batches, run_trainings, train_batch
 from gyro_pipeline.parameters import Training
 
-CPU = torch.device("cpu")
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 SETTINGS = Training(
     centring="per_device",
     **{"channels": 4, "kernel": 6, "stride": 5, "pool": 2, "hidden": 8},
@@ -28,16 +26,7 @@ SETTINGS = Training(
 )
 
 
-@pytest.fixture(autouse=True)
-def torch_settings_restored():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-    torch.use_deterministic_algorithms(False)
-
-
-def recordings():
+def recorded():
     generator = np.random.default_rng(0)
     bias = generator.normal(size=(3, 12, 3))
     rates = bias[..., None] + generator.normal(size=(3, 12, 3, 123))
@@ -55,127 +44,105 @@ def device(rates, bias, imu, numbers, size):
     return Device(rates, (imu,), numbers, biases, (starts,) * len(numbers))
 
 
-def grid(windows=(40, 60), imus=(1, 2, 3), seeds=(0, 1)):
-    """Every window with so many IMUs and every seed."""
-    rates, bias = recordings()
-    train, watch = tuple(range(1, 10)), (10, 11)
+def grid(windows=(40, 60), imus=(1, 2), seeds=(0, 1)):
+    """Every window with so many IMUs and every seed, and once more without the last recording."""
+    rates, bias = recorded()
     return [
         TrainingJob(
-            name=f"{window} {count} {seed}",
+            name=f"{window} {count} {train} {seed}",
             devices=[device(rates, bias, imu, train, window) for imu in range(1, count + 1)],
-            validation=device(rates, bias, 1, watch, window),
+            validation=device(rates, bias, 1, (10, 11), window),
             window=window,
             settings=SETTINGS,
             seed=seed,
-            cell=(window, count),
+            cell=(window, count, train),
         )
         for window in windows
         for count in imus
+        for train in (tuple(range(1, 9)), tuple(range(2, 10)))
         for seed in seeds
     ]
 
 
 def results_of(jobs):
     """Trained in batches."""
-    found = trainings.run_trainings(jobs, "batched", "all")
-    return {jobs[number].name: trained for number, trained in found}
+    return {jobs[number].name: trained for number, trained in run_trainings(jobs, "batched", "all")}
 
 
-def one_by_one(jobs):
-    return {job.name: run_training(job, lambda work: None) for job in jobs}
-
-
-def assert_same(one, other):
-    assert one.keys() == other.keys()
+def assert_those_one_by_one(jobs, results):
     windows = np.random.default_rng(1).normal(size=(50, 3, 60)).astype(np.float32)
-    for name, trained in one.items():
-        a, b = trained.artifact, other[name].artifact
-        assert (a["architecture"], a["best_epoch"]) == (b["architecture"], b["best_epoch"])
-        pd.testing.assert_frame_equal(trained.history, other[name].history, rtol=1e-5)
+    assert results.keys() == {job.name for job in jobs}
+    for job in jobs:
+        got, expected = results[job.name], run_training(job, lambda work: None)
+        assert got.artifact["best_epoch"] == expected.artifact["best_epoch"]
+        pd.testing.assert_frame_equal(got.history, expected.history, rtol=1e-5)
         for which in ("last", "best"):
-            seen = windows[..., : a["architecture"]["window"]]
-            given = (StoredNetwork(artifact, which).biases(seen) for artifact in (a, b))
+            seen = windows[..., : job.window]
+            given = (StoredNetwork(one.artifact, which).biases(seen) for one in (got, expected))
             np.testing.assert_allclose(*given, rtol=0, atol=1e-5)
 
 
 def test_networks_trained_at_once_are_those_trained_one_by_one():
-    together, alone = results_of(grid()), one_by_one(grid())
-    assert_same(together, alone)
-    assert {trained.engine for trained in together.values()} == {"batched cpu"} or (
-        torch.cuda.is_available()
-    )
-    assert {trained.engine for trained in alone.values()} <= {"fused", "cpu"}
+    results = results_of(grid())
+    assert_those_one_by_one(grid(), results)
+    assert {trained.engine for trained in results.values()} == {f"batched {DEVICE.type}"}
 
 
-def test_equal_sizes_are_a_batch_and_others_are_not():
-    jobs = grid() + [replace(job, settings=other()) for job in grid(windows=(40,), imus=(1,))]
-    batches = in_batches(jobs, CPU, memory=np.inf)
-    assert sorted(batch.size for batch in batches) == [2, 6, 6]
-    for batch in batches:
-        assert len({(job.architecture, job.settings) for job in batch.jobs}) == 1
-    assert [batch.work for batch in batches] == sorted((b.work for b in batches), reverse=True)
+def test_equal_sizes_schedules_and_numbers_of_windows_are_a_batch():
+    steeper = SETTINGS.model_copy(update={"learning_rate": 1e-2})
+    one = grid(windows=(40,), imus=(1,))
+    jobs = grid() + [replace(job, settings=steeper) for job in one]
+    jobs += [replace(job, validation=None) for job in one]
+    assert [len(batch.jobs) for batch in in_batches(jobs, DEVICE, 1e12)] == [4] * 6
 
 
-def other():
-    return SETTINGS.model_copy(update={"learning_rate": 1e-2})
-
-
-def test_batches_fit_the_memory_there_is_and_give_the_same(monkeypatch):
-    jobs = grid(windows=(40,))
-    whole = results_of(jobs)
-    memory = 0.6 * estimated_bytes(jobs)
-    batches = in_batches(jobs, CPU, memory)
-    assert len(batches) > 1
-    assert all(estimated_bytes(batch.jobs) <= memory for batch in batches)
-    assert sorted(job.name for batch in batches for job in batch.jobs) == sorted(whole)
-    monkeypatch.setattr(trainings, "free_memory", lambda device: memory)
-    assert_same(results_of(jobs), whole)
-
-
-def test_what_fits_nowhere_is_trained_alone():
-    assert [batch.size for batch in in_batches(grid(windows=(40,)), CPU, memory=1.0)] == [1] * 6
-
-
-def test_seeds_of_a_cell_share_memory_and_cells_do_not():
-    one, two = grid(windows=(40,), imus=(3,))
-    strangers = [replace(job, cell=None) for job in (one, two)]
-    data = estimated_bytes(strangers) - estimated_bytes([one, two])
-    assert data > 2 * 4 * 3 * 9 * 3 * 3 * 40  # IMUs, recordings, windows, axes, samples
-    assert estimated_bytes([one, two]) > estimated_bytes([one])
+def test_batches_fit_the_memory_there_is_and_one_training_is_always_made():
+    jobs = grid(windows=(40,), imus=(1,))
+    memory = 2.5 * trainings._bytes(jobs[0])
+    assert [len(batch.jobs) for batch in in_batches(jobs, DEVICE, memory)] == [2, 2]
+    assert [len(batch.jobs) for batch in in_batches(jobs, DEVICE, 1.0)] == [1] * 4
+    assert 0 < trainings.free_memory(DEVICE) < 1e15
 
 
 def test_a_cell_is_prepared_once_for_all_its_seeds(monkeypatch):
     prepared, asked = jobs_module.prepared, []
-
-    def counted(job, after_each):
-        asked.append(job.cell)
-        return prepared(job, after_each)
-
-    monkeypatch.setattr(trainings, "prepared", counted)
+    monkeypatch.setattr(trainings, "prepared", lambda job: asked.append(job.cell) or prepared(job))
     results_of(grid())
     assert sorted(asked) == sorted({job.cell for job in grid()})
+    asked.clear()
+    strangers = [replace(job, cell=None) for job in grid(windows=(40,), imus=(1,))]
+    assert_those_one_by_one(strangers, results_of(strangers))
+    assert len(asked) == len(strangers)
 
 
-def test_jobs_that_name_no_cell_share_nothing():
-    jobs = [replace(job, cell=None) for job in grid(windows=(40,))]
-    assert_same(results_of(jobs), results_of(grid(windows=(40,))))
+class Dropping(CalibrationNetwork):
+    """The paper's network with dropout, which no two trainings share."""
+
+    def forward_packed(self, packed):
+        return super().forward_packed(nn.functional.dropout(packed, 0.1))
+
+
+def test_networks_that_cannot_be_batched_are_trained_one_by_one_and_the_log_says_why(
+    monkeypatch, caplog
+):
+    caplog.set_level(logging.INFO)
+    for module in (jobs_module, trainings):
+        monkeypatch.setattr(
+            module, "initial_network", lambda architecture, _: Dropping(architecture)
+        )
+    (batch,) = in_batches(grid(windows=(40,), imus=(1,)), DEVICE, 1e12)
+    reported = []
+    assert [one.engine for one in train_batch(batch, reported.append)] == ["cpu"] * 4
+    assert sum(reported) == pytest.approx(batch.work)
+    assert "Dropping: trained one by one: vmap: called random operation" in caplog.text
 
 
 def test_the_estimated_work_is_what_is_reported():
-    for batch in in_batches(grid(), CPU, memory=np.inf):
+    for batch in in_batches(grid(), DEVICE, 1e12):
         reported = []
-        assert len(list(train_batch(batch, reported.append))) == batch.size
-        assert sum(reported) == batch.work
-
-
-def test_results_come_before_the_rest_is_trained():
-    """So an interrupt loses only what has not been handed out."""
-    (batch,) = in_batches(grid(windows=(40,)), CPU, memory=np.inf)
-    reported = []
-    results = train_batch(batch, reported.append)
-    assert next(results)[0].cell == (40, 1)
-    assert sum(reported) < batch.work
-    results.close()
+        train_batch(batch, reported.append)
+        assert sum(reported) == pytest.approx(batch.work)
+        assert len(reported) == len(batch.jobs) + SETTINGS.epochs
 
 
 def test_a_loss_that_is_no_longer_finite_ends_the_run():
@@ -187,37 +154,18 @@ def test_a_loss_that_is_no_longer_finite_ends_the_run():
 @pytest.mark.parametrize(
     ("executor", "cuda", "chosen"),
     [
-        ("auto", True, "cuda"),
-        ("auto", False, None),
-        ("batched", True, "cuda"),
-        ("batched", False, "cpu"),
-        ("processes", True, None),
-        ("serial", True, None),
+        *(("auto", True, "cuda"), ("auto", False, None)),
+        *(("batched", True, "cuda"), ("batched", False, "cpu")),
+        *(("processes", True, None), ("serial", True, None)),
     ],
 )
 def test_the_gpu_is_used_where_there_is_one_and_asked_for_nowhere_else(
     monkeypatch, executor, cuda, chosen
 ):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
-    device = batch_device(executor)
-    assert (device and device.type) == chosen
+    found = batch_device(executor)
+    assert (found and found.type) == chosen
 
 
 def test_nothing_to_train_is_nothing_to_do():
     assert results_of([]) == {}
-
-
-def test_one_training_stays_on_the_processor(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    assert run_training(grid()[0], lambda work: None).engine in {"fused", "cpu"}
-
-
-def test_free_memory_is_less_than_all():
-    assert 0 < trainings.free_memory(CPU) < 1e15
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU here")
-def test_on_a_gpu_networks_are_those_of_the_processor():
-    together = results_of(grid())
-    assert {trained.engine for trained in together.values()} == {"batched cuda"}
-    assert_same(together, one_by_one(grid()))

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import nn
 
 from gyro_pipeline.learning.network import Architecture, CalibrationNetwork
 from gyro_pipeline.learning.packing import CACHE_LINE, aligned_zeros, packed_shape
@@ -114,7 +115,7 @@ class FusedEngine:
         return float(squares) / (len(order) * gyroscopes)
 
     @torch.no_grad()
-    def load_into(self, network: CalibrationNetwork) -> None:
+    def load_into(self, network: nn.Module) -> None:
         """Copy the weights as they are now into a network of the same architecture."""
         for name, value in network.state_dict().items():
             value.copy_(torch.from_numpy(self._weights[self._index[name]]))

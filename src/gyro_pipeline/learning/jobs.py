@@ -1,8 +1,8 @@
 """One training as a pure job: everything it needs comes in, everything it makes goes out."""
 
 import time
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -100,7 +100,7 @@ def run_training(job: TrainingJob, report: Callable[[float], None]) -> TrainedNe
 
     Args:
         job: What to train.
-        report: Told the work done after every recording that is prepared, and after every epoch.
+        report: Told the work done after the preparation, and after every epoch.
 
     Returns:
         Weights at the last and the best validation epoch with all that an estimate needs.
@@ -108,10 +108,12 @@ def run_training(job: TrainingJob, report: Callable[[float], None]) -> TrainedNe
     started = time.time()
     torch.set_num_threads(1)
     torch.use_deterministic_algorithms(True)
-    examples, validation, scaling = prepared(job, lambda: report(RECORDING_WORK))
-    compiled = fused.available()
+    examples, validation, scaling = prepared(job)
+    report(job.recordings * RECORDING_WORK)
+    network = initial_network(job.architecture, job.seed)
+    compiled = type(network) is CalibrationNetwork and fused.available()
     trained = train(
-        initial_network(job.architecture, job.seed),
+        network,
         examples,
         validation,
         job.settings,
@@ -123,37 +125,12 @@ def run_training(job: TrainingJob, report: Callable[[float], None]) -> TrainedNe
     return TrainedNetwork(artifact, trained.history, started, "fused" if compiled else "cpu")
 
 
-@dataclass(frozen=True)
-class _Watched(Device):
-    """A device that tells when one of its recordings has been used."""
-
-    after_each: Callable[[], None] = field(kw_only=True)
-
-    def samples(self) -> Iterator[np.ndarray]:
-        """See :class:`Device`."""
-        for samples in super().samples():
-            yield samples
-            self.after_each()
-
-
-def prepared(
-    job: TrainingJob, after_each: Callable[[], None]
-) -> tuple[Examples, Examples | None, Scaling]:
-    """Training and validation examples, and the scaling of both; the same for every seed.
-
-    Args:
-        job: What to prepare for.
-        after_each: Called after every recording, ``job.recordings`` times.
-    """
-
-    def watched(device: Device) -> Device:
-        return _Watched(**vars(device), after_each=after_each)
-
-    devices, a = [watched(device) for device in job.devices], job.architecture
-    examples, scaling = training_examples(devices, a, job.settings.centring)
+def prepared(job: TrainingJob) -> tuple[Examples, Examples | None, Scaling]:
+    """Training and validation examples, and the scaling of both; the same for every seed."""
+    examples, scaling = training_examples(job.devices, job.architecture, job.settings.centring)
     if job.validation is None:
         return examples, None, scaling
-    return examples, scaled_examples(watched(job.validation), a, scaling), scaling
+    return examples, scaled_examples(job.validation, job.architecture, scaling), scaling
 
 
 def stored(architecture: Architecture, scaling: Scaling, trained: Trained) -> dict[str, Any]:

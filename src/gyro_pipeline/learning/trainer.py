@@ -7,11 +7,10 @@ from typing import Protocol
 import numpy as np
 import pandas as pd
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from gyro_pipeline.learning.examples import Examples
-from gyro_pipeline.learning.network import CalibrationNetwork
 from gyro_pipeline.parameters import Training
 
 StateDict = dict[str, Tensor]
@@ -37,13 +36,42 @@ class Trained:
     history: pd.DataFrame
 
 
+class Losses:
+    """The losses of a training epoch by epoch, and the weights of the best one."""
+
+    def __init__(self) -> None:
+        self._rows: list[dict[str, float]] = []
+        self._lowest, self._best = np.inf, dict[int, StateDict]()
+
+    def add(
+        self, rate: float, loss: float, val_loss: float | None, weights: Callable[[], StateDict]
+    ) -> None:
+        """Note an epoch; its weights are asked for if no validation loss was as low before.
+
+        Raises:
+            FloatingPointError: If the training loss is not finite.
+        """
+        epoch = len(self._rows) + 1
+        if not np.isfinite(loss):
+            raise FloatingPointError(f"the loss is {loss} in epoch {epoch}")
+        watched = {} if val_loss is None else {"val_loss": val_loss}
+        self._rows.append({"epoch": epoch, "learning_rate": rate, "train_loss": loss} | watched)
+        if val_loss is not None and val_loss < self._lowest:
+            self._lowest, self._best = val_loss, {epoch: weights()}
+
+    def trained(self, last: StateDict) -> Trained:
+        """The result, from the weights at the end."""
+        ((best_epoch, best),) = self._best.items() or [(None, None)]
+        return Trained(last, best, best_epoch, pd.DataFrame(self._rows))
+
+
 class Engine(Protocol):
     """Trains one network on one set of examples, an epoch at a time."""
 
     def epoch(self, order: np.ndarray, learning_rate: float) -> float:
         """Train on the examples in this order, batch by batch; the mean loss on the way."""
 
-    def load_into(self, network: CalibrationNetwork) -> None:
+    def load_into(self, network: nn.Module) -> None:
         """Copy the weights as they are now into a network."""
 
 
@@ -58,9 +86,10 @@ class TorchEngine:
     """
 
     def __init__(
-        self, network: CalibrationNetwork, inputs: np.ndarray, targets: np.ndarray, batch_size: int
+        self, network: nn.Module, inputs: np.ndarray, targets: np.ndarray, batch_size: int
     ) -> None:
         self._network, self._batch_size = network, batch_size
+        self._forward = forward_of(network)
         self._inputs, self._targets = _tensors(Examples(inputs, targets), _device(network))
         self._optimizer = torch.optim.Adam(network.parameters(), fused=True)
 
@@ -70,7 +99,7 @@ class TorchEngine:
             group["lr"] = learning_rate
         total = torch.zeros((), device=self._inputs.device)
         for batch in torch.from_numpy(order).to(self._inputs.device).split(self._batch_size):
-            outputs = self._network.forward_packed(self._inputs.index_select(0, batch))
+            outputs = self._forward(self._inputs.index_select(0, batch))
             loss = functional.mse_loss(outputs, self._targets.index_select(0, batch))
             self._optimizer.zero_grad()
             loss.backward()
@@ -78,13 +107,13 @@ class TorchEngine:
             total += loss.detach() * len(batch)
         return float(total) / len(order)
 
-    def load_into(self, network: CalibrationNetwork) -> None:
+    def load_into(self, network: nn.Module) -> None:
         """See :class:`Engine`."""
         network.load_state_dict(self._network.state_dict())
 
 
 def train(
-    network: CalibrationNetwork,
+    network: nn.Module,
     training: Examples,
     validation: Examples | None,
     schedule: Training,
@@ -111,35 +140,39 @@ def train(
     """
     steps = engine(network, training.inputs, training.targets, schedule.batch_size)
     watched = None if validation is None else _tensors(validation, _device(network))
-    rows, best, lowest = [], None, np.inf
-    rates = schedule.learning_rates(len(training.inputs)).tolist()
-    for epoch, rate in enumerate(rates, start=1):
+    losses = Losses()
+    for rate in schedule.learning_rates(len(training.inputs)).tolist():
         order = torch.randperm(len(training.inputs), generator=shuffling).numpy()
-        row = {"epoch": epoch, "learning_rate": rate, "train_loss": steps.epoch(order, rate)}
-        if not np.isfinite(row["train_loss"]):
-            raise FloatingPointError(f"the loss is {row['train_loss']} in epoch {epoch}")
+        loss = steps.epoch(order, rate)
         steps.load_into(network)
-        if watched is not None:
-            row["val_loss"] = _loss(network, *watched)
-            if row["val_loss"] < lowest:
-                lowest, best = row["val_loss"], (epoch, _weights(network))
-        rows.append(row)
+        val_loss = None if watched is None else _loss(network, *watched)
+        losses.add(rate, loss, val_loss, lambda: weights_of(network))
         after_epoch()
-    best_epoch, best_weights = best or (None, None)
-    return Trained(_weights(network), best_weights, best_epoch, pd.DataFrame(rows))
+    return losses.trained(weights_of(network))
 
 
 @torch.no_grad()
-def predict(network: CalibrationNetwork, inputs: Tensor) -> Tensor:
+def predict(network: nn.Module, inputs: Tensor) -> Tensor:
     """Network outputs for packed inputs of any number, shape (n, gyroscopes)."""
-    return torch.cat([network.forward_packed(part) for part in inputs.split(_VALIDATION_BATCH)])
+    return torch.cat([forward_of(network)(part) for part in inputs.split(_VALIDATION_BATCH)])
 
 
-def _loss(network: CalibrationNetwork, inputs: Tensor, targets: Tensor) -> float:
+def forward_of(network: nn.Module) -> Callable[[Tensor], Tensor]:
+    """What computes a network's outputs: of the paper's, its fast way for packed windows."""
+    forward: Callable[[Tensor], Tensor] = getattr(network, "forward_packed", network.forward)
+    return forward
+
+
+def weights_of(network: nn.Module) -> StateDict:
+    """A copy on the CPU."""
+    return {name: value.detach().cpu().clone() for name, value in network.state_dict().items()}
+
+
+def _loss(network: nn.Module, inputs: Tensor, targets: Tensor) -> float:
     return float(functional.mse_loss(predict(network, inputs), targets))
 
 
-def _device(network: CalibrationNetwork) -> torch.device:
+def _device(network: nn.Module) -> torch.device:
     return next(network.parameters()).device
 
 
@@ -147,7 +180,3 @@ def _tensors(examples: Examples, device: torch.device) -> tuple[Tensor, Tensor]:
     arrays = examples.inputs, examples.targets
     inputs, targets = (torch.from_numpy(array).to(device) for array in arrays)
     return inputs, targets
-
-
-def _weights(network: CalibrationNetwork) -> StateDict:
-    return {name: value.detach().cpu().clone() for name, value in network.state_dict().items()}

@@ -1,6 +1,6 @@
-"""Many trainings at once, in batches that fit the memory of a GPU."""
+"""Trainings on a GPU, in batches that fit its memory."""
 
-import os
+import logging
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
@@ -9,28 +9,45 @@ from itertools import groupby
 import psutil
 import torch
 
-from gyro_pipeline.executors import run_batches
-from gyro_pipeline.learning import batched
-from gyro_pipeline.learning.batched import Learner, train_together
+from gyro_pipeline.executors import run_jobs
+from gyro_pipeline.learning.batched import Learner, obstacle, train_together
 from gyro_pipeline.learning.examples import Examples, Scaling
 from gyro_pipeline.learning.jobs import (
+    RECORDING_WORK,
     TrainedNetwork,
     TrainingJob,
     initial_network,
     prepared,
+    run_training,
     shuffling,
     stored,
 )
 from gyro_pipeline.learning.packing import packed_shape
+from gyro_pipeline.parameters import Execution
 
-_SHARE = 0.8
-"""Of the free memory that is planned for; the rest is for what the estimate does not know."""
-_RECORDING = 10
-"""What reading, scaling and packing one costs, in steps: a guess, no GPU has timed it yet."""
+logger = logging.getLogger(__name__)
+
+_SHARE = 0.5
+"""Of the free memory that is planned for."""
+_STEP = 20
+"""What a step keeps of a window, in sizes of that window. The paper's network needs 5 to 10."""
+
+
+@dataclass(frozen=True)
+class TrainingBatch:
+    """Jobs of equal sizes, schedules and numbers of windows, to be trained at once on a device."""
+
+    jobs: Sequence[TrainingJob]
+    device: torch.device
+
+    @property
+    def work(self) -> float:
+        """Estimated cost, as if they were trained one by one."""
+        return sum(job.work for job in self.jobs)
 
 
 def batch_device(executor: str) -> torch.device | None:
-    """Where many networks are trained at once; None where they are trained one by one.
+    """Where many networks are trained at once; None where they are trained in processes.
 
     Args:
         executor: ``auto`` is ``batched`` where there is a GPU.
@@ -44,7 +61,7 @@ def batch_device(executor: str) -> torch.device | None:
 def run_trainings(
     jobs: Sequence[TrainingJob], executor: str, label: str
 ) -> Iterator[tuple[int, TrainedNetwork]]:
-    """Train all networks in batches, in this process.
+    """Train networks in batches, in this process.
 
     Args:
         jobs: Independent of each other.
@@ -52,144 +69,87 @@ def run_trainings(
         label: Names the work in progress lines.
 
     Yields:
-        The number of a job and its result, as it is finished.
+        The number of a job and its result, when its batch is finished.
     """
     device = batch_device(executor)
     assert device is not None
     numbers = {id(job): number for number, job in enumerate(jobs)}
-    batches = in_batches(jobs, device, free_memory(device))
-    for job, trained in run_batches(batches, train_batch, label, "trainings"):
-        yield numbers[id(job)], trained
-
-
-@dataclass(frozen=True)
-class TrainingBatch:
-    """Jobs with networks and schedules of the same sizes, to be trained at once."""
-
-    jobs: Sequence[TrainingJob]
-    device: torch.device
-
-    @property
-    def size(self) -> int:
-        """How many trainings."""
-        return len(self.jobs)
-
-    @property
-    def cells(self) -> dict[Hashable, TrainingJob]:
-        """One job of each cell: its examples are those of all its seeds."""
-        return {_cell(job): job for job in self.jobs}
-
-    @property
-    def work(self) -> float:
-        """Estimated cost, in steps of all networks at once."""
-        return max(map(_steps, self.jobs)) + _RECORDING * sum(
-            job.recordings for job in self.cells.values()
-        )
+    batches = in_batches(jobs, device, _SHARE * free_memory(device))
+    serial = Execution(executor="serial", workers=1)
+    for batch, results in run_jobs(batches, train_batch, serial, label, "batches of networks"):
+        for job, trained in zip(batch.jobs, results, strict=True):
+            yield numbers[id(job)], trained
 
 
 def in_batches(
     jobs: Sequence[TrainingJob], device: torch.device, memory: float
 ) -> list[TrainingBatch]:
-    """Jobs of the same sizes together, in batches that fit the memory.
+    """Jobs that can be trained step by step together, as many as fit the memory.
 
     Args:
         jobs: Any.
         device: Where they will be trained.
         memory: Bytes that a batch may take. A training that takes more is a batch of its own.
-
-    Returns:
-        The longest batches first; cells of similar length are in the same one.
     """
+
+    def sizes(job: TrainingJob) -> str:
+        watched = job.validation.windows if job.validation else 0
+        return f"{job.architecture} {job.settings} {job.windows} {watched}"
+
     batches = []
-    for _, same in groupby(sorted(jobs, key=_order), key=_sizes):
-        batch: list[TrainingJob] = []
-        for job in same:
-            if batch and estimated_bytes([*batch, job]) > memory:
-                batches.append(TrainingBatch(batch, device))
-                batch = []
-            batch.append(job)
-        batches.append(TrainingBatch(batch, device))
-    return sorted(batches, key=lambda batch: batch.work, reverse=True)
+    for _, group in groupby(sorted(jobs, key=lambda job: (sizes(job), str(_cell(job)))), sizes):
+        same = list(group)
+        count = max(1, int(memory / _bytes(same[0])))
+        parts = (same[first : first + count] for first in range(0, len(same), count))
+        batches += [TrainingBatch(part, device) for part in parts]
+    return batches
 
 
-def train_batch(
-    batch: TrainingBatch, report: Callable[[float], None]
-) -> Iterator[tuple[TrainingJob, TrainedNetwork]]:
-    """Train the networks of a batch together; the examples of a cell are prepared once.
+def train_batch(batch: TrainingBatch, report: Callable[[float], None]) -> list[TrainedNetwork]:
+    """Train the networks of a batch; the examples of a cell are prepared once for all its seeds.
+
+    Networks that cannot be trained at once are trained one by one; the log says why.
 
     Args:
         batch: What to train, and where.
-        report: Told the work done, after every recording that is prepared and every chunk of steps.
-
-    Yields:
-        A job and its result.
+        report: Told the work done, of a training once it is prepared, and of all after every epoch.
     """
-    started, scalings = time.time(), list[Scaling]()
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # cuBLAS repeats itself with this
-
-    def examples() -> Iterator[tuple[Examples, Examples | None]]:
-        for job in batch.cells.values():
-            training, validation, scaling = prepared(job, lambda: report(_RECORDING))
-            scalings.append(scaling)
-            yield training, validation
-
-    numbers = {cell: number for number, cell in enumerate(batch.cells)}
-    learners = [
-        Learner(
-            initial_network(job.architecture, job.seed), numbers[_cell(job)], shuffling(job.seed)
-        )
-        for job in batch.jobs
+    started, first, device = time.time(), batch.jobs[0], batch.device
+    networks = [initial_network(job.architecture, job.seed) for job in batch.jobs]
+    if reason := obstacle(networks[0], packed_shape(first.architecture), device):
+        logger.info("%s: trained one by one: %s", type(networks[0]).__name__, reason)
+        return [run_training(job, report) for job in batch.jobs]
+    examples, learners = dict[Hashable, tuple[Examples, Examples | None, Scaling]](), []
+    for job, network in zip(batch.jobs, networks, strict=True):
+        if _cell(job) not in examples:
+            examples[_cell(job)] = prepared(job)
+        training, validation, _ = examples[_cell(job)]
+        learners.append(Learner(network, training, validation, shuffling(job.seed)))
+        report(job.recordings * RECORDING_WORK)
+    epoch_work = sum(job.epoch_work for job in batch.jobs)
+    results = train_together(learners, first.settings, device, lambda: report(epoch_work))
+    artifacts = [
+        stored(job.architecture, examples[_cell(job)][2], trained)
+        for job, trained in zip(batch.jobs, results, strict=True)
     ]
-    schedule, engine = batch.jobs[0].settings, f"batched {batch.device.type}"
-    for number, trained in train_together(learners, examples(), schedule, batch.device, report):
-        job = batch.jobs[number]
-        artifact = stored(job.architecture, scalings[numbers[_cell(job)]], trained)
-        yield job, TrainedNetwork(artifact, trained.history, started, engine)
+    return [
+        TrainedNetwork(artifact, trained.history, started, f"batched {device.type}")
+        for artifact, trained in zip(artifacts, results, strict=True)
+    ]
 
 
 def free_memory(device: torch.device) -> float:
-    """Bytes that a batch may take of what is free."""
+    """Free bytes."""
     if device.type == "cuda":
-        torch.cuda.empty_cache()  # what PyTorch keeps for itself is free as well
-        return _SHARE * torch.cuda.mem_get_info(device)[0]
-    return _SHARE * psutil.virtual_memory().available
+        return float(torch.cuda.mem_get_info(device)[0])
+    return float(psutil.virtual_memory().available)
 
 
-def estimated_bytes(jobs: Sequence[TrainingJob]) -> float:
-    """Upper estimate of what it takes on the device to train these jobs at once."""
-    architecture, batch_size = jobs[0].architecture, jobs[0].settings.batch_size
-    blocks, width = packed_shape(architecture)
-    taps = -(-architecture.kernel // architecture.stride)
-    weights = sum(value.numel() for value in initial_network(architecture, 0).parameters())
-    # Of a window: its copy; the convolution's outputs by tap, their sum, maxima and gradients; of a
-    # product, its kernel and the gradient of that.
-    window = blocks * width + 8 * blocks * taps * architecture.channels
-    window += 2 * width * taps * architecture.channels + 8 * architecture.hidden
-    # Twice, as a step and a validation are captured with memory of their own.
-    network = 2 * (batch_size * window + 12 * weights) + 2 * batched.CHUNK * batch_size
-    cells = {_cell(job): job for job in jobs}.values()
-    # Twice, as the cells' examples are joined on the device.
-    examples = 2 * sum(_examples(job) for job in cells) * (blocks * width + architecture.gyroscopes)
-    return 4.0 * (len(jobs) * network + examples)
-
-
-def _steps(job: TrainingJob) -> int:
-    epochs = len(job.settings.learning_rates(job.windows))
-    return epochs * -(-job.windows // job.settings.batch_size)
-
-
-def _examples(job: TrainingJob) -> int:
-    """Training and validation windows."""
-    return job.windows + (job.validation.windows if job.validation else 0)
-
-
-def _sizes(job: TrainingJob) -> str:
-    """What networks that are trained at once have in common."""
-    return f"{job.architecture} {job.settings}"
-
-
-def _order(job: TrainingJob) -> tuple[str, int, str]:
-    return _sizes(job), -job.windows, str(_cell(job))
+def _bytes(job: TrainingJob) -> float:
+    """Estimate of what a training takes: its examples, and what a step keeps."""
+    blocks, width = packed_shape(job.architecture)
+    examples = job.windows + (job.validation.windows if job.validation else 0)
+    return 4.0 * blocks * width * (2 * examples + _STEP * job.settings.batch_size)
 
 
 def _cell(job: TrainingJob) -> Hashable:
