@@ -83,7 +83,7 @@ def completed(stops):
 def test_a_stopped_run_fails_takes_its_workers_along_and_looks_finished_nowhere(stops):
     project, (killed, interrupted, evaluating) = stops
     for one in (killed, interrupted, evaluating):
-        assert one.code != 0
+        assert one.code != 0, one.output
         assert one.survivors == []
         for run in one.finished:
             kept = {path.name for path in project.artifacts(run).iterdir()}
