@@ -121,8 +121,8 @@ def pool(
         row["folds"] = int(found[0].params["folds"])
         row["run_ids"] = " ".join(run.run_id for run in found)
         results.append(row)
-        if key in defaults and spec.estimator == CNN:
-            best = [best_epoch(run) for run in found]
+        best = [best_epoch(run) for run in found if spec.estimator == CNN]
+        if key in defaults and best and all(len(run.load(ERRORS)) for run in best):
             figures = network_row(best, means[key], spec.window_s)
             less = differences(best, references, evaluation)
             results.append(row | figures | less | {"estimator": CNN_BEST})
