@@ -48,6 +48,9 @@ def count_finished(path: Path, study: str, params: Mapping[str, str]) -> int:
     """How many runs of a study, with these parameters, are FINISHED and not deleted.
 
     It asks the file itself, as MLflow takes seconds to open a store.
+
+    Raises:
+        InputError: The file is no run store.
     """
     query = (
         "select count(*) from runs join experiments using (experiment_id) where "
@@ -56,8 +59,12 @@ def count_finished(path: Path, study: str, params: Mapping[str, str]) -> int:
     for _ in params:
         query += " and run_uuid in (select run_uuid from params where key = ? and value = ?)"
     values = [study, *(part for pair in params.items() for part in pair)]
-    with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as connection:
-        return int(connection.execute(query, values).fetchone()[0])
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as connection:
+            return int(connection.execute(query, values).fetchone()[0])
+    except sqlite3.DatabaseError:
+        check_store(path)  # it says what is wrong with the file
+        return 0
 
 
 def check_not_moved(experiment: Experiment, store: Path) -> None:
