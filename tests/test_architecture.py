@@ -40,13 +40,13 @@ ALLOWED = {
         for stage in STAGES
     },
     "pipelines": set(),
-    "pipeline_registry": {
-        "parameters",
-        "studies",
-        "pipelines",
+    "pipelines.assembly": {
+        *("parameters", "pipelines", "studies"),
         *(f"pipelines.{stage}" for stage in STAGES),
     },
-    "hooks": {"conventions", "datasets", "parameters", "pipeline_registry", "studies"},
+    "pipeline_registry": {"parameters", "pipelines.assembly"},
+    "runner": {"conventions", "datasets", "estimators", "fingerprints"},
+    "hooks": {"conventions", "datasets", "parameters", "pipeline_registry", "runner", "studies"},
     "settings": {"hooks"},
     "store": {"conventions"},
     "__init__": set(),
@@ -149,6 +149,8 @@ def test_imports_point_one_way():
         ("pipelines.training.nodes", "from gyro_pipeline.pipelines import ground_truth"),
         ("pipelines.training.nodes", "from ..raw_logs.nodes import label_recordings"),
         ("pipelines.training.nodes", "from gyro_pipeline.datasets.tracked_runs import TrackedRuns"),
+        ("pipelines.training.pipeline", "from gyro_pipeline.runner import ChangedNodesRunner"),
+        ("runner", "from gyro_pipeline.pipelines.assembly import assemble"),
         ("conventions", "from gyro_pipeline.parameters import Parameters"),
     ],
 )

@@ -24,6 +24,11 @@ ROW = ["sensor", "estimator", "real_gyros", "virtual_gyros", "window_s"]
 PARAMS = {
     *ROW, "study", "source", "protocol", "method", "window_stride_s", "seed", "folds",
     "validation_recordings", "fold_validation_recordings", "training_windows", "split_seed",
+    "test_fraction", "k_fold_below", "leave_one_out_up_to",
+}  # fmt: skip
+VIRTUAL = {
+    "virtual_imus", "virtual_recordings", "virtual_train_recordings",
+    "virtual_turn_on_jitter_mdps", "virtual_seed",
 }  # fmt: skip
 HYPER_PARAMETERS = {
     "centring", "channels", "kernel", "stride", "pool", "hidden", "epochs", "batch_size",
@@ -112,7 +117,7 @@ def test_rows_whose_estimator_uses_the_same_training_set_are_one_finished_run(sm
 def test_parameters_and_metrics_keep_their_names(smoke):
     for run in smoke.runs:
         params, network = run.data.params, run.data.params["estimator"] == "cnn"
-        virtual = {"turn_on_jitter_mdps"} if params["virtual_gyros"] != "0" else set()
+        virtual = VIRTUAL if params["virtual_gyros"] != "0" else set()
         assert set(params) == PARAMS | virtual | (HYPER_PARAMETERS if network else set())
         fixed = {"study": "augmentation", "source": "simulated_smoke", "method": "2", "folds": "1"}
         assert {name: params[name] for name in fixed} == fixed
@@ -353,12 +358,12 @@ def strangers(new_project):
     (project.folder / "src/of_a_stranger.py").write_text(LARGEST)
     changes = {"studies": {"augmentation": {"estimators": ["cnn", "of_a_stranger:Largest"]}}}
     changes |= {"training": {"epochs": 1}, "only": {"sensor": "sparkfun", "window_s": 30}}
-    done = project.run_here("augmentation", "smoke", **changes, execution=SERIAL)
-    return project, done
+    changes |= {"execution": SERIAL}
+    return project, project.run_here("augmentation", "smoke", **changes), changes
 
 
 def test_rows_of_a_strangers_estimator_are_trained_on_what_they_name(strangers):
-    project, done = strangers
+    project, done, _ = strangers
     assert done.code == 0, done.output
     every = project.runs("augmentation")
     runs = [run for run in every if run.data.params["estimator"] not in ("mean", "cnn")]
@@ -372,6 +377,32 @@ def test_rows_of_a_strangers_estimator_are_trained_on_what_they_name(strangers):
             model = mlflow.pyfunc.load_model(f"runs:/{run_id}/model")
             said = model.predict(np.zeros((1, 3, 450)))["bias_dps"]
             assert said.tolist() == [[(real + virtual) / 3] * 3]
+
+
+def test_a_second_run_does_nothing_a_change_runs_what_follows_and_a_named_node_is_run(strangers):
+    project, done, changes = strangers
+    up_to_date = r"(\d+) of (\d+) nodes are up to date and not run again \((.*)\)"
+    assert not re.search(up_to_date, done.output)
+    states, runs = project.files(), identities(project.runs("augmentation"))
+    again = project.run_here("augmentation", "smoke", **changes)
+    left, nodes, _ = re.search(up_to_date, again.output).groups()
+    assert (again.code, left) == (0, nodes)
+    assert project.files() == states
+    assert identities(project.runs("augmentation")) == runs
+    changed = changes | {"evaluation": {"resamples": 60}}
+    other = project.run_here("augmentation", "smoke", **changed)
+    assert other.code == 0, other.output
+    stages = set(re.search(up_to_date, other.output)[3].split(", "))
+    assert stages - {"reporting"} == {
+        *("raw_logs", "ground_truth", "virtual_gyros", "windowed_splits", "training"),
+    }
+    assert f"sparkfun: {len(runs)} runs evaluated, 0 skipped" in other.output
+    assert project.runs("augmentation")[0].data.tags["evaluated_with"]
+    bias = project.folder / "data/04_feature/simulated_smoke/sparkfun/bias.csv"
+    before = bias.stat().st_mtime_ns
+    named = project.kedro_run("--pipeline=ground_truth", "--env=smoke", "--nodes=bias_sparkfun")
+    assert named.code == 0, named.output
+    assert bias.stat().st_mtime_ns > before
 
 
 @pytest.fixture(scope="module")

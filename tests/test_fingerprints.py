@@ -180,8 +180,18 @@ def test_a_package_counts_with_all_its_modules():
 
 
 def test_a_module_that_is_not_there_is_refused():
-    with pytest.raises(ModuleNotFoundError, match="no module 'not_there' whose source"):
+    with pytest.raises(ModuleNotFoundError, match="no module 'not_there'"):
         code_hash("not_there:Mine")
+
+
+def test_an_installed_module_counts_by_its_version(monkeypatch):
+    forget()
+    before = code_hash("numpy.linalg:norm")
+    for installed, same in (("0.0.1", False), (np.__version__, True)):
+        monkeypatch.setattr(fingerprints, "version", lambda _, installed=installed: installed)
+        code_hash.cache_clear()
+        assert (code_hash("numpy.linalg:norm") == before) == same
+    forget()
 
 
 ARRAY = np.arange(24, dtype=np.float32).reshape(2, 3, 4)

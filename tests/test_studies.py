@@ -201,12 +201,10 @@ def test_a_run_carries_its_identity_and_the_settings_that_it_depends_on(base):
         given = base.training, base.splits, base.virtual_gyros
         return run_params(row, base.studies[study], *given)
 
-    identity = set(RunSpec.names())
-    splits = {"split_seed", "training_windows", "validation_recordings"}
-    splits |= {"fold_validation_recordings"}
-    jitter = {"turn_on_jitter_mdps"}
+    identity, splits = set(RunSpec.names()), set(base.splits.model_dump())
+    virtual = {f"virtual_{name}" for name in base.virtual_gyros.model_dump()}
     training = set(base.training.model_dump(exclude_none=True))
-    assert set(params_of(ROW)) == identity | splits | jitter | training
+    assert set(params_of(ROW)) == identity | splits | virtual | training
     alone = replace(ROW, estimator="best_linear", virtual_gyros=0)
     assert set(params_of(alone)) == identity | splits
     leak = params_of(replace(ROW, virtual_gyros=0), "leakage")

@@ -33,6 +33,9 @@ MDPS = 1e-3
 TRAIN, VALIDATION, TEST = "train", "validation", "test"
 """The roles of windows and recordings."""
 
+ALWAYS = "always"
+"""Tag of a node that is run each time, since somebody waits for what it prints."""
+
 UNSEEN = 0
 """In place of the number of an IMU, of which the first is 1: any that is not there."""
 

@@ -18,14 +18,12 @@ from kedro.pipeline import Node, Pipeline
 from kedro.runner import SequentialRunner
 from pluggy import PluginManager
 
+from gyro_pipeline.conventions import ALWAYS
 from gyro_pipeline.datasets.atomic import replacing
 from gyro_pipeline.estimators import ESTIMATORS
 from gyro_pipeline.fingerprints import code_hash, fingerprint
 
 logger = logging.getLogger(__name__)
-
-ALWAYS = "always"
-"""Tag of a node that is run each time, since somebody waits for what it prints."""
 
 _PARAMETERS = "params:"
 

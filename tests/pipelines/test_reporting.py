@@ -228,13 +228,33 @@ def test_the_newest_run_with_these_settings_counts_and_of_others_it_is_told_why_
     assert "augmentation: 4 older runs with other settings or data are in" in caplog.text
 
 
-def test_what_the_last_plan_left_out_is_no_gap(make_run, mean, pool):
-    study = study_of(estimators=["ridge_same_time", CNN])
-    lacking = make_run("", errors(1.0), estimator="ridge_same_time").params
-    row = {name: lacking[name] for name in RunSpec.names()} | {LEFT_OUT: "one recording"}
+def test_a_run_that_the_last_plan_has_is_found_by_its_fingerprint(make_run, mean, pool):
+    study = study_of(real=(3, 6))
+    stale = make_run("of other data", errors(1.0), started_ms=9)
+    planned_run = make_run("planned", errors(1e-3))
+    planned_run = replace(planned_run, params=planned_run.params | {"split_seed": "77"})
+    narrowed = make_run("not in the plan", errors(1e-3), real_gyros=6)
+    plan = plan_of(planned_run, mean)
+    results, _, unused = pool([stale, planned_run, narrowed, mean], study, plan=plan)
+    assert results.run_ids.tolist() == ["mean", "planned", "not in the plan"]
+    assert unused.run_id.tolist() == ["of other data"]
+    results, _, _ = pool([stale, narrowed, mean], study, plan=plan)
+    assert results[results.missing.notna()].real_gyros.tolist() == [3]
+
+
+def plan_of(*runs, left_out=""):
+    """A plan as its file gives it back."""
+    rows = [{name: run.params[name] for name in RunSpec.names()} for run in runs]
     numbers = {name: int for name in ("method", "real_gyros", "virtual_gyros", "seed")}
     kinds = numbers | dict.fromkeys(("window_s", "window_stride_s"), float)
-    plan = pd.DataFrame([row]).astype(kinds)
+    keys = {FINGERPRINT: [run.fingerprint for run in runs], LEFT_OUT: left_out or None}
+    return pd.DataFrame(rows).astype(kinds).assign(**keys)
+
+
+def test_what_the_last_plan_left_out_is_no_gap(make_run, mean, pool):
+    study = study_of(estimators=["ridge_same_time", CNN])
+    lacking = make_run("", errors(1.0), estimator="ridge_same_time")
+    plan = plan_of(lacking, left_out="one recording")
     network = make_run("network", errors(1e-3))
     assert pool([network, mean], study)[0].missing.notna().sum() == 1
     results, _, _ = pool([network, mean], study, plan=plan)

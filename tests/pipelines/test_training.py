@@ -321,11 +321,23 @@ def test_everything_changes_with_the_recordings_and_with_those_that_test(varied)
     assert changed(varied, raw=moved) == everything
 
 
-def test_every_run_changes_with_the_settings_of_the_splits_that_it_carries(varied):
-    """Reports find runs by them; a run that kept others would be missing for ever."""
-    for setting in ({"training_windows": "first"}, {"fold_validation_recordings": 1}):
+def test_a_setting_of_the_splits_changes_the_runs_whose_windows_it_changes(varied):
+    """Reports find runs by fingerprint, so that the others are found whatever they carry."""
+    for setting, expected in (
+        ({"training_windows": "first"}, set(varied.fingerprints)),
+        ({"fold_validation_recordings": 1}, set()),  # this is a hold-out
+    ):
         splits = varied.splits.model_copy(update=setting)
-        assert changed(varied, splits=splits) == set(varied.fingerprints)
+        assert changed(varied, splits=splits) == expected
+
+
+def test_every_run_changes_with_its_labels(varied):
+    ends = varied.raw.angular_rate.isel(sample=0, drop=True).astype(float)
+    cut = varied.recordings.assign(recording_mean=varied.recordings.recording_mean + 1e-9 * ends)
+    given = varied.study, cut, varied.windows, [10.0], [0], varied.only, varied.training
+    plan = nodes.plan_runs(*given, varied.virtual)
+    assert len(plan) == len(varied.fingerprints)
+    assert not {*plan[FINGERPRINT]} & {*varied.fingerprints.values()}
 
 
 def test_its_own_code_changes_a_strangers_runs_alone_and_a_remark_does_not(strange, stranger):

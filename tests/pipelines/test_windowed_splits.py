@@ -172,7 +172,11 @@ def test_a_window_that_lost_its_samples_moves_no_recording_to_another_fold(make,
         tested = numbers(table, TEST, f"fold {fold}")
         assert tested == numbers(whole, TEST, f"fold {fold}") == [fold + 1]
         train = numbers(table, TRAIN, f"fold {fold}") + numbers(table, VALIDATION, f"fold {fold}")
-        assert sorted(train) == [n for n in (1, 3, 4, 5) if n not in tested]
+        assert sorted(train) == [n for n in range(1, 6) if n not in tested]
+    trained = table[table.role != TEST].groupby("recording").start.unique()
+    assert {n: [*starts] for n, starts in trained.items()} == {
+        n: [200 if n == 2 else 0] for n in range(1, 6)
+    }
     tests = table[(table.role == TEST) & (table.recording == 2)]
     assert tests.start.tolist() == [200, 400]
 

@@ -2,13 +2,13 @@
 
 from kedro.pipeline import Node, Pipeline
 
+from gyro_pipeline.conventions import ALWAYS
 from gyro_pipeline.pipelines.ground_truth.nodes import (
     measure_allan_variance,
     measure_bias,
     measure_noise,
 )
 from gyro_pipeline.pipelines.ground_truth.report import report_biases
-from gyro_pipeline.runner import ALWAYS
 
 
 def create_report(sensor: str) -> Pipeline:
