@@ -93,6 +93,11 @@ REFUSED = [
     ),
     (of_study("leakage", strides_s=[1, 0]), "studies.leakage.strides_s.1:", "greater than 0"),
     (of_study("leakage", strides_s=[1, 1]), "studies.leakage:", "names one of them twice"),
+    (
+        of_study("leakage", also={"leave_one_device_out": ["mean"]}),
+        "studies.leakage:",
+        "also: leave_one_device_out is a study's only protocol",
+    ),
     (of_study("leakage", protocol="peek"), "studies.leakage.protocol:", "'by_recording'"),
     (
         {"sensors": {"ng": {"train_recordings": 100}}},

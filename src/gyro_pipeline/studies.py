@@ -236,7 +236,8 @@ def run_params(
         splits: How recordings are split, and which windows train.
         virtual_gyros: How they were drawn, where the run has some.
     """
-    params: dict[str, Any] = asdict(spec) | study.splits(splits).model_dump()
+    split = study.splits(splits).model_dump(exclude={"folds"})  # a run carries how many it has
+    params: dict[str, Any] = asdict(spec) | split
     if spec.virtual_gyros:
         drawn = virtual_gyros.model_dump()
         params |= {f"virtual_{name}": value for name, value in drawn.items()}

@@ -449,12 +449,26 @@ def test_what_was_judged_this_way_is_skipped_and_nothing_else(world, stored, jud
     assert "0 runs evaluated, 5 skipped" in caplog.text
     waiting = [replace(finished[0], finished=False), *finished[1:]]
     assert [run.run_id for run in world.evaluate(waiting)] == [finished[0].run_id]
-    other = replace(world, evaluation=world.evaluation.model_copy(update={"resamples": 101}))
-    again = other.evaluate(finished)
-    assert len(again) == 5
-    assert {run.tags[EVALUATED_WITH] for run in again}.isdisjoint(
-        run.tags[EVALUATED_WITH] for run in judged.values()
-    )
+    resampled = world.evaluation.model_copy(update={"resamples": 101})
+    for other in (
+        replace(world, evaluation=resampled),
+        replace(world, raw_bias=world.raw_bias.assign(bias_dps=world.raw_bias.bias_dps + 1e-9)),
+        replace(world, allan=world.allan.assign(allan_variance=world.allan.allan_variance * 1.01)),
+    ):
+        given = world.plan, finished, world.recordings, world.windows, other.bias, other.allan
+        again = list(evaluate(*given, other.evaluation))
+        assert len(again) == 5
+        assert {run.tags[EVALUATED_WITH] for run in again}.isdisjoint(
+            run.tags[EVALUATED_WITH] for run in judged.values()
+        )
+
+
+def test_a_metric_of_an_earlier_evaluation_that_is_none_now_is_stored_as_none(world, stored):
+    earlier = [replace(run, metrics={"coverage_95_pct": 95.0}) for run in stored]
+    networks = {run.run_id for run in stored if run.params["estimator"] == CNN}
+    for judged in world.evaluate(earlier):
+        none = np.isnan(judged.metrics["coverage_95_pct"])
+        assert none == (judged.run_id in networks)
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,7 @@ from gyro_pipeline.pipelines.reporting.tables import (
     three_gyroscopes,
 )
 from gyro_pipeline.studies import CNN, LEFT_OUT, MEAN, RunSpec, run_params, run_spec
-from gyro_pipeline.tracking import CURVE, ERRORS, SCORES, StoredRun
+from gyro_pipeline.tracking import CURVE, ERRORS, FINGERPRINT, SCORES, StoredRun
 
 WINDOW_S = 10.0
 TIMES_S = np.array([1.0, 5.0, 10.0, 20.0, 40.0])
