@@ -230,14 +230,14 @@ def test_the_newest_run_with_these_settings_counts_and_of_others_it_is_told_why_
 
 def test_a_run_that_the_last_plan_has_is_found_by_its_fingerprint(make_run, mean, pool):
     study = study_of(real=(3, 6))
-    stale = make_run("of other data", errors(1.0), started_ms=9)
+    stale = make_run("stale", errors(1.0), started_ms=9)
     planned_run = make_run("planned", errors(1e-3))
     planned_run = replace(planned_run, params=planned_run.params | {"split_seed": "77"})
-    narrowed = make_run("not in the plan", errors(1e-3), real_gyros=6)
+    narrowed = make_run("narrowed", errors(1e-3), real_gyros=6)
     plan = plan_of(planned_run, mean)
     results, _, unused = pool([stale, planned_run, narrowed, mean], study, plan=plan)
-    assert results.run_ids.tolist() == ["mean", "planned", "not in the plan"]
-    assert unused.run_id.tolist() == ["of other data"]
+    assert results.run_ids.tolist() == ["mean", "planned", "narrowed"]
+    assert unused.run_id.tolist() == ["stale"]
     results, _, _ = pool([stale, narrowed, mean], study, plan=plan)
     assert results[results.missing.notna()].real_gyros.tolist() == [3]
 
