@@ -6,6 +6,7 @@ import importlib.util
 import json
 import sysconfig
 from functools import cache
+from importlib.metadata import packages_distributions, version
 from pathlib import Path
 from typing import Any
 
@@ -44,10 +45,13 @@ def code_hash(*entries: str) -> str:
         ModuleNotFoundError: There is no such module.
     """
     contents: dict[str, bytes] = {}
-    waiting = [name for entry in entries for name in _members(entry.partition(":")[0])]
+    asked = [name for entry in entries for name in _members(entry.partition(":")[0])]
+    waiting = [*asked]
     while waiting:
         name = waiting.pop()
         path = _source(name)
+        if path is None and name in asked:
+            contents[name] = _version(name).encode()
         if path is None or name in contents:
             continue
         package = name if path.name == "__init__.py" else name.rpartition(".")[0]
@@ -64,11 +68,19 @@ def code_hash(*entries: str) -> str:
 def _members(name: str) -> list[str]:
     """The module, and all modules in it if it is a package."""
     path = _source(name)
-    if path is None:
-        raise ModuleNotFoundError(f"no module {name!r} whose source could be read", name=name)
+    if path is None and importlib.util.find_spec(name) is None:
+        raise ModuleNotFoundError(f"no module {name!r}", name=name)
+    if path is None:  # installed: its version counts
+        return [name]
     inside = path.parent.rglob("*.py") if path.name == "__init__.py" else []
     parts = [file.relative_to(path.parent).with_suffix("").parts for file in inside]
     return [name, *(".".join([name, *part]) for part in parts if part[-1] != "__init__")]
+
+
+def _version(name: str) -> str:
+    """Name and version of the package that an installed module is of."""
+    packages = packages_distributions().get(name.partition(".")[0], [])
+    return ", ".join(f"{package} {version(package)}" for package in packages)
 
 
 def _source(name: str) -> Path | None:

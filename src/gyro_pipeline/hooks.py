@@ -194,7 +194,7 @@ class Provenance:
 def _changed(base: Mapping[str, Any], given: Mapping[str, Any]) -> frozenset[str]:
     """Names of the settings of runs that differ from those of ``conf/base``."""
     return frozenset(
-        key
+        f"virtual_{key}" if group == "virtual_gyros" else key
         for group in ("splits", "virtual_gyros", "training")
         for key, value in (given.get(group) or {}).items()
         if base.get(group, {}).get(key) != value

@@ -489,8 +489,13 @@ class Study(Parameter):
         return Training.model_validate(base.model_dump() | self.training)
 
     def splits(self, base: Splits) -> Splits:
-        """Settings of the splits with what the study changes."""
-        return base.model_copy(update={"folds": self.folds or base.folds})
+        """Settings of the splits with what the study changes.
+
+        Where windows of all roles are at a stride, this is the one at which they train.
+        """
+        windows = "all" if self.strides_s else base.training_windows
+        changed = {"folds": self.folds or base.folds, "training_windows": windows}
+        return base.model_copy(update=changed)
 
     @model_validator(mode="after")
     def _nothing_is_named_twice(self) -> Self:
@@ -500,6 +505,8 @@ class Study(Parameter):
 
     @model_validator(mode="after")
     def _networks_know_their_device(self) -> Self:
+        if LEAVE_ONE_DEVICE_OUT in self.also:
+            raise ValueError(f"also: {LEAVE_ONE_DEVICE_OUT} is a study's only protocol")
         networks = [name for name in self.estimators if name.startswith("cnn")]
         if self.unseen_devices and networks:
             raise ValueError(

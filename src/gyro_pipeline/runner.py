@@ -8,7 +8,7 @@ what it stored is not there or was changed since.
 
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from kedro.runner import SequentialRunner
 from pluggy import PluginManager
 
 from gyro_pipeline.datasets.atomic import replacing
+from gyro_pipeline.estimators import ESTIMATORS
 from gyro_pipeline.fingerprints import code_hash, fingerprint
 
 logger = logging.getLogger(__name__)
@@ -124,15 +125,11 @@ def _fingerprints(pipeline: Pipeline, catalog: CatalogProtocol) -> dict[str, str
     return made
 
 
-def _own_classes(values: Any) -> list[str]:
-    """Names such as ``package.module:Class`` among parameters, whose code counts as well."""
-    if isinstance(values, str):
-        return [values] if values.partition(":")[2].isidentifier() else []
-    if isinstance(values, Mapping):
-        values = values.values()
-    if not hasattr(values, "__iter__"):
-        return []
-    return sorted({name for value in values for name in _own_classes(value)})
+def _own_classes(inputs: Iterable[Any]) -> list[str]:
+    """Estimators of one's own, ``package.module:Class``, in studies: their code counts as well."""
+    studies = [value for value in inputs if isinstance(value, Mapping) and "estimators" in value]
+    names = {name for study in studies for name in study["estimators"]}
+    return sorted(names - ESTIMATORS.keys())
 
 
 def _state(name: str, catalog: CatalogProtocol) -> Any:

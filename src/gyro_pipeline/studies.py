@@ -234,22 +234,12 @@ def run_params(
         study: Its study, which may change some settings.
         training: Hyper-parameters, of estimators that have some.
         splits: How recordings are split, and which windows train.
-        virtual_gyros: Their turn-on jitter is recorded where the run has some.
+        virtual_gyros: How they were drawn, where the run has some.
     """
-    params: dict[str, Any] = asdict(spec) | split_params(study, splits)
+    params: dict[str, Any] = asdict(spec) | study.splits(splits).model_dump()
     if spec.virtual_gyros:
-        params["turn_on_jitter_mdps"] = virtual_gyros.turn_on_jitter_mdps
+        drawn = virtual_gyros.model_dump()
+        params |= {f"virtual_{name}": value for name, value in drawn.items()}
     if estimator_class(spec.estimator).seeded:
         params |= study.training_of(training).model_dump(exclude_none=True)
     return params
-
-
-def split_params(study: Study, splits: Splits) -> dict[str, Any]:
-    """Settings of the splits that a run's parameters name."""
-    named = {
-        "split_seed",
-        "training_windows",
-        "validation_recordings",
-        "fold_validation_recordings",
-    }
-    return study.splits(splits).model_dump(include=named)

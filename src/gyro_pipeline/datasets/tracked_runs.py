@@ -302,12 +302,15 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
         if run is None:
             tags = self._tags_of(fitted)
             differs = [f"{key} {wanted.params[key]}" for key in self.changed & wanted.params.keys()]
+            env = self.provenance.get("kedro_env", "base")
             name = ", ".join([wanted.name, *sorted(differs)])
+            name += f" ({env})" * (env != "base")
             run = self._client.create_run(experiment_id, fitted.started_ms, tags, name)
         else:
             self._client.update_run(run.info.run_id, "RUNNING")
             self._client.set_tag(run.info.run_id, _OWNER, _this_process())
-        if not run.data.params:
+        inputs = run.inputs.dataset_inputs if run.inputs else []
+        if not (run.data.params and inputs):  # also where a kill came between the two
             params = [Param(key, str(value)) for key, value in wanted.params.items()]
             self._client.log_batch(run.info.run_id, params=params)
             self._client.log_inputs(run.info.run_id, [_dataset(fitted.dataset)])

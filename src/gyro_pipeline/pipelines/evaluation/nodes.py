@@ -18,7 +18,7 @@ from gyro_pipeline.conventions import (
 )
 from gyro_pipeline.estimators import ORIENTATION_NOTE
 from gyro_pipeline.estimators.base import Estimator
-from gyro_pipeline.fingerprints import code_hash, fingerprint
+from gyro_pipeline.fingerprints import code_hash, data_hash, fingerprint
 from gyro_pipeline.parameters import Evaluation
 from gyro_pipeline.pipelines.evaluation.bench import Bench
 from gyro_pipeline.pipelines.evaluation.device import TestDevice, describe_devices
@@ -74,11 +74,15 @@ def evaluate(
     Yields:
         Metrics, scores and the errors of each window, to be added to each run.
     """
-    judged_with = fingerprint([code_hash(__name__), evaluation.model_dump()])
+    truths = [
+        data_hash(pd.util.hash_pandas_object(bias, index=False).to_numpy(), None),
+        data_hash(allan.allan_variance.load().to_numpy(), None),
+    ]
+    judged_with = fingerprint([code_hash(__name__), evaluation.model_dump(), truths])
     specs, stored = planned(plan), {run.fingerprint: run for run in reversed(runs)}
     benches = Benches(recordings, windows, bias, allan, evaluation)
     judged = 0
-    for key, spec in specs.items():
+    for key, spec in sorted(specs.items(), key=lambda item: _bench_key(item[1])):
         run = stored[key]
         if run.finished and run.tags.get(EVALUATED_WITH) == judged_with:
             continue
@@ -88,8 +92,12 @@ def evaluate(
     logger.info("%s: %d runs evaluated, %d skipped", label, judged, len(specs) - judged)
 
 
+def _bench_key(spec: RunSpec) -> tuple[str, float, float]:
+    return spec.protocol, spec.window_s, spec.window_stride_s
+
+
 class Benches:
-    """The benches of a study on a sensor, each made once.
+    """The benches of a study on a sensor, of which the last one is kept.
 
     Args:
         recordings, windows, bias, allan, evaluation: As :func:`evaluate` takes them.
@@ -112,7 +120,7 @@ class Benches:
 
     def of(self, spec: RunSpec) -> Bench:
         """The bench on which a run is judged."""
-        key = spec.protocol, spec.window_s, spec.window_stride_s
+        key = _bench_key(spec)
         if key not in self._made:
             table = self._tables[key]
             columns = ["fold", "imu", "recording", "start"]
@@ -146,7 +154,9 @@ def _judge(run: StoredRun, spec: RunSpec, bench: Bench, judged_with: str) -> Eva
         errors.append(table.assign(weights=weights))
         scores.append(bench.scores(table, weights))
     table = pd.concat(scores, ignore_index=True)
-    metrics = _metrics(table) | _losses(first)
+    metrics = _metrics(table)
+    # of an earlier evaluation, and none now: the store can replace metrics, and not remove them
+    metrics |= {name: np.nan for name in METRICS if name in run.metrics and name not in metrics}
     artifacts = {ERRORS: pd.concat(errors, ignore_index=True), SCORES: table}
     if spec.estimator == MEAN:
         artifacts[CURVE] = bench.curve
@@ -182,17 +192,9 @@ def _value(scores: pd.DataFrame, score: str, windows: str, column: str = "value"
     return float(chosen[column].iloc[0]) if chosen[column].notna().any() else np.nan
 
 
-def _losses(estimator: Estimator) -> dict[str, float]:
-    """Losses of a network at the last epoch."""
-    if estimator.history is None:
-        return {}
-    last = estimator.history.iloc[-1]
-    return {name: float(last[name]) for name in ("train_loss", "val_loss") if name in last}
-
-
 def _off_the_curve(metrics: Mapping[str, float]) -> dict[str, str]:
     """In words, why an equivalent time is none."""
-    if "rmse_mdps" not in metrics or "equivalent_time_s" in metrics:
+    if "rmse_mdps" not in metrics or np.isfinite(metrics.get("equivalent_time_s", np.nan)):
         return {}
     worse = metrics["rmse_mdps"] > metrics["mean_rmse_mdps"]
     return {

@@ -18,7 +18,7 @@ from gyro_pipeline.pipelines.reporting.results import (
     rows_of,
     why_unused,
 )
-from gyro_pipeline.studies import LEFT_OUT, RunSpec, run_spec, study_rows
+from gyro_pipeline.studies import LEFT_OUT, RunSpec, planned, run_spec, study_rows
 from gyro_pipeline.tracking import StoredRun
 
 logger = logging.getLogger(__name__)
@@ -64,13 +64,19 @@ def pool_results(  # noqa: PLR0913, PLR0917 - a node's arguments are its dataset
     runs = [run for name, own in stored.items() if name.endswith("_runs") for run in own]
     settings = Settings(study, training, splits, virtual_gyros, evaluation)
     sensors = [name.removesuffix("_runs") for name in stored if name.endswith("_runs")]
-    left_out = _left_out(part for name, part in stored.items() if name.endswith("_plan"))
+    plans = [
+        part
+        for name, part in stored.items()
+        if name.endswith("_plan") and isinstance(part, pd.DataFrame)
+    ]
+    left_out = _left_out(plans)
+    fingerprints = {spec: key for plan in plans for key, spec in planned(plan).items()}
     specs = [
         spec
         for spec in _specs(study, sensors, source, windows_s, seeds)
         if run_spec(spec, study.unseen_devices) not in left_out
     ]
-    results, means = pool(rows_of(specs), runs, settings)
+    results, means = pool(rows_of(specs), runs, settings, fingerprints)
     used = {run_id for row in results for run_id in (row["run_ids"] or "").split()}
     unused = [
         {"run_id": run.run_id, "why": why_unused(run, specs, settings)} | dict(run.params)
@@ -191,11 +197,10 @@ def _specs(
     ]
 
 
-def _left_out(plans: Iterable[pd.DataFrame | Missing]) -> set[RunSpec]:
+def _left_out(plans: Iterable[pd.DataFrame]) -> set[RunSpec]:
     """Runs that cannot be made, by the last plans."""
     return {
         RunSpec(**{name: row[name] for name in RunSpec.names()})
         for plan in plans
-        if isinstance(plan, pd.DataFrame)
         for row in plan[plan[LEFT_OUT].notna()].to_dict("records")
     }

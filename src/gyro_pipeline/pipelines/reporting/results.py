@@ -64,15 +64,22 @@ class Settings:
     virtual_gyros: VirtualGyros
     evaluation: Evaluation
 
+    def spec(self, row: RunSpec) -> RunSpec:
+        """The run that makes a row."""
+        return run_spec(row, self.study.unseen_devices)
+
     def params(self, row: RunSpec) -> dict[str, str]:
         """Parameters of the run that makes a row, as the store has them."""
-        spec = run_spec(row, self.study.unseen_devices)
+        spec = self.spec(row)
         made = run_params(spec, self.study, self.training, self.splits, self.virtual_gyros)
         return {name: str(value) for name, value in made.items()}
 
 
 def pool(
-    rows: Iterable[Sequence[RunSpec]], runs: Sequence[StoredRun], settings: Settings
+    rows: Iterable[Sequence[RunSpec]],
+    runs: Sequence[StoredRun],
+    settings: Settings,
+    fingerprints: Mapping[RunSpec, str] | None = None,
 ) -> tuple[list[dict[str, Any]], dict[str, StoredRun]]:
     """Results of some rows.
 
@@ -80,6 +87,7 @@ def pool(
         rows: From :func:`rows_of`; the running mean of a window before others.
         runs: Finished ones count, newest first.
         settings: What they must have been made with.
+        fingerprints: Of runs, by the last plans.
 
     Returns:
         A result for each row, with ``missing``, the command that makes it where its runs are not
@@ -89,7 +97,7 @@ def pool(
     results: list[dict[str, Any]] = []
     means: dict[tuple[str, float], RunningMeans] = {}
     defaults: dict[tuple[str, float], pd.DataFrame] = {}
-    run_of = Finder(runs, settings)
+    run_of = Finder(runs, settings, fingerprints)
     of_rows = [(row, run_of(row)) for row in rows]
     for seeds, found in of_rows:
         if found and seeds[0].estimator == DEFAULT:
@@ -172,15 +180,25 @@ def rows_of(specs: Sequence[RunSpec]) -> Iterator[list[RunSpec]]:
 
 
 class Finder:
-    """Finds the newest finished runs that were made with the current settings.
+    """Finds the finished runs that make rows: by their fingerprints, where a plan has them.
+
+    Rows that the last plan left out, as a run was narrowed, are made by the newest runs with the
+    parameters of today.
 
     Args:
         runs: Finished ones count, newest first.
         settings: What they must have been made with.
+        planned: Fingerprints by the last plans.
     """
 
-    def __init__(self, runs: Sequence[StoredRun], settings: Settings) -> None:
-        self._settings = settings
+    def __init__(
+        self,
+        runs: Sequence[StoredRun],
+        settings: Settings,
+        planned: Mapping[RunSpec, str] | None = None,
+    ) -> None:
+        self._settings, self._planned = settings, planned or {}
+        self._by_fingerprint = {run.fingerprint: run for run in reversed(runs) if run.finished}
         self._runs: dict[frozenset[tuple[str, str]], StoredRun] = {}
         for run in runs:
             if run.finished:
@@ -189,10 +207,15 @@ class Finder:
 
     def __call__(self, row: Sequence[RunSpec]) -> list[StoredRun]:
         """The runs of all seeds of a row; none if any is missing, or of other data."""
-        keys = dict.fromkeys(frozenset(self._settings.params(spec).items()) for spec in row)
-        found = [self._runs[key] for key in keys if key in self._runs]
+        specs = dict.fromkeys(self._settings.spec(one) for one in row)
+        found = [run for spec in specs if (run := self._find(spec)) is not None]
         alike = len({run.tags["data_hash"] for run in found}) == 1
-        return found if alike and len(found) == len(keys) else []
+        return found if alike and len(found) == len(specs) else []
+
+    def _find(self, spec: RunSpec) -> StoredRun | None:
+        if spec in self._planned:
+            return self._by_fingerprint.get(self._planned[spec])
+        return self._runs.get(frozenset(self._settings.params(spec).items()))
 
 
 def why_unused(run: StoredRun, specs: Sequence[RunSpec], settings: Settings) -> str:

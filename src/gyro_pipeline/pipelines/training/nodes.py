@@ -20,7 +20,7 @@ from gyro_pipeline.conventions import (
     UNSEEN,
     InputError,
 )
-from gyro_pipeline.estimators import entry, estimator_class, make_estimator
+from gyro_pipeline.estimators import ESTIMATORS, entry, estimator_class, make_estimator
 from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.estimators.fitting import FitJob, run_fits
 from gyro_pipeline.estimators.training import TrainingSet
@@ -34,7 +34,6 @@ from gyro_pipeline.studies import (
     planned,
     run_params,
     run_specs,
-    split_params,
     study_rows,
 )
 from gyro_pipeline.tracking import FINGERPRINT, HISTORY, FittedRun, RunIdentity, StoredRun
@@ -102,8 +101,10 @@ class TrainingSets:
                 f"{spec.source} recordings hold {len(AXES) * len(real)} that train; narrow with "
                 "--params=only.real_gyros=..."
             )
+        # where every device is an unseen one in its turn, all of them train the model
+        more = device == UNSEEN and len(tests) == 0
         imus = {
-            ORIGIN_REAL: real[: spec.real_imus],
+            ORIGIN_REAL: real[: spec.real_imus + more],
             ORIGIN_VIRTUAL: range(1, 1 + spec.virtual_imus),
         }
         used = [(learned.origin == origin) & learned.imu.isin(of) for origin, of in imus.items()]
@@ -126,7 +127,6 @@ def plan_runs(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     seeds: list[int],
     only: Only,
     training: Training,
-    splits: Splits,
     virtual: xr.Dataset | None = None,
 ) -> pd.DataFrame:
     """List the runs that a study needs on a sensor, before anything is trained.
@@ -139,7 +139,6 @@ def plan_runs(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
         seeds: Of estimators that draw at random.
         only: Narrows the grid.
         training: Hyper-parameters; part of the fingerprints of estimators that have some.
-        splits: Settings that runs carry.
         virtual: Virtual recordings, where the study uses some.
 
     Returns:
@@ -155,8 +154,7 @@ def plan_runs(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     runs = []
     for spec in run_specs(rows, study.unseen_devices):
         folds = sets.of(spec)
-        # what a report finds runs by, also where it makes no difference
-        content = [*_content(spec, sets, settings), split_params(study, splits)]
+        content = _content(spec, sets, settings)
         problem = _lacking(spec, sets) or _problem(spec, folds, settings)
         if problem:
             logger.warning("%s is left out: %s", _name(spec), problem)
@@ -167,16 +165,21 @@ def plan_runs(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
 def _content(spec: RunSpec, sets: TrainingSets, settings: Training) -> list[Any]:
     """All that a run depends on: code, settings, data and windows, but not its study."""
     estimator = estimator_class(spec.estimator)
+    used = [sets.recordings, *([sets.virtual] if spec.virtual_imus and sets.virtual else [])]
+    # an estimator of one's own may use any of ours by its name
+    ours = [] if spec.estimator in ESTIMATORS else ["gyro_pipeline.estimators"]
     return [
-        code_hash("gyro_pipeline.estimators.fitting", entry(spec.estimator)),
-        spec.estimator,
-        sets.recordings.attrs["data_hash"],
-        [sets.virtual.attrs["data_hash"]] if spec.virtual_imus and sets.virtual else [],
+        code_hash(__name__, "gyro_pipeline.estimators.fitting", entry(spec.estimator), *ours),
+        {name: value for name, value in vars(spec).items() if name not in ("study", "seed")},
+        [(data.attrs["data_hash"], _labels_hash(data)) for data in used],
         {fold: _hash(training.windows) for fold, training in sets.of(spec).items()},
         _hash(_tests(sets.table_of(spec))),
         [spec.seed, settings.model_dump()] if estimator.seeded else [],
-        [spec.sensor, spec.method, spec.window_s],
     ]
+
+
+def _labels_hash(recordings: xr.Dataset) -> str:
+    return data_hash(recordings.recording_mean.load().to_numpy(), None)
 
 
 def _hash(windows: pd.DataFrame) -> str:
@@ -354,18 +357,17 @@ def _name(spec: RunSpec) -> str:
 
 def _note(spec: RunSpec, folds: Mapping[str, TrainingSet]) -> str:
     """What was trained on what, in two sentences."""
-    model = folds.get(ALL_RECORDINGS) or next(iter(folds.values()))
-    counts = model.windows.groupby("origin", observed=True).recording.agg(["nunique", "size"])
+    fold = ALL_RECORDINGS if ALL_RECORDINGS in folds else next(iter(folds))
+    windows, judged = folds[fold].windows, sum(name != ALL_RECORDINGS for name in folds)
     shown = " and ".join(
-        f"{row['size']} windows of {row['nunique']} {origin} recordings"
-        for origin, row in counts.iterrows()
+        f"{len(rows)} windows of {len(rows[['imu', 'recording']].drop_duplicates())} {origin!s} "
+        "recordings"
+        for origin, rows in windows.groupby("origin", observed=True)
     )
-    tested = [fold for fold in folds if fold != ALL_RECORDINGS]
-    judged = "a hold-out" if len(tested) == 1 else f"{len(tested)} folds, each fitted by itself"
-    final = "; the model is fitted once more, to all recordings" * (ALL_RECORDINGS in folds)
     return (
-        f"`{spec.estimator}` estimates the bias of {spec.sensor} from {spec.window_s:g} s, learned "
-        f"from {shown or 'nothing'} ({spec.real_gyros} real and {spec.virtual_gyros} virtual "
-        f"gyroscopes, source {spec.source}). It is judged on {judged} (protocol {spec.protocol})"
-        f"{final}."
+        f"The model `{spec.estimator}` estimates the bias of {spec.sensor} from {spec.window_s:g} "
+        f"s; it was fitted to {shown or 'nothing'} ({fold}; {spec.real_gyros} real and "
+        f"{spec.virtual_gyros} virtual gyroscopes, source {spec.source}). The figures are of "
+        f"the protocol {spec.protocol}, by {judged} fit{'s' * (judged > 1)}, of which none saw what "
+        "it was judged on unless the protocol is a leak."
     )

@@ -19,12 +19,11 @@ def create_pipeline(study: str, sensor: str, virtual: bool) -> Pipeline:
         "recordings": f"{sensor}.windowed_splits.recordings",
         "windows": f"{study}.{sensor}.windowed_splits.windows",
         "training": "params:training",
-        "splits": "params:splits",
     }
     if virtual:
         data["virtual"] = f"{sensor}.virtual_gyros.recordings"
     grid = {name: f"params:{name}" for name in ("windows_s", "seeds", "only")}
-    settings = {name: f"params:{name}" for name in ("virtual_gyros", "execution")}
+    settings = {name: f"params:{name}" for name in ("splits", "virtual_gyros", "execution")}
     runs = {"plan": f"{stage}.plan", "tracked": f"{sensor}.training.tracked"}
     return Pipeline(
         [

@@ -152,11 +152,11 @@ def split_windows(  # noqa: PLR0917 - a node's arguments are its datasets
         InputError: No window can be used, or the table breaks its protocol.
     """
     sensor, source = recordings.attrs["sensor"], recordings.attrs["source"]
-    rows = study_rows(study, sensor, source, windows_s, [0], only)
+    rows = study_rows(study, sensor, source, windows_s, [only.seed or 0], only)
     places = zip(contents.imu.tolist(), contents.recording.tolist(), strict=True)
     hashes = dict(zip(places, contents.content.tolist(), strict=True))
     drawn_from = [] if virtual is None else np.atleast_1d(virtual.attrs["drawn_from"]).tolist()
-    splits = splits.model_copy(update={"folds": study.folds or splits.folds})
+    splits = study.splits(splits)
     tables = []
     for protocol, window_s, stride_s in dict.fromkeys(
         (row.protocol, row.window_s, row.window_stride_s) for row in rows
@@ -224,10 +224,13 @@ def _real_windows(  # noqa: PLR0917 - what a table depends on
             f"{label}: no test recording has one that can be used; lower windows_s of the study, "
             "or bring recordings that lost fewer samples"
         )
-    if splits.training_windows == "all" or stride != size:
+    if splits.training_windows == "all":
         return tested
-    first_only = splits.training_windows == "first"
-    training_stride = samples if first_only else round(splits.training_windows * rate_hz)
+    if splits.training_windows == "first":
+        trained = tested[tested.role != TEST]
+        first = trained.groupby(["fold", *_PLACE]).start.transform("min") == trained.start
+        return pd.concat([trained[first], tested[tested.role == TEST]])
+    training_stride = round(splits.training_windows * rate_hz)
     trained = table(usable_windows(contents, samples, size, max(training_stride, 1)))
     return pd.concat([trained[trained.role != TEST], tested[tested.role == TEST]])
 
@@ -244,9 +247,11 @@ def _first_recordings(
 def _virtual_windows(virtual: xr.Dataset, size: int, splits: Splits) -> pd.DataFrame:
     """Windows of the virtual recordings, all of which train."""
     rate_hz, samples = virtual.attrs["rate_hz"], virtual.sizes["sample"]
-    starts = {"all": range(0, samples - size + 1, size), "first": range(1)}.get(
-        str(splits.training_windows)
-    ) or range(0, samples - size + 1, round(float(splits.training_windows) * rate_hz))
+    strides = {"all": size, "first": samples}
+    stride = strides.get(str(splits.training_windows)) or max(
+        round(float(splits.training_windows) * rate_hz), 1
+    )
+    starts = range(0, samples - size + 1, stride)
     numbers = range(1, 1 + int(virtual.attrs["train_recordings"]))
     index = pd.MultiIndex.from_product(
         [virtual.imu.to_numpy(), numbers, starts], names=[*_PLACE, "start"]
