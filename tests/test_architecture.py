@@ -35,18 +35,14 @@ ALLOWED = {
     **{
         f"pipelines.{stage}": {
             *("conventions", "estimators", "executors", "fingerprints", "learning", "logs"),
-            *("parameters", "physics", "protocol", "quality", "studies", "tracking"),
+            *("parameters", "physics", "protocol", "quality", "runner", "studies", "tracking"),
         }
         for stage in STAGES
     },
-    "pipelines": set(),
-    "pipeline_registry": {
-        "parameters",
-        "studies",
-        "pipelines",
-        *(f"pipelines.{stage}" for stage in STAGES),
-    },
-    "hooks": {"conventions", "datasets", "parameters", "pipeline_registry", "studies"},
+    "pipelines": {"parameters", "studies", *(f"pipelines.{stage}" for stage in STAGES)},
+    "pipeline_registry": {"parameters", "pipelines"},
+    "runner": {"datasets", "estimators", "fingerprints"},
+    "hooks": {"conventions", "datasets", "parameters", "pipeline_registry", "runner", "studies"},
     "settings": {"hooks"},
     "store": {"conventions"},
     "__init__": set(),

@@ -79,7 +79,7 @@ class World:
     @cached_property
     def plan(self) -> pd.DataFrame:
         given = self.study, self.recordings, self.windows, list(self.windows_s), list(self.seeds)
-        return plan_runs(*given, self.only, self.training, self.splits, self.virtual)
+        return plan_runs(*given, self.only, self.training, self.virtual)
 
     @property
     def specs(self) -> dict[str, RunSpec]:
