@@ -16,6 +16,7 @@ import xarray as xr
 from mlflow import MlflowClient
 
 from gyro_pipeline.estimators import ESTIMATORS, ORIENTATION_NOTE, make_estimator
+from gyro_pipeline.parameters import Splits, VirtualGyros
 
 SERIAL = {"executor": "serial"}  # where few fits are not worth the start of processes
 REPORT = "data/08_reporting/simulated_smoke"
@@ -23,7 +24,7 @@ PAGE = "data/08_reporting/report"
 ROW = ["sensor", "estimator", "real_gyros", "virtual_gyros", "window_s"]
 PARAMS = {
     *ROW, "study", "source", "protocol", "method", "window_stride_s", "seed", "folds",
-    "validation_recordings", "fold_validation_recordings", "training_windows", "split_seed",
+    *Splits.model_fields,
 }  # fmt: skip
 HYPER_PARAMETERS = {
     "centring", "channels", "kernel", "stride", "pool", "hidden", "epochs", "batch_size",
@@ -112,7 +113,8 @@ def test_rows_whose_estimator_uses_the_same_training_set_are_one_finished_run(sm
 def test_parameters_and_metrics_keep_their_names(smoke):
     for run in smoke.runs:
         params, network = run.data.params, run.data.params["estimator"] == "cnn"
-        virtual = {"turn_on_jitter_mdps"} if params["virtual_gyros"] != "0" else set()
+        virtual = {f"virtual_{name}" for name in VirtualGyros.model_fields}
+        virtual = virtual if params["virtual_gyros"] != "0" else set()
         assert set(params) == PARAMS | virtual | (HYPER_PARAMETERS if network else set())
         fixed = {"study": "augmentation", "source": "simulated_smoke", "method": "2", "folds": "1"}
         assert {name: params[name] for name in fixed} == fixed
