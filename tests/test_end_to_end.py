@@ -41,7 +41,7 @@ METRICS = {
     "accuracy_gain_pct_lo", "accuracy_gain_pct_hi", "time_saving_pct", "equivalent_time_s",
     "accuracy_gain_pct_first", "time_saving_pct_first",
 }  # fmt: skip
-LOSSES = {"train_loss", "val_loss", "learning_rate"}
+LOSSES = {"train_loss", "val_loss"}
 # What `kedro run` writes: the five tables of the paper, every figure, and all results.
 FORMATS = {"tables": ("csv", "md", "tex"), "figures": ("png", "svg")}
 AUGMENTATION = {

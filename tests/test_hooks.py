@@ -25,7 +25,10 @@ def test_only_the_report_goes_on_without_its_data():
     ("options", "words"),
     [
         ({"only_missing_outputs": True}, "--only-missing-outputs: .* type kedro run without it"),
-        ({"runner": ParallelRunner()}, "ParallelRunner: .* --params=execution.workers=N"),
+        (
+            {"runner": object.__new__(ParallelRunner)},  # one that was made starts a process
+            "ParallelRunner: .* --params=execution.workers=N",
+        ),
         ({"runner": SequentialRunner(is_async=True)}, "--async: .* type kedro run without it"),
     ],
 )

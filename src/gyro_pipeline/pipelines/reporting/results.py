@@ -69,10 +69,10 @@ class Settings:
         return run_spec(row, self.study.unseen_devices)
 
     def params(self, row: RunSpec) -> dict[str, str]:
-        """Parameters of the run that makes a row, as the store has them."""
+        """Parameters of the run that makes a row, as the store has them, but how many folds."""
         spec = self.spec(row)
         made = run_params(spec, self.study, self.training, self.splits, self.virtual_gyros)
-        return {name: str(value) for name, value in made.items()}
+        return {name: str(value) for name, value in made.items() if name != "folds"}
 
 
 def pool(
