@@ -35,7 +35,7 @@ ALLOWED = {
     **{
         f"pipelines.{stage}": {
             *("conventions", "estimators", "executors", "fingerprints", "learning", "logs"),
-            *("parameters", "physics", "protocol", "quality", "runner", "studies", "tracking"),
+            *("parameters", "physics", "protocol", "quality", "studies", "tracking"),
         }
         for stage in STAGES
     },

@@ -262,6 +262,16 @@ def test_what_the_last_plan_left_out_is_no_gap(make_run, mean, pool):
     assert results.missing.isna().all()
 
 
+def test_a_run_of_the_last_plan_counts_unless_the_settings_are_others_now(make_run, mean, pool):
+    network = make_run("network", errors(1e-3))
+    plan = plan_of(network, mean)
+    # of the splits, what makes no difference to a run may have been another when it was made
+    for setting, made in (("fold_validation_recordings", True), ("hidden", False)):
+        older = replace(network, params=network.params | {setting: "33"})
+        results, _, _ = pool([older, mean], plan=plan)
+        assert (results.run_ids == "network").any() == made
+
+
 def test_measured_data_of_other_sources_are_pooled_as_far_as_they_are_there(
     make_run, mean, settings
 ):

@@ -213,9 +213,14 @@ class Finder:
         return found if alike and len(found) == len(specs) else []
 
     def _find(self, spec: RunSpec) -> StoredRun | None:
+        params = self._settings.params(spec)
         if spec in self._planned:
-            return self._by_fingerprint.get(self._planned[spec])
-        return self._runs.get(frozenset(self._settings.params(spec).items()))
+            planned = self._by_fingerprint.get(self._planned[spec])
+            # the plan may be older than the settings; those of the splits may change nothing
+            asked = {key: value for key, value in params.items() if key not in Splits.model_fields}
+            if planned is None or asked.items() <= planned.params.items():
+                return planned
+        return self._runs.get(frozenset(params.items()))
 
 
 def why_unused(run: StoredRun, specs: Sequence[RunSpec], settings: Settings) -> str:
