@@ -293,7 +293,7 @@ def _means(rows: Array) -> Blocks:
 def _outcome(stretch: Stretch) -> tuple[str, ...]:
     """What became of the history on each axis."""
     known = np.isfinite(stretch.taken.prior.narrow)
-    gone = stretch.taken.dropped.astype(bool)
+    gone = stretch.taken.dropped
     return tuple(np.where(known, np.where(gone, DROPPED, USED), NONE).tolist())
 
 

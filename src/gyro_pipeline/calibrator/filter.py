@@ -16,7 +16,7 @@ and a bias that nothing is known of needs no large variance anywhere. All but y 
 the data, so the variance at any later time is known now.
 """
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
@@ -62,17 +62,22 @@ class Noise:
 
 
 class Own(NamedTuple):
-    """What the data alone say, (3,) each: infinite variances before the first block.
+    """What the data alone say after each of n filters; infinite variances before the first block.
 
-    ``bias`` and ``variance`` are those of the bias now, which is ``follows`` times the bias at the
-    start, of ``start`` and ``start_variance``, and something independent of it.
+    The bias now is ``follows`` times the bias at the start, and something independent of it.
     """
 
-    bias: Array
-    variance: Array
-    start: Array
-    start_variance: Array
-    follows: Array
+    bias: Array  # (n, 3), now
+    variance: Array  # (n, 3)
+    start: Array  # (n, 3), the bias at the start
+    start_variance: Array  # (n, 3)
+    follows: Array  # (n, 3)
+    squares: Array  # (n, 3), of the residuals over their variances
+    freedom: Array  # (n, 1), degrees of freedom of those
+
+    def row(self, number: int) -> "Own":
+        """After one filter, (3,) each."""
+        return Own(*(column[number] for column in self))
 
 
 class _Steps:
@@ -86,7 +91,8 @@ class _Steps:
         walk = noise.random_walk[:, None] ** 2 * step_s
         self.keep = np.append(1.0, decay)  # F
         self.read = np.append(1.0, mean)  # H
-        self.added = np.hstack([walk, flicker * (1 - decay**2)])  # Q, diagonal
+        added = np.hstack([walk, flicker * (1 - decay**2)])
+        self.added = added[:, :, None] * np.eye(4)  # Q
         self.shared = np.hstack([walk / 2, flicker * (1 - decay) ** 2 / d])  # of end and mean
         within = flicker * (2 * (d - 1 + decay) / d**2 - mean**2)
         white = noise.white**2 / step_s + _WITHIN_BLOCK * noise.instability**2
@@ -152,35 +158,26 @@ class Filter:
             0 where nothing was known before.
         """
         steps = _steps(self.noise, self.block_s)
-        columns = self._columns(mean)
         to_mean = self.covariance @ steps.read
         variance = to_mean @ steps.read + steps.white
-        left = columns - np.einsum("s,asc->ac", steps.read, self.states)
+        left = self._columns(mean) - steps.read @ self.states
         gain = (steps.keep * to_mean + steps.shared) / variance[:, None]
-        states = steps.keep[:, None] * self.states + gain[:, :, None] * left[:, None, :]
-        covariance = steps.fading * self.covariance
-        covariance -= variance[:, None, None] * gain[:, :, None] * gain[:, None, :]
-        covariance[:, range(4), range(4)] += steps.added
+        covariance = steps.fading * self.covariance + steps.added
+        covariance -= (variance[:, None] * gain)[:, :, None] * gain[:, None, :]
         of_y, of_x = left[:, 0], left[:, 1:]
-        innovation = self._innovation(of_y, of_x, variance)
         scaled = of_x / variance[:, None]
-        following = replace(
-            self,
-            time_s=self.time_s + self.block_s,
-            blocks=self.blocks + 1,
-            states=states,
-            covariance=covariance,
-            information=self.information + scaled[:, :, None] * of_x[:, None, :],
-            weighted=self.weighted + scaled * of_y[:, None],
-            squares=self.squares + of_y**2 / variance,
-        )
-        return following, innovation
+        following = type(self)(
+            self.noise, self.block_s, self.age_s, self.reference, self.time_s + self.block_s,
+            self.blocks + 1, steps.keep[:, None] * self.states + gain[:, :, None] * left[:, None, :],
+            covariance, self.information + scaled[:, :, None] * of_x[:, None, :],
+            self.weighted + scaled * of_y[:, None], self.squares + of_y**2 / variance,
+        )  # fmt: skip
+        return following, self._innovation(of_y, of_x, variance)
 
     def skip(self, seconds: float) -> Self:
         """Move on over a gap without data."""
         steps = _steps(self.noise, seconds)
-        covariance = steps.fading * self.covariance
-        covariance[:, range(4), range(4)] += steps.added
+        covariance = steps.fading * self.covariance + steps.added
         states = steps.keep[:, None] * self.states
         return replace(self, time_s=self.time_s + seconds, states=states, covariance=covariance)
 
@@ -203,49 +200,64 @@ class Filter:
         if not self.blocks:
             return np.zeros(3)
         c, uncertainty = self.constants()
-        expected = np.einsum("ap,ap->a", of_x, c)
-        spread = variance + np.einsum("ap,apq,aq->a", of_x, uncertainty, of_x)
-        return np.asarray((of_y - expected) / np.sqrt(spread))
+        spread = variance + np.sum(_times(uncertainty, of_x) * of_x, axis=1)
+        return np.asarray((of_y - np.sum(of_x * c, axis=1)) / np.sqrt(spread))
 
     def constants(self) -> tuple[Array, Array]:
         """c by the data alone, (3, p), about the reference, and its covariance, (3, p, p)."""
-        uncertainty = np.linalg.inv(self.information)
-        return np.einsum("apq,aq->ap", uncertainty, self.weighted), uncertainty
-
-    def own(self) -> Own:
-        """The bias now and at the start, by the data alone."""
-        if not self.blocks:
-            unknown = np.full(3, np.nan)
-            return Own(unknown, np.full(3, np.inf), unknown, np.full(3, np.inf), np.ones(3))
-        c, uncertainty = self.constants()
-        on_c = np.eye(c.shape[1])[0] - self.states[:, 0, 1:]
-        shared = np.einsum("ap,apq->aq", on_c, uncertainty)
-        bias = self.reference + self.states[:, 0, 0] + np.sum(on_c * c, axis=1)
-        variance = self.covariance[:, 0, 0] + np.sum(shared * on_c, axis=1)
-        at_start = uncertainty[:, 0, 0]
-        return Own(bias, variance, self.reference + c[:, 0], at_start, shared[:, 0] / at_start)
-
-    def chi_square(self) -> tuple[Array, int]:
-        """Squares of the residuals over their variances, (3,), and their degrees of freedom."""
-        c, _ = self.constants()
-        left = self.squares - np.einsum("ap,ap->a", c, self.weighted)
-        if self.noise.warm_up is not None and self.age_s is not None:  # the amplitude's prior
-            mean, spread, _ = self.noise.warm_up
-            left = left + (mean / spread) ** 2
-            return left, self.blocks - 1
-        return left, self.blocks - c.shape[1]
+        uncertainty = _inverse(self.information)
+        return _times(uncertainty, self.weighted), uncertainty
 
     def warm_up(self) -> tuple[Array, Array]:
         """How far the warm-up still is from its end, and the standard deviation, (3,), deg/s."""
         c, uncertainty = self.constants()
         return self.decay() * c[:, -1], self.decay() * np.sqrt(uncertainty[:, -1, -1])
 
-    def ahead(self, most_s: float) -> Iterator[tuple[int, Self]]:
-        """Filters of blocks to come, each with its number from 1: later variances, known now."""
-        following = self
-        for number in range(1, round(most_s / self.block_s) + 1):
-            following, _ = following.update(None)
-            yield number, following
+    def ahead(self, blocks: int) -> list[Self]:
+        """Filters of so many blocks to come: later variances, which are known now."""
+        following = [self]
+        for _ in range(blocks):
+            following.append(following[-1].update(None)[0])
+        return following[1:]
+
+
+def own(filters: Sequence[Filter]) -> Own:
+    """What filters of one stretch say by the data alone."""
+    first, blocks = filters[0], np.array([[f.blocks] for f in filters], np.float64)
+    if not first.blocks:
+        unknown, infinite = np.full((1, 3), np.nan), np.full((1, 3), np.inf)
+        none, one = np.zeros((1, 3)), np.ones((1, 3))
+        return Own(unknown, infinite, unknown, infinite, one, none, none[:, :1])
+    uncertainty = _inverse(np.array([f.information for f in filters]))
+    weighted = np.array([f.weighted for f in filters])
+    walk = np.array([f.states[:, 0] for f in filters])  # of y, and of each column
+    c, on_c = _times(uncertainty, weighted), -walk[..., 1:]
+    on_c[..., 0] += 1
+    shared = _times(uncertainty, on_c)
+    squares = np.array([f.squares for f in filters]) - np.sum(c * weighted, axis=-1)
+    freedom = blocks - 1
+    if first.noise.warm_up is not None:  # the amplitude's prior is one datum more
+        mean, spread, _ = first.noise.warm_up
+        free = first.age_s is None
+        squares, freedom = squares + (0 if free else (mean / spread) ** 2), freedom - free
+    of_walk = np.array([f.covariance[:, 0, 0] for f in filters])
+    return Own(
+        first.reference + walk[..., 0] + np.sum(on_c * c, axis=-1),
+        of_walk + np.sum(shared * on_c, axis=-1),
+        first.reference + c[..., 0],
+        uncertainty[..., 0, 0],
+        shared[..., 0] / uncertainty[..., 0, 0],
+        squares,
+        np.maximum(freedom, 0),
+    )
+
+
+def _inverse(matrices: Array) -> Array:
+    return 1 / matrices if matrices.shape[-1] == 1 else np.linalg.inv(matrices)
+
+
+def _times(matrices: Array, vectors: Array) -> Array:
+    return np.sum(matrices * vectors[..., None, :], axis=-1)
 
 
 def _steps(noise: Noise, step_s: float) -> _Steps:

@@ -1,13 +1,14 @@
 """A stretch in one attitude: the filter, the test of rest, and the history with its conflict."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gyro_pipeline.calibrator.device_types import DeviceType
-from gyro_pipeline.calibrator.filter import Filter, Own
+from gyro_pipeline.calibrator.filter import Filter, Own, own
 from gyro_pipeline.calibrator.history import Prior, angle_deg
 from gyro_pipeline.calibrator.rest import BRIEF, WHOLE, Alarm, RestMonitor
 from gyro_pipeline.calibrator.state import Array
@@ -25,6 +26,7 @@ _TURN_DEG = 1.0  # the attitude is the same after a motion that turned the devic
 _WARMER_C = 0.5  # by which the temperature moves until the prior is looked up again
 _REFERENCE = 6  # blocks at rest that say what rest is like after a motion
 _PATIENCE = 20  # blocks of motion after which rest is looked for anew
+_AHEAD = 64  # blocks that are looked ahead at a time
 _TWO_SIDED = 1.959964
 _SETS = np.array([[axis in s for axis in range(3)] for n in (1, 2, 3) for s in combinations(range(3), n)])
 
@@ -49,11 +51,10 @@ class Taken(NamedTuple):
     filter: Filter
     prior: Prior
     warmth: float  # degrees Celsius that the prior is of, NaN where it is of none
-    dropped: Array  # (3,), axes whose history was dropped
+    dropped: NDArray[np.bool_]  # (3,), axes whose history was dropped
     log_ratio: Array  # (3,), wide over narrow prior
-    variances: Array  # (3,), sum of those within blocks
-    gravity: Array  # (4,), sum and count
-    temperature: Array  # (4,), sum, count, least and most
+    sums: Array  # (9,), of variances within blocks, gravity and its count, temperature and its
+    range_c: tuple[float, float]  # of the temperature
 
 
 class Stretch:
@@ -80,10 +81,12 @@ class Stretch:
         self.size, self.block_s, self.start_s = size, block_s, start_s
         self.known_still = known_still
         empty = Filter.start(kind.noise, block_s, np.zeros(3), age_s)
-        warmth = np.array([0.0, 0.0, np.inf, -np.inf])
-        nothing = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(4), warmth
-        self.taken = Taken(empty, prior_of(None, None), np.nan, *nothing)
+        self.taken = Taken(
+            empty, prior_of(None, None), np.nan, np.zeros(3, bool), np.zeros(3), np.zeros(9),
+            (np.inf, -np.inf),
+        )  # fmt: skip
         self._before: Taken | None = None  # the last block
+        self._looked: tuple[Taken, tuple[Array, Array, Own]] | None = None
         self.moving = 0  # blocks of motion that just came
         self._turned = np.zeros(3)  # deg, over them
         self.motions: list[float] = []  # when each started, seconds since the first sample
@@ -106,13 +109,14 @@ class Stretch:
     @property
     def up(self) -> Array | None:
         """(3,), direction of the mean acceleration."""
-        length = np.linalg.norm(self.taken.gravity[:3])
-        return self.taken.gravity[:3] / length if length > 0 else None
+        gravity = self.taken.sums[3:6]
+        length = np.linalg.norm(gravity)
+        return np.asarray(gravity / length) if length > 0 else None
 
     @property
     def temperature_c(self) -> float | None:
         """Mean over the blocks."""
-        total, count, *_ = self.taken.temperature
+        total, count = self.taken.sums[7:]
         return float(total / count) if count else None
 
     def take(self, blocks: Blocks) -> tuple[int, Alarm | None]:
@@ -164,39 +168,66 @@ class Stretch:
         return alarm
 
     def _accept(self, part: Blocks, filters: list[Filter]) -> None:
-        """Take blocks at rest, with the filters before and after them."""
-        for row, filter_ in enumerate(filters[1:]):
-            gravity, before = np.append(part.gravity[row], 1.0), self.taken
-            self._before = before
-            self.taken = before._replace(
-                filter=filter_,
-                variances=before.variances + part.variances[row],
-                gravity=before.gravity + (gravity if np.isfinite(gravity).all() else 0),
-                temperature=_warmth(before.temperature, part.temperature[row]),
-            )
-            self._look_up(part.temperature[row])
-            self._test_history()
-            self.moving, self._turned = 0, np.zeros(3)
+        """Take blocks at rest, with the filters before the first and after each."""
+        first, count = 0, len(part.means)
+        while first < count:
+            self._look_up(part, first)
+            moved = np.abs(part.temperature[first:] - self.taken.warmth) > _WARMER_C
+            moved |= np.isnan(self.taken.warmth) & np.isfinite(part.temperature[first:])
+            last = first + int(moved.argmax()) if moved.any() else count
+            self._add(part.rows(first, last), filters[first + 1 : last + 1])
+            first = last
+        self.moving, self._turned = 0, np.zeros(3)
 
-    def _look_up(self, temperature: float) -> None:
-        """The prior with the first block's attitude, and anew when it gets warmer or colder."""
-        warmer = abs(temperature - self.taken.warmth) > _WARMER_C
-        if self.blocks == 1 or warmer or (np.isfinite(temperature) and np.isnan(self.taken.warmth)):
-            known = float(temperature) if np.isfinite(temperature) else None
-            prior = self.prior_of(self.up, known)
-            self.taken = self.taken._replace(prior=prior, warmth=float(temperature))
+    def _look_up(self, part: Blocks, row: int) -> None:
+        """The prior at the attitude and the temperature of a block."""
+        warmth, up = float(part.temperature[row]), self.up
+        if up is None and np.isfinite(part.gravity[row]).all():
+            up = part.gravity[row] / np.linalg.norm(part.gravity[row])
+        if not self.blocks or np.isfinite(warmth):
+            prior = self.prior_of(up, warmth if np.isfinite(warmth) else None)
+            self.taken = self.taken._replace(prior=prior, warmth=warmth)
 
-    def _test_history(self) -> None:
-        """Drop the history on the axes that speak against it, once all together say so."""
-        usable = np.isfinite(self.taken.prior.narrow) & ~self.taken.dropped.astype(bool)
+    def _add(self, part: Blocks, filters: list[Filter]) -> None:
+        """Take blocks of one prior; what was known one block before is kept as well."""
+        known = np.isfinite(part.temperature)[:, None]
+        felt = np.isfinite(part.gravity).all(axis=1)[:, None]
+        warmth = np.where(known, part.temperature[:, None], 0)
+        gravity = np.where(felt, part.gravity, 0)
+        rows = np.hstack([part.variances, gravity, felt, warmth, known])
+        sums = np.add.accumulate(np.vstack([self.taken.sums, rows]))
+        least, most = np.where(known, warmth, np.inf), np.where(known, warmth, -np.inf)
+        lows = np.minimum.accumulate(np.append(self.taken.range_c[0], least))
+        highs = np.maximum.accumulate(np.append(self.taken.range_c[1], most))
+        dropped, log_ratio = self._conflicts(filters)
+        for row in range(max(len(filters) - 2, 0), len(filters)):
+            self._before = self.taken
+            self.taken = self.taken._replace(
+                filter=filters[row], dropped=dropped[row], log_ratio=log_ratio[row],
+                sums=sums[row + 1], range_c=(lows[row + 1], highs[row + 1]),
+            )  # fmt: skip
+
+    def _conflicts(self, filters: list[Filter]) -> tuple[NDArray[np.bool_], Array]:
+        """After each block (n, 3): axes whose history is dropped, and the log of the ratio.
+
+        Once the mean e-value says that the history is wrong, it is dropped on the axes that speak
+        against it, for the rest of the stretch.
+        """
+        prior, dropped = self.taken.prior, self.taken.dropped
+        usable = np.isfinite(prior.narrow) & ~dropped
         if not usable.any():
-            return
-        log_ratio = np.where(usable, self._posterior(self.own(), usable)[2], 0.0)
-        sums = _SETS @ log_ratio
-        mean = np.log(np.mean(np.exp(sums - sums.max()))) + sums.max()
-        against = usable & (log_ratio > 0) & (mean > np.log(CONFLICT))
-        dropped = np.where(against, 1.0, self.taken.dropped)
-        self.taken = self.taken._replace(dropped=dropped, log_ratio=log_ratio)
+            none = np.zeros((len(filters), 3))
+            return none + dropped > 0, none
+        alone = own(filters)
+        variance = alone.start_variance * _factor(*self._noise_of(alone))
+        mean, narrow, wide = _usable(prior, usable)
+        ratio = mixture_posterior(alone.start, variance, mean, narrow, wide).log_ratio
+        ratio = np.where(usable, ratio, 0.0)
+        sums = ratio @ _SETS.T
+        e_value = np.log(np.mean(np.exp(sums - sums.max(axis=1, keepdims=True)), axis=1))
+        wrong = (e_value + sums.max(axis=1) > np.log(CONFLICT))[:, None]
+        against = np.logical_or.accumulate(wrong & usable & (ratio > 0))
+        return dropped | against, ratio
 
     def _leave_out(self, part: Blocks, filters: list[Filter], row: int) -> None:
         """Leave out a block of motion and the one before it."""
@@ -208,7 +239,7 @@ class Stretch:
         left_out = 1 if moving or not (self.blocks or row) else 2
         current = self.taken.filter
         if current.blocks:
-            self._turned = self._turned + np.sum(motion - current.own().bias, axis=0) * self.block_s
+            self._turned = self._turned + np.sum(motion - own([current]).bias[0], axis=0) * self.block_s
             for _ in range(left_out):
                 current = current.skip(self.block_s)
             self.taken = self.taken._replace(filter=current)
@@ -216,7 +247,7 @@ class Stretch:
             self.motions.append(self.start_s + current.time_s)
         self.moving, self._before = moving + left_out, None
         enough = self.blocks >= _REFERENCE
-        self.monitor = self._monitor(np.sqrt(self.taken.variances / self.blocks) if enough else None)
+        self.monitor = self._monitor(np.sqrt(self.taken.sums[:3] / self.blocks) if enough else None)
 
     def _attitude_changed(self, part: Blocks) -> bool:
         """Whether the device was turned over a motion: by its rates, or by gravity."""
@@ -231,48 +262,57 @@ class Stretch:
             self.taken = self.taken._replace(filter=self.taken.filter.skip(seconds))
             self._before = None
 
+    def _noise_of(self, alone: Own) -> tuple[Array, Array]:
+        """N^2 over that of the type with these blocks, (n, 3), and its degrees of freedom."""
+        if np.isinf(self.freedom).all():
+            return self.scale, self.freedom
+        freedom = self.freedom + alone.freedom
+        return (self.freedom * self.scale + alone.squares) / np.maximum(freedom, 1e-9), freedom
+
+    def _look(self) -> tuple[Array, Array, Own]:
+        """N^2 over that of the type, its degrees of freedom, and the estimate, each (3,)."""
+        if self._looked is None or self._looked[0] is not self.taken:
+            alone = own([self.taken.filter])
+            scale, freedom = (np.reshape(x, (-1, 3))[0] for x in self._noise_of(alone))
+            self._looked = self.taken, (scale, freedom, _scaled(alone.row(0), scale, freedom))
+        return self._looked[1]
+
     def noise(self) -> tuple[Array, Array]:
         """N^2 over that of the type, (3,), with this log's blocks, and its degrees of freedom."""
-        if np.all(np.isinf(self.freedom)) or not self.blocks:
-            return self.scale, self.freedom
-        squares, freedom = self.taken.filter.chi_square()
-        total = np.maximum(self.freedom + freedom, 1e-9)
-        return (self.freedom * self.scale + squares) / total, self.freedom + freedom
+        return self._look()[:2]
 
     def log_noise(self) -> tuple[Array, float]:
         """N of this stretch alone, (3,), deg/s * sqrt(s), and its degrees of freedom."""
-        squares, freedom = self.taken.filter.chi_square()
-        if freedom <= 0:
+        if self.blocks < 3:  # noqa: PLR2004 - a warm-up takes two
             return np.full(3, np.nan), 0.0
-        return self.kind.noise.white * np.sqrt(squares / freedom), float(freedom)
+        alone = own([self.taken.filter]).row(0)
+        return self.kind.noise.white * np.sqrt(alone.squares / alone.freedom), float(alone.freedom[0])
 
     def own(self) -> Own:
         """The estimate by this stretch alone, with the noise as known, and Student's interval."""
-        scale, freedom = self.noise()
-        return _scaled(self.taken.filter.own(), scale, freedom)
+        return self._look()[2]
 
-    def _posterior(self, own: Own, usable: Array) -> tuple[Array, Array, Array]:
-        """Bias and variance with the history where it is usable, and the log of the ratio."""
-        prior = self.taken.prior
-        mean, narrow, wide = (np.where(usable, x, 1.0) for x in (prior.mean, prior.narrow, prior.wide))
-        at_start = mixture_posterior(own.start, own.start_variance, mean, narrow, wide)
-        unknown = np.isinf(own.variance)
+    def _posterior(self, alone: Own, usable: Array) -> tuple[Array, Array]:
+        """Bias and variance with the history where it is usable."""
+        at_start = mixture_posterior(
+            alone.start, alone.start_variance, *_usable(self.taken.prior, usable)
+        )
+        unknown = np.isinf(alone.variance)
         with np.errstate(invalid="ignore"):
-            moved = own.bias + own.follows * (at_start.mean - own.start)
-            rest = own.variance - own.follows**2 * own.start_variance
-        bias = np.where(usable, np.where(unknown, at_start.mean, moved), own.bias)
-        later = np.where(unknown, 0.0, rest) + own.follows**2 * at_start.variance
-        return bias, np.where(usable, later, own.variance), at_start.log_ratio
+            moved = alone.bias + alone.follows * (at_start.mean - alone.start)
+            rest = alone.variance - alone.follows**2 * alone.start_variance
+        bias = np.where(usable, np.where(unknown, at_start.mean, moved), alone.bias)
+        later = np.where(unknown, 0.0, rest) + alone.follows**2 * at_start.variance
+        return bias, np.where(usable, later, alone.variance)
 
     def answer(self) -> tuple[Array, Array]:
         """The bias and its variance, by the stretch and the history."""
-        bias, variance, _ = self._posterior(self.own(), self.usable)
-        return bias, variance
+        return self._posterior(self.own(), self.usable)
 
     @property
     def usable(self) -> Array:
         """(3,), axes with a history that was not dropped."""
-        return np.isfinite(self.taken.prior.narrow) & ~self.taken.dropped.astype(bool)
+        return np.isfinite(self.taken.prior.narrow) & ~self.taken.dropped
 
     def seconds_left(self, target_dps: float, most_s: float) -> Array:
         """(3,), seconds at rest until the target; infinite where it is not within ``most_s``.
@@ -280,34 +320,42 @@ class Stretch:
         The variances of blocks to come do not depend on the data. What does, the distance from the
         history and the noise where it is not known, is taken as it is now.
         """
-        own, (scale, freedom) = self.own(), self.noise()
+        now, (scale, freedom), usable = self.own(), self.noise(), self.usable
+        seen = self.blocks > 0
         left = np.where(self.answer()[1] <= target_dps**2, 0.0, np.inf)
         floor = self.kind.noise.floor_dps * np.sqrt(scale)
-        hopeless = (floor > target_dps) & ~self.usable
-        for number, following in self.taken.filter.ahead(most_s):
-            if np.all(np.isfinite(left) | hopeless):
-                break
-            later = _scaled(following.own(), scale, freedom + number)
-            later = later._replace(bias=own.bias, start=own.start)
-            reached = self._posterior(later, self.usable)[1] <= target_dps**2
-            left = np.where(np.isinf(left) & reached, number * self.block_s, left)
-        return np.where(hopeless & (left > 0), np.inf, left)
+        hopeless = (floor > target_dps) & (left > 0) & ~usable
+        following, done = self.taken.filter, 0
+        while np.any(np.isinf(left) & ~hopeless) and done * self.block_s < most_s:
+            filters = following.ahead(_AHEAD)
+            following, number = filters[-1], done + 1 + np.arange(_AHEAD)[:, None]
+            later = _scaled(own(filters), scale, freedom + number)
+            start = now.start if seen else np.where(usable, self.taken.prior.mean, 0.0)
+            later = later._replace(start=np.broadcast_to(start, (_AHEAD, 3)))
+            reached = self._posterior(later, usable)[1] <= target_dps**2
+            first = np.where(reached.any(axis=0), done + 1 + reached.argmax(axis=0), np.inf)
+            left = np.minimum(left, first * self.block_s)
+            done += _AHEAD
+        return np.where(hopeless, np.inf, left)
 
 
-def _warmth(before: Array, temperature: float) -> Array:
-    """Sum, count, least and most, with one temperature more, if it is known."""
-    if not np.isfinite(temperature):
-        return before
-    total, count, least, most = before
-    return np.array([total + temperature, count + 1, min(least, temperature), max(most, temperature)])
+def _usable(prior: Prior, usable: NDArray[np.bool_]) -> Iterator[Array]:
+    """The prior's mean and variances; numbers that are not used where it is not."""
+    return (np.where(usable, x, 1.0) for x in (prior.mean, prior.narrow, prior.wide))
 
 
-def _scaled(own: Own, scale: Array, freedom: Array) -> Own:
-    """Variances with the noise as known, so that 1.96 standard deviations are Student's limits."""
-    safe = np.where(freedom > 0, freedom, np.nan)
-    student = np.where(np.isinf(freedom), _TWO_SIDED, student_limits(_TWO_SIDED, safe))
-    factor = scale * (student / _TWO_SIDED) ** 2
-    factor = np.where(freedom > 0, factor, np.inf)
-    return own._replace(
-        variance=own.variance * factor, start_variance=own.start_variance * factor
+def _factor(scale: Array, freedom: Array) -> Array:
+    """On variances of N as of the type: the noise as known, and 1.96 sigma as Student's limits."""
+    if np.isinf(freedom).all():
+        return scale
+    known = np.where(freedom > 0, freedom, 1.0)
+    with np.errstate(invalid="ignore"):
+        student = np.where(np.isinf(known), _TWO_SIDED, student_limits(_TWO_SIDED, known))
+    return np.where(freedom > 0, scale * (student / _TWO_SIDED) ** 2, np.inf)
+
+
+def _scaled(alone: Own, scale: Array, freedom: Array) -> Own:
+    factor = _factor(scale, freedom)
+    return alone._replace(
+        variance=alone.variance * factor, start_variance=alone.start_variance * factor
     )

@@ -145,7 +145,7 @@ def _of_samples(facts: Facts) -> Iterator[Reason]:
 
 
 def _of_temperature(stretch: Stretch) -> Iterator[Reason]:
-    _, count, least, most = stretch.taken.temperature
+    count, (least, most) = stretch.taken.sums[8], stretch.taken.range_c
     if 0 < count < stretch.blocks:
         text = f"the temperature is missing in {stretch.blocks - count:.0f} of {stretch.blocks} blocks"
         yield Reason("temperature", text, None, float(stretch.blocks - count))

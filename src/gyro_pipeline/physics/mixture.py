@@ -51,17 +51,18 @@ def mixture_posterior(
         wide: Variance of the wide prior.
         share: Of the narrow prior, from 0 to 1.
     """
-    own = np.asarray(variance, np.float64)
-    priors = np.stack(np.broadcast_arrays(narrow, wide)).astype(np.float64)
-    shares = np.array([share, 1 - share]).reshape(2, *[1] * (priors.ndim - 1))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        total = priors + own
-        off = np.where(np.isinf(own), 0.0, np.asarray(estimate) - mean)
-        gain = np.where(np.isinf(own), 0.0, priors / total)
-        logs = np.where(np.isinf(own), 0.0, -0.5 * (np.log(total) + off**2 / total))
-        logs_with_shares = logs + np.log(shares)
+    given = np.broadcast_arrays(estimate, variance, mean, narrow, wide)
+    estimates, own, centre, *both = (np.asarray(x, np.float64) for x in given)
+    priors = np.stack(both)
+    shares = np.array([share, 1 - share]).reshape(2, *[1] * centre.ndim)
+    unseen = np.isinf(own)
+    total = priors + np.where(unseen, 1.0, own)
+    off = np.where(unseen, 0.0, estimates - centre)
+    gain = np.where(unseen, 0.0, priors / total)
+    logs = np.where(unseen, 0.0, -0.5 * (np.log(total) + off**2 / total))
+    logs_with_shares = logs + np.log(shares)
     weights = np.exp(logs_with_shares - logs_with_shares.max(axis=0))
     weights /= weights.sum(axis=0)
     posterior = np.sum(weights * gain, axis=0) * off
     spread = np.sum(weights * ((1 - gain) * priors + (gain * off) ** 2), axis=0)
-    return Posterior(mean + posterior, spread - posterior**2, logs[1] - logs[0])
+    return Posterior(centre + posterior, spread - posterior**2, logs[1] - logs[0])
