@@ -148,6 +148,10 @@ class Calibrator:
             _outcome(stretch), noise, freedom,
         )  # fmt: skip
 
+    def temperature_range(self) -> tuple[float, float]:
+        """The least and the most temperature of the answer's stretch, degrees Celsius."""
+        return self._best().taken.range_c
+
     def state(self, finished: bool = False) -> State:
         """The answer so far."""
         stretch = self._best() if finished else self.stretch
@@ -161,7 +165,7 @@ class Calibrator:
                 return np.zeros(3)
             return np.maximum(snapshot.seconds_left(target, LONGEST_S), left_s)
 
-        reached = target is None or bool(np.all(variance <= target**2))
+        reached = target is None or bool(stretch.reached(target).all())
         return State(
             bias, np.sqrt(variance), own.bias, np.sqrt(own.variance), prior.mean,
             np.sqrt(prior.narrow), rest, self.time_s, stretch.seconds, _outcome(stretch),

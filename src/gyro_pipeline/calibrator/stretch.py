@@ -1,7 +1,6 @@
 """A stretch in one attitude: the filter, the test of rest, and the history with its conflict."""
 
-from collections.abc import Callable, Iterator
-from itertools import combinations
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -12,12 +11,12 @@ from gyro_pipeline.calibrator.filter import Filter, Own, own
 from gyro_pipeline.calibrator.history import Prior, angle_deg
 from gyro_pipeline.calibrator.rest import BRIEF, WHOLE, Alarm, RestMonitor
 from gyro_pipeline.calibrator.state import Array
-from gyro_pipeline.physics.mixture import mixture_posterior
+from gyro_pipeline.physics.mixture import Posterior, mixture_posterior
 from gyro_pipeline.quality.rest import student_limits
 
 CONFLICT = 120.0
-"""The mean e-value over sets of axes at which the history is dropped. Where it holds, that happens
-in at most one of so many calibrations (Ville), in half of these as measured."""
+"""The e-value at which the history is dropped. Where it holds, that happens in at most one of so
+many calibrations (Ville), and in half as many as measured."""
 
 PriorOf = Callable[[Array | None, float | None], Prior]
 """The prior, by the up direction and the temperature, None where they are not measured."""
@@ -28,7 +27,6 @@ _REFERENCE = 6  # blocks at rest that say what rest is like after a motion
 _PATIENCE = 20  # blocks of motion after which rest is looked for anew
 _AHEAD = 64  # blocks that are looked ahead at a time
 _TWO_SIDED = 1.959964
-_SETS = np.array([[axis in s for axis in range(3)] for n in (1, 2, 3) for s in combinations(range(3), n)])
 
 
 class Blocks(NamedTuple):
@@ -220,14 +218,10 @@ class Stretch:
             return none + dropped > 0, none
         alone = own(filters)
         variance = alone.start_variance * _factor(*self._noise_of(alone))
-        mean, narrow, wide = _usable(prior, usable)
-        ratio = mixture_posterior(alone.start, variance, mean, narrow, wide).log_ratio
-        ratio = np.where(usable, ratio, 0.0)
-        sums = ratio @ _SETS.T
-        e_value = np.log(np.mean(np.exp(sums - sums.max(axis=1, keepdims=True)), axis=1))
-        wrong = (e_value + sums.max(axis=1) > np.log(CONFLICT))[:, None]
-        against = np.logical_or.accumulate(wrong & usable & (ratio > 0))
-        return dropped | against, ratio
+        seen = _with_history(alone.start, variance, prior, usable)
+        wrong = (seen.log_e > np.log(CONFLICT))[:, None]
+        against = np.logical_or.accumulate(wrong & usable & (seen.log_ratio > 0))
+        return dropped | against, seen.log_ratio
 
     def _leave_out(self, part: Blocks, filters: list[Filter], row: int) -> None:
         """Leave out a block of motion and the one before it."""
@@ -294,15 +288,14 @@ class Stretch:
 
     def _posterior(self, alone: Own, usable: Array) -> tuple[Array, Array]:
         """Bias and variance with the history where it is usable."""
-        at_start = mixture_posterior(
-            alone.start, alone.start_variance, *_usable(self.taken.prior, usable)
-        )
+        prior = self.taken.prior
+        at_start = _with_history(alone.start, alone.start_variance, prior, usable)
         unknown = np.isinf(alone.variance)
         with np.errstate(invalid="ignore"):
             moved = alone.bias + alone.follows * (at_start.mean - alone.start)
             rest = alone.variance - alone.follows**2 * alone.start_variance
         bias = np.where(usable, np.where(unknown, at_start.mean, moved), alone.bias)
-        later = np.where(unknown, 0.0, rest) + alone.follows**2 * at_start.variance
+        later = np.where(unknown, 0.0, rest) + alone.follows**2 * at_start.charged
         return bias, np.where(usable, later, alone.variance)
 
     def answer(self) -> tuple[Array, Array]:
@@ -314,6 +307,15 @@ class Stretch:
         """(3,), axes with a history that was not dropped."""
         return np.isfinite(self.taken.prior.narrow) & ~self.taken.dropped
 
+    def hopeless(self, target_dps: float) -> NDArray[np.bool_]:
+        """(3,), axes whose target is below the floor of the sensor, and that have no history."""
+        floor = self.kind.noise.floor_dps * np.sqrt(self.noise()[0])
+        return np.asarray((floor > target_dps) & ~self.usable)
+
+    def reached(self, target_dps: float) -> NDArray[np.bool_]:
+        """(3,), axes whose standard deviation is at the target or below."""
+        return (self.answer()[1] <= target_dps**2) & ~self.hopeless(target_dps)
+
     def seconds_left(self, target_dps: float, most_s: float) -> Array:
         """(3,), seconds at rest until the target; infinite where it is not within ``most_s``.
 
@@ -321,10 +323,8 @@ class Stretch:
         history and the noise where it is not known, is taken as it is now.
         """
         now, (scale, freedom), usable = self.own(), self.noise(), self.usable
-        seen = self.blocks > 0
-        left = np.where(self.answer()[1] <= target_dps**2, 0.0, np.inf)
-        floor = self.kind.noise.floor_dps * np.sqrt(scale)
-        hopeless = (floor > target_dps) & (left > 0) & ~usable
+        seen, hopeless = self.blocks > 0, self.hopeless(target_dps)
+        left = np.where(self.reached(target_dps), 0.0, np.inf)
         following, done = self.taken.filter, 0
         while np.any(np.isinf(left) & ~hopeless) and done * self.block_s < most_s:
             filters = following.ahead(_AHEAD)
@@ -336,12 +336,15 @@ class Stretch:
             first = np.where(reached.any(axis=0), done + 1 + reached.argmax(axis=0), np.inf)
             left = np.minimum(left, first * self.block_s)
             done += _AHEAD
-        return np.where(hopeless, np.inf, left)
+        return left
 
 
-def _usable(prior: Prior, usable: NDArray[np.bool_]) -> Iterator[Array]:
-    """The prior's mean and variances; numbers that are not used where it is not."""
-    return (np.where(usable, x, 1.0) for x in (prior.mean, prior.narrow, prior.wide))
+def _with_history(
+    start: Array, variance: Array, prior: Prior, usable: NDArray[np.bool_]
+) -> Posterior:
+    """The posterior of the bias at the start; meaningless on axes whose history is not usable."""
+    mean, narrow, wide = (np.where(usable, x, 1.0) for x in (prior.mean, prior.narrow, prior.wide))
+    return mixture_posterior(start, np.where(usable, variance, np.inf), mean, narrow, wide)
 
 
 def _factor(scale: Array, freedom: Array) -> Array:

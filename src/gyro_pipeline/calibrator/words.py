@@ -16,6 +16,7 @@ CONSTANT = 4
 
 _FAR = 15.0  # factor on the noise that another unit makes, not another device
 _WARMER_C = 1.0  # over a log, from which on it is said
+_ENOUGH = 6  # blocks that tell a unit by their noise
 _VERTICAL = 0.9  # cosine of the angle between an axis and the vertical
 _UNITS = {57.3: "rad/s", 1e3: "mdps", 3600.0: "deg/h", 6.0: "rpm"}
 
@@ -72,7 +73,7 @@ def unit_reason(factor: float, name: str) -> Reason | None:
 def reasons_of(facts: Facts, stretch: Stretch, target_dps: float | None) -> tuple[Reason, ...]:
     """All that should be known, the most important first."""
     return (
-        *facts.unusable, *_of_rest(facts, stretch), *_of_history(stretch),
+        *facts.unusable, *_of_rest(facts, stretch), *_of_unit(stretch), *_of_history(stretch),
         *_of_noise(stretch, target_dps), *_of_samples(facts), *_of_temperature(stretch),
         *_of_rotation(stretch),
     )  # fmt: skip
@@ -97,6 +98,15 @@ def _of_rest(facts: Facts, stretch: Stretch) -> Iterator[Reason]:
         else:
             text = f"in motion up to {at:.1f} s; the longest stretch counts"
         yield Reason(alarm.code, text, None, at)
+
+
+def _of_unit(stretch: Stretch) -> Iterator[Reason]:
+    """Too little noise is no motion, and no alarm of the test of rest."""
+    if stretch.blocks < _ENOUGH or not np.all(stretch.freedom > 0):
+        return
+    known = np.sqrt(stretch.scale) * stretch.kind.noise.white
+    if reason := unit_reason(float(np.median(stretch.log_noise()[0] / known)), stretch.kind.name):
+        yield reason
 
 
 def _of_history(stretch: Stretch) -> Iterator[Reason]:

@@ -1,0 +1,401 @@
+"""What the calibrator reaches, beside what it must (docs/calibrator.md).
+
+    python benchmarks/calibrator.py                  # all of it, 20 minutes on two cores
+    python benchmarks/calibrator.py coverage turned  # some sections
+    python benchmarks/calibrator.py --count 200      # fewer calibrations a world
+    python benchmarks/calibrator.py --full           # four times as many
+
+Base: N 3.3 mdps sqrt(s), white, turn-on spread 0.31 mdps, a history of 14 calibrations of 30 s that is
+right, latitude 32 degrees, axis z vertical, at rest, 20 samples a second. One factor varies at a
+time. A cell falls short only where its 99 % Clopper-Pearson interval lies outside the bounds.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+from scipy import stats
+
+from gyro_pipeline.calibrator import Calibration, Calibrator, Circumstances
+from gyro_pipeline.calibrator.device_types import type_of
+from gyro_pipeline.calibrator.filter import FLICKER_S, Filter, own
+from gyro_pipeline.conventions import MDPS
+from gyro_pipeline.physics.noise import simulate_noise, warm_up
+from gyro_pipeline.physics.recording_model import noise_covariances, profiles
+
+EARTH, LATITUDE, RATE = 4.178, 32.0, 20.0
+MARKS = (1, 3, 10, 30, 60)
+HISTORY_S, PAST = 30, 14
+
+
+@dataclass(frozen=True)
+class World:
+    """What is varied; mdps, seconds, degrees."""
+
+    white: float = 3.3
+    flicker: float = 0.0
+    walk: float = 0.0
+    lag1: float = 0.0
+    warm_up: tuple[float, float, float] | None = None
+    tau: float = 0.31
+    past: int = PAST
+    declared: bool = True
+    turn: float | None = 0.0  # about the vertical; None: any heading at each calibration
+    step: float = 0.0  # of the level, on all axes
+    ramp: float = 0.0  # degrees Celsius over the calibration, at 5 mdps a degree
+    target: float = 1.0
+    longest_s: int = 30
+    rate: float = RATE
+    accel_ug: float | None = None
+    disturb: Callable[[np.random.Generator, np.ndarray, float], None] | None = None
+    known: bool = True  # whether the type's noise is
+    step_dps: float = 0.0  # of an int16
+    lost: float = 0.0  # share of samples lost at random
+    jitter: float = 0.0  # of stamps, of the period
+    gap_s: float = 0.0  # one gap in the middle
+
+
+@dataclass
+class Result:
+    """One calibration: errors and standard deviations (mark, 3), mdps, and the stop."""
+
+    error: np.ndarray
+    sigma: np.ndarray
+    mean: np.ndarray  # error of the plain mean
+    stop: tuple[np.ndarray, np.ndarray] | None
+    stop_s: float
+    dropped: np.ndarray
+    seen_s: float  # when the history was first dropped on any axis
+    rest: str
+    codes: tuple[str, ...] = field(default=())
+
+
+def kind_of(world: World):
+    """The type, as fitted to 30 devices of it: a little is left open."""
+    noise = {"noise_mdps_rts": world.white} if world.known else {}
+    settling = dict(zip(("amplitude_mdps", "spread_mdps", "time_constant_s"), world.warm_up or (), strict=False))
+    return type_of(
+        {
+            "type": "simulated", **noise, "flicker_mdps": world.flicker,
+            "random_walk_mdps_per_rts": world.walk, "turn_on_mdps": world.tau, "turn_on_factor": 1.3,
+            "walk_mdps_per_rtday": 0.03, "walk_factor": 2.0, "warm_up": settling or None,
+            **({"temperature_spread_mdps_per_c": 5.0} if world.ramp else {}),
+        },
+        "benchmark",
+    )  # fmt: skip
+
+
+def earth(heading: float) -> np.ndarray:
+    """The Earth's rate on x, y, z (up), mdps."""
+    across = EARTH * np.cos(np.radians(LATITUDE))
+    up = EARTH * np.sin(np.radians(LATITUDE))
+    return np.array([across * np.cos(heading), -across * np.sin(heading), up])
+
+
+def own_variance(world: World, seconds: float) -> np.ndarray:
+    filter_ = Filter.start(kind_of(world).noise, 0.5, np.zeros(3))
+    return own(filter_.ahead(round(seconds / 0.5))).variance[-1] / MDPS**2
+
+
+def noise(rng, world: World, seconds: float) -> np.ndarray:
+    """Noise (n, 3), mdps, and the walk in it ends where it ends: (n, 3)."""
+    count = round(FLICKER_S * world.rate)
+    short = round(seconds * world.rate)
+    figures = np.full(3, world.white), world.lag1
+    if world.flicker:
+        samples = simulate_noise(rng, (3, count), world.rate, *figures, world.flicker)[:, :short]
+    else:
+        samples = simulate_noise(rng, (3, short), world.rate, *figures)
+    return samples.T.astype(np.float64)
+
+
+def one(world: World, history_variance: np.ndarray, seed: Sequence[int]) -> Result:
+    """One device with its history, and one calibration of it."""
+    rng = np.random.default_rng(seed)
+    level, heading = rng.uniform(-500, 500, 3), rng.uniform(0, 2 * np.pi)
+    past = []
+    for _ in range(world.past):
+        if world.turn is None:
+            heading = rng.uniform(0, 2 * np.pi)
+        bias = level + rng.normal(0, world.tau, 3) + earth(heading)
+        mean = bias + rng.normal(0, np.sqrt(history_variance))
+        up = np.array([0, 0, 1.0]) if world.accel_ug else None
+        warmth = 25 + rng.normal(0, 0.5) if world.ramp else None
+        past.append(Calibration(mean * MDPS, history_variance * MDPS**2, temperature_c=warmth, up=up))
+    heading = rng.uniform(0, 2 * np.pi) if world.turn is None else heading + np.radians(world.turn)
+    bias = level + rng.normal(0, world.tau, 3) + earth(heading) + world.step
+    return measured(rng, world, past, bias)
+
+
+def measured(rng, world: World, past, bias: np.ndarray) -> Result:
+    count = round(world.longest_s * world.rate)
+    samples = noise(rng, world, world.longest_s) + bias
+    time_s = (np.arange(count) + 0.5) / world.rate
+    walk = np.zeros((count, 3))
+    if world.walk:
+        walk = np.cumsum(rng.normal(0, world.walk / np.sqrt(world.rate), (count, 3)), axis=0)
+    if world.warm_up:
+        mean, spread, constant_s = world.warm_up
+        samples += warm_up(rng.normal(mean, spread, 3), constant_s, count, world.rate).T
+    warmth = None
+    if world.ramp:
+        warmth = 25 + world.ramp * time_s / world.longest_s
+        walk = walk + (5 * (warmth - 25))[:, None]
+    samples = (samples + walk) * MDPS
+    accel = None
+    if world.accel_ug:
+        accel = rng.normal([0, 0, 1], world.accel_ug * 1e-6 * np.sqrt(world.rate / 2), (count, 3))
+    if world.disturb:
+        world.disturb(rng, samples, world.rate, *([accel] if accel is not None else []))
+    if world.step_dps:
+        samples = np.rint(samples / world.step_dps) * world.step_dps
+    stamps = time_s + world.jitter / world.rate * rng.uniform(-0.5, 0.5, count)
+    kept = rng.uniform(size=count) >= world.lost
+    if world.gap_s:
+        kept &= np.abs(time_s - world.longest_s / 2) > world.gap_s / 2
+    now = Circumstances(same_heading=world.declared, latitude_deg=LATITUDE)
+    age = 0.0 if world.warm_up else None
+    calibrator = Calibrator(kind_of(world), world.rate, past, now, world.target * MDPS, age)
+    marks = [mark for mark in MARKS if mark <= world.longest_s]
+    error, sigma, plain, stop, stop_s, seen_s = [], [], [], None, np.inf, np.inf
+    edges = sorted({*marks, *range(1, world.longest_s + 1)})
+    first, state = 0, None
+    for edge in edges:
+        if stop is not None and edge not in marks:
+            continue
+        last = round(edge * world.rate)
+        rows = np.flatnonzero(kept[first:last]) + first
+        state = calibrator.update(
+            stamps[rows], samples[rows], None if accel is None else accel[rows],
+            None if warmth is None else warmth[rows],
+        )  # fmt: skip
+        truth = bias + walk[last - 1]
+        off = state.bias_dps / MDPS - truth
+        if stop is None and state.done:
+            stop, stop_s = (off, state.sigma_dps / MDPS), edge
+        if "dropped" in state.history:
+            seen_s = min(seen_s, edge)
+        if edge in marks:
+            error.append(off)
+            sigma.append(state.sigma_dps / MDPS)
+            plain.append(samples[:last].mean(axis=0) / MDPS - truth)
+        first = last
+    final = calibrator.finish()
+    dropped = np.array([outcome == "dropped" for outcome in final.history])
+    codes = tuple(reason.code for reason in final.reasons)
+    return Result(np.array(error), np.array(sigma), np.array(plain), stop, stop_s, dropped, seen_s, final.rest, codes)
+
+
+def many(pool, world: World, count: int, seed: int) -> list[Result]:
+    variance = own_variance(world, HISTORY_S)
+    seeds = [(seed, number) for number in range(count)]
+    return list(pool.map(partial(one, world, variance), seeds, chunksize=20))
+
+
+def share(inside: np.ndarray) -> str:
+    """A share with its 99 % Clopper-Pearson interval."""
+    inside = np.asarray(inside).ravel()
+    hits, n = int(inside.sum()), inside.size
+    low = stats.beta.ppf(0.005, hits, n - hits + 1) if hits else 0.0
+    high = stats.beta.ppf(0.995, hits + 1, n - hits) if hits < n else 1.0
+    return f"{hits / max(n, 1):.3f} [{low:.3f}, {high:.3f}]"
+
+
+def covered(error: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    return np.abs(error) <= 1.96 * sigma
+
+
+def rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(x))))
+
+
+COVERAGE = {
+    "base": World(),
+    "no history": World(past=0),
+    "flicker 3": World(flicker=3, target=2.5),
+    "flicker 3, no history": World(flicker=3, past=0, target=2.5),
+    "walk 0.3": World(walk=0.3, target=1.5),
+    "walk 0.3, no history": World(walk=0.3, past=0, target=1.5),
+    "warm-up 5±1, 30 s": World(warm_up=(5, 1, 30)),
+    "warm-up 5±1, 30 s, no history": World(warm_up=(5, 1, 30), past=0, target=1.5),
+    "lag-1 -0.15": World(lag1=-0.15),
+    "noise not known, no history": World(known=False, past=0, target=1.5),
+    "tau 2": World(tau=2.0),
+    "any heading, not declared": World(turn=None, declared=False),
+    "int16, 2 mdps a step": World(step_dps=2e-3),
+    "jitter 50 %, 5 % lost": World(jitter=0.5, lost=0.05),
+    "gap of 3 s": World(gap_s=3.0, past=0, target=0.7),
+}
+
+
+def coverage(pool, count: int) -> None:
+    print("\n## Coverage of 95 % intervals at the stop, per axis; must be 0.935 to 0.965\n")
+    print("| world | target | median stop, s | coverage x / y / z | all, 99 % interval | dropped | used / dropped / none |\n|---|---|---|---|---|---|---|")
+    for number, (name, world) in enumerate(COVERAGE.items()):
+        results = many(pool, world, count, 100 + number)
+        stops = [r for r in results if r.stop is not None]
+        inside = np.array([covered(*r.stop) for r in stops])
+        drops = np.array([r.dropped for r in stops])
+        of = " / ".join(f"{x:.3f}" for x in inside.mean(axis=0))
+        used = f"{inside[~drops].mean():.3f} (n {int((~drops).sum())}) / {inside[drops].mean() if drops.any() else np.nan:.3f} (n {int(drops.sum())})"
+        lost = np.mean([r.dropped.any() for r in results])
+        moving = sum(r.rest != "still" for r in results)
+        print(f"| {name} | {world.target:g} | {np.median([r.stop_s for r in results]):g} | {of} | {share(inside)} | {lost:.4f} | {used}; {moving} not at rest |", flush=True)
+
+
+TURNED = {
+    **{f"not declared, turned {t}°": World(declared=False, turn=t) for t in (0, 30, 90, 180)},
+    "not declared, any heading": World(declared=False, turn=None),
+    **{f"declared, turned {t}°": World(turn=t) for t in (0, 30, 90, 180)},
+    **{f"level stepped by {s}": World(step=s) for s in (3, 10, 50)},
+}
+
+
+def turned(pool, count: int) -> None:
+    print("\n## History that is wrong: RMSE, mdps / over the mean's / coverage, all axes\n")
+    marks = [m for m in MARKS if m <= World().longest_s]
+    print("| world | " + " | ".join(f"{m} s" for m in marks) + " | dropped | seen by 10 s |\n|---|" + "---|" * (len(marks) + 2))
+    for number, (name, world) in enumerate(TURNED.items()):
+        results = many(pool, world, count, 200 + number)
+        error, sigma, plain = (np.array([getattr(r, key) for r in results]) for key in ("error", "sigma", "mean"))
+        cells = [
+            f"{rms(error[:, i]):.2f} / {rms(error[:, i]) / rms(plain[:, i]):.2f} / {covered(error[:, i], sigma[:, i]).mean():.3f}"
+            for i in range(len(marks))
+        ]
+        seen = np.mean([r.seen_s <= 10 for r in results])
+        print(f"| {name} | {' | '.join(cells)} | {np.mean([r.dropped.any() for r in results]):.4f} | {seen:.3f} |", flush=True)
+
+
+def drops(pool, count: int) -> None:
+    print("\n## History dropped where it holds, up to 60 s; must be at most 0.005 of calibrations\n")
+    for name, world in {"base": World(longest_s=60), "flicker 3": World(longest_s=60, flicker=3, target=2.5)}.items():
+        results = many(pool, world, count, 300)
+        error, sigma = (np.array([getattr(r, key) for r in results]) for key in ("error", "sigma"))
+        print(f"{name}: {share(np.array([r.dropped.any() for r in results]))}; RMSE at 10 s {rms(error[:, 2]):.3f}, at 1 s {rms(error[:, 0]):.3f}", flush=True)
+
+
+def filters(pool, count: int) -> None:
+    print("\n## The filter alone: RMSE over the exact best linear estimate; must be at most 1.005\n")
+    worlds = {"white": World(), "flicker 3": World(flicker=3), "walk 1": World(walk=1), "warm-up 5±2, 20 s": World(warm_up=(5, 2, 20))}
+    print("| world | prior | 1 s | 3 s | 10 s | 30 s |\n|---|---|---|---|---|---|")
+    for name, world in worlds.items():
+        for prior in (None, 0.31):
+            cells = [f"{against_exact(world, seconds, prior):.5f}" for seconds in (1, 3, 10, 30)]
+            print(f"| {name} | {'flat' if prior is None else 'narrow'} | {' | '.join(cells)} |")
+
+
+def against_exact(world: World, seconds: int, prior: float | None) -> float:
+    """The filter's RMSE under the exact covariance over the least, in mdps."""
+    rate, blocks = 100, 2 * seconds
+    edges = np.arange(blocks + 1) * 50
+    unit = noise_covariances(edges, round(FLICKER_S * rate), rate)
+    covariance = np.tensordot(np.square([world.white, world.flicker, world.walk]), unit, axes=1)
+    now = world.walk**2 * (edges[:-1] + edges[1:] + 1) / 2 / rate
+    if world.warm_up:
+        decay = profiles(edges, rate, world.warm_up[2])[:, 1]
+        covariance = covariance + world.warm_up[1] ** 2 * np.outer(decay, decay)
+    spread = 1e8 if prior is None else prior**2
+    total = covariance + spread
+    weights = np.linalg.solve(total, now + spread)
+    squares = lambda w: w @ covariance @ w - 2 * w @ now + seconds * world.walk**2 + spread * (1 - w.sum()) ** 2  # noqa: E731
+    filter_, columns = Filter.start(kind_of(replace(world)).noise, 0.5, np.zeros(3), 0.0), []
+    for unit_block in [None, *range(blocks)]:
+        current = filter_
+        for block in range(blocks):
+            current, _ = current.update(np.full(3, 1.0 if block == unit_block else 0.0))
+        last = own([current]).row(0)
+        gain = 1.0 if prior is None else spread / (spread + last.start_variance[0] / MDPS**2)
+        columns.append(last.bias[0] + last.follows[0] * (gain - 1) * last.start[0])
+    own_weights = np.array(columns[1:]) - columns[0]
+    return float(np.sqrt(squares(own_weights) / squares(weights)))
+
+
+def slow_rotation(rng, samples, rate, accel=None, *, rate_mdps: float, axis: int) -> None:
+    """A steady rotation about an axis from the start, felt by the accelerometer."""
+    samples[:, axis] += rate_mdps * MDPS
+    if accel is not None and axis != 2:
+        angle = np.radians(rate_mdps * MDPS) * (np.arange(len(samples)) + 0.5) / rate
+        other = 1 - axis
+        accel[:, other] += (1 if axis == 0 else -1) * np.sin(angle)
+
+
+def rocking(rng, samples, rate, accel=None, *, size_dps: float, period_s: float) -> None:
+    phase = rng.uniform(0, 2 * np.pi)
+    samples[:, 0] += size_dps * np.sin(2 * np.pi * np.arange(len(samples)) / rate / period_s + phase)
+
+
+def knock(rng, samples, rate, accel=None, *, size_dps: float = 2.0) -> None:
+    start = int(len(samples) * rng.uniform(0.3, 0.7))
+    length = max(int(0.3 * rate), 2)
+    shape = np.sin(2 * np.pi * np.arange(length) / length)
+    samples[start : start + length] += size_dps * shape[:, None]
+
+
+REST = {
+    "white": World(longest_s=30),
+    "white, accelerometer": World(longest_s=30, accel_ug=100),
+    "lag-1 -0.15": World(longest_s=30, lag1=-0.15),
+    "flicker 3": World(longest_s=30, flicker=3, target=2.5),
+    "noise not known": World(longest_s=30, known=False, past=0),
+    "knock": World(longest_s=30, disturb=knock),
+    **{
+        f"rocking {size:g} deg/s, {period:g} s": World(longest_s=30, disturb=partial(rocking, size_dps=size, period_s=period))
+        for size in (0.05, 0.3) for period in (0.4, 4.0)
+    },
+    **{
+        f"slow rotation {rate:g} mdps about {name}": World(longest_s=10, past=0, accel_ug=100, disturb=partial(slow_rotation, rate_mdps=rate, axis=axis))
+        for rate in (3.13, 30, 300) for axis, name in ((0, "x (horizontal)"), (2, "z (vertical)"))
+    },
+}  # fmt: skip
+
+
+def rest(pool, count: int) -> None:
+    print("\n## At rest or not; at rest 'moving' must be at most 6 in 3,000, 3.13 mdps about x seen in 0.95\n")
+    print("| world | still | moving | unsure | a motion cut | rotation seen |\n|---|---|---|---|---|---|")
+    for number, (name, world) in enumerate(REST.items()):
+        results = many(pool, world, count, 400 + number)
+        rests = [r.rest for r in results]
+        cut, turn = (sum(code in r.codes for r in results) for code in ("cut", "rotation"))
+        print(f"| {name} | {rests.count('still')} | {rests.count('moving')} | {rests.count('unsure')} | {cut} | {turn} of {len(results)} |", flush=True)
+
+
+def speed(pool, count: int) -> None:
+    print("\n## Speed at 1,000 Hz; must be 1e6 samples a second\n")
+    rng = np.random.default_rng(1)
+    samples = rng.normal(0, 0.1, (120_000, 3))
+    times = np.arange(len(samples)) / 1000
+    for seconds in (1, 10, 120):
+        best = np.inf
+        for _ in range(3):
+            calibrator = Calibrator(kind_of(World()), 1000.0, target_dps=1e-3)
+            start = time.perf_counter()
+            for first in range(0, len(samples), seconds * 1000):
+                part = slice(first, first + seconds * 1000)
+                calibrator.update(times[part], samples[part])
+            best = min(best, time.perf_counter() - start)
+        print(f"chunks of {seconds} s: {len(samples) / best:.3g} samples a second", flush=True)
+
+
+SECTIONS: dict[str, Callable[..., None]] = {
+    "filters": filters, "coverage": coverage, "turned": turned, "drops": drops, "rest": rest, "speed": speed,
+}  # fmt: skip
+
+
+def main(arguments: Iterable[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sections", nargs="*", choices=list(SECTIONS), default=list(SECTIONS))
+    parser.add_argument("--count", type=int, default=1000, help="calibrations a world")
+    parser.add_argument("--full", action="store_true", help="4,000 calibrations a world")
+    parser.add_argument("--workers", type=int, default=2)
+    options = parser.parse_args(arguments)
+    with ProcessPoolExecutor(options.workers) as pool:
+        for name in options.sections:
+            SECTIONS[name](pool, 4000 if options.full else options.count)
+
+
+if __name__ == "__main__":
+    main()
