@@ -28,7 +28,6 @@ from gyro_pipeline.calibrator.state import (
     UNSURE,
     USED,
     Array,
-    Reason,
     State,
 )
 from gyro_pipeline.calibrator.stretch import Blocks, Stretch
@@ -251,8 +250,9 @@ class Calibrator:
             self.time_s, age, self.known_still,
         )  # fmt: skip
 
-    def _prior_of(self, up: Array | None, temperature_c: float | None) -> Prior:
-        now = replace(self.now, up=up, temperature_c=temperature_c)
+    def _prior_of(self, up: Array | None, temperature_c: float | None, believed: bool) -> Prior:
+        same = self.now.same_heading and believed
+        now = replace(self.now, up=up, temperature_c=temperature_c, same_heading=same)
         return prior_of(self.history, self.kind, now)
 
     def _best(self) -> Stretch:

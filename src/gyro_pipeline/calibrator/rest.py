@@ -88,7 +88,7 @@ class RestMonitor:
         alarms += self._noise(innovations)
         alarms += self._rotation(blocks.gravity, blocks.gravity_variances)
         self.blocks += len(innovations)
-        return min(alarms, key=lambda alarm: (alarm.row, -alarm.kind), default=None)
+        return min(alarms, key=lambda alarm: (alarm.row, alarm.kind), default=None)
 
     def _noise(self, innovations: Array) -> list[Alarm]:
         """The mean square of the innovations over 1, by its cube root (Wilson and Hilferty)."""

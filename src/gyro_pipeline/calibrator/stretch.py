@@ -18,8 +18,12 @@ CONFLICT = 120.0
 """The e-value at which the history is dropped. Where it holds, that happens in at most one of so
 many calibrations (Ville), and in half as many as measured."""
 
-PriorOf = Callable[[Array | None, float | None], Prior]
-"""The prior, by the up direction and the temperature, None where they are not measured."""
+PriorOf = Callable[[Array | None, float | None, bool], Prior]
+"""The prior, by the up direction and the temperature, None where they are not measured, and whether
+a declared heading is believed."""
+
+VERTICAL = 0.9
+"""Cosine of the angle between an axis that counts as vertical and the vertical."""
 
 _TURN_DEG = 1.0  # the attitude is the same after a motion that turned the device by less
 _WARMER_C = 0.5  # by which the temperature moves until the prior is looked up again
@@ -49,6 +53,7 @@ class Taken(NamedTuple):
     filter: Filter
     prior: Prior
     warmth: float  # degrees Celsius that the prior is of, NaN where it is of none
+    believed: bool  # that a declared heading repeats
     dropped: NDArray[np.bool_]  # (3,), axes whose history was dropped
     log_ratio: Array  # (3,), wide over narrow prior
     sums: Array  # (9,), of variances within blocks, gravity and its count, temperature and its
@@ -80,7 +85,7 @@ class Stretch:
         self.known_still = known_still
         empty = Filter.start(kind.noise, block_s, np.zeros(3), age_s)
         self.taken = Taken(
-            empty, prior_of(None, None), np.nan, np.zeros(3, bool), np.zeros(3), np.zeros(9),
+            empty, prior_of(None, None, True), np.nan, True, np.zeros(3, bool), np.zeros(3), np.zeros(9),
             (np.inf, -np.inf),
         )  # fmt: skip
         self._before: Taken | None = None  # the last block
@@ -173,8 +178,7 @@ class Stretch:
             moved = np.abs(part.temperature[first:] - self.taken.warmth) > _WARMER_C
             moved |= np.isnan(self.taken.warmth) & np.isfinite(part.temperature[first:])
             last = first + int(moved.argmax()) if moved.any() else count
-            self._add(part.rows(first, last), filters[first + 1 : last + 1])
-            first = last
+            first += self._add(part.rows(first, last), filters[first + 1 : last + 1])
         self.moving, self._turned = 0, np.zeros(3)
 
     def _look_up(self, part: Blocks, row: int) -> None:
@@ -183,45 +187,64 @@ class Stretch:
         if up is None and np.isfinite(part.gravity[row]).all():
             up = part.gravity[row] / np.linalg.norm(part.gravity[row])
         if not self.blocks or np.isfinite(warmth):
-            prior = self.prior_of(up, warmth if np.isfinite(warmth) else None)
-            self.taken = self.taken._replace(prior=prior, warmth=warmth)
+            self._set_prior(up, warmth)
 
-    def _add(self, part: Blocks, filters: list[Filter]) -> None:
-        """Take blocks of one prior; what was known one block before is kept as well."""
+    def _set_prior(self, up: Array | None, warmth: float) -> None:
+        known = warmth if np.isfinite(warmth) else None
+        prior = self.prior_of(up, known, self.taken.believed)
+        self.taken = self.taken._replace(prior=prior, warmth=warmth)
+
+    def _add(self, part: Blocks, filters: list[Filter]) -> int:
+        """Take blocks of one prior, up to the first at which the history is dropped.
+
+        Returns:
+            How many; what was known one block before the last is kept as well.
+        """
+        count, against, log_ratio = self._conflict(filters)
+        filters, part = filters[:count], part.rows(0, count)
         known = np.isfinite(part.temperature)[:, None]
         felt = np.isfinite(part.gravity).all(axis=1)[:, None]
         warmth = np.where(known, part.temperature[:, None], 0)
-        gravity = np.where(felt, part.gravity, 0)
-        rows = np.hstack([part.variances, gravity, felt, warmth, known])
+        rows = np.hstack([part.variances, np.where(felt, part.gravity, 0), felt, warmth, known])
         sums = np.add.accumulate(np.vstack([self.taken.sums, rows]))
         least, most = np.where(known, warmth, np.inf), np.where(known, warmth, -np.inf)
         lows = np.minimum.accumulate(np.append(self.taken.range_c[0], least))
         highs = np.maximum.accumulate(np.append(self.taken.range_c[1], most))
-        dropped, log_ratio = self._conflicts(filters)
-        for row in range(max(len(filters) - 2, 0), len(filters)):
+        for row in range(max(count - 2, 0), count):
             self._before = self.taken
             self.taken = self.taken._replace(
-                filter=filters[row], dropped=dropped[row], log_ratio=log_ratio[row],
-                sums=sums[row + 1], range_c=(lows[row + 1], highs[row + 1]),
+                filter=filters[row], log_ratio=log_ratio[row], sums=sums[row + 1],
+                range_c=(lows[row + 1], highs[row + 1]),
             )  # fmt: skip
+        if against.any():
+            self._drop(against)
+        return count
 
-    def _conflicts(self, filters: list[Filter]) -> tuple[NDArray[np.bool_], Array]:
-        """After each block (n, 3): axes whose history is dropped, and the log of the ratio.
+    def _drop(self, against: NDArray[np.bool_]) -> None:
+        """Drop the history on axes; a heading that one of them contradicts is not believed."""
+        self.taken = self.taken._replace(dropped=self.taken.dropped | against)
+        up = self.up
+        if self.taken.believed and (up is None or np.any(against & (np.abs(up) < VERTICAL))):
+            self.taken = self.taken._replace(believed=False)
+            self._set_prior(up, self.taken.warmth)
 
-        Once the mean e-value says that the history is wrong, it is dropped on the axes that speak
-        against it, for the rest of the stretch.
+    def _conflict(self, filters: list[Filter]) -> tuple[int, NDArray[np.bool_], Array]:
+        """Blocks until the history is dropped, or all; axes on which it is; the log of the ratio.
+
+        The e-value says of all axes together that the history is wrong. It is then dropped on the
+        axes that speak against it, for the rest of the stretch.
         """
-        prior, dropped = self.taken.prior, self.taken.dropped
-        usable = np.isfinite(prior.narrow) & ~dropped
+        prior, usable = self.taken.prior, self.usable
         if not usable.any():
-            none = np.zeros((len(filters), 3))
-            return none + dropped > 0, none
+            return len(filters), np.zeros(3, bool), np.zeros((len(filters), 3))
         alone = own(filters)
         variance = alone.start_variance * _factor(*self._noise_of(alone))
         seen = _with_history(alone.start, variance, prior, usable)
-        wrong = (seen.log_e > np.log(CONFLICT))[:, None]
-        against = np.logical_or.accumulate(wrong & usable & (seen.log_ratio > 0))
-        return dropped | against, seen.log_ratio
+        wrong = np.flatnonzero(seen.log_e > np.log(CONFLICT))
+        if not wrong.size:
+            return len(filters), np.zeros(3, bool), seen.log_ratio
+        row = int(wrong[0])
+        return row + 1, usable & (seen.log_ratio[row] > 0), seen.log_ratio
 
     def _leave_out(self, part: Blocks, filters: list[Filter], row: int) -> None:
         """Leave out a block of motion and the one before it."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from gyro_pipeline.calibrator.rest import Alarm
 from gyro_pipeline.calibrator.state import Array, Reason
-from gyro_pipeline.calibrator.stretch import Stretch
+from gyro_pipeline.calibrator.stretch import VERTICAL, Stretch
 from gyro_pipeline.conventions import AXES, MDPS
 
 CONSTANT = 4
@@ -17,7 +17,6 @@ CONSTANT = 4
 _FAR = 15.0  # factor on the noise that another unit makes, not another device
 _WARMER_C = 1.0  # over a log, from which on it is said
 _ENOUGH = 6  # blocks that tell a unit by their noise
-_VERTICAL = 0.9  # cosine of the angle between an axis and the vertical
 _UNITS = {57.3: "rad/s", 1e3: "mdps", 3600.0: "deg/h", 6.0: "rpm"}
 
 
@@ -169,7 +168,7 @@ def _of_rotation(stretch: Stretch) -> Iterator[Reason]:
     if not stretch.blocks:
         return
     up, usable = stretch.up, stretch.usable
-    unseen = np.ones(3, bool) if up is None else np.abs(up) > _VERTICAL
+    unseen = np.ones(3, bool) if up is None else np.abs(up) > VERTICAL
     which = "the vertical" if up is not None else "any axis"
     if not (usable & unseen).any():
         yield Reason("rotation_bound", f"A steady rotation about {which} cannot be told from a bias.")
