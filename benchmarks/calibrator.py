@@ -77,7 +77,9 @@ class Result:
 def kind_of(world: World):
     """The type, as fitted to 30 devices of it: a little is left open."""
     noise = {"noise_mdps_rts": world.white} if world.known else {}
-    settling = dict(zip(("amplitude_mdps", "spread_mdps", "time_constant_s"), world.warm_up or (), strict=False))
+    settling = dict(
+        zip(("amplitude_mdps", "spread_mdps", "time_constant_s"), world.warm_up or (), strict=False)
+    )
     return type_of(
         {
             "type": "simulated", **noise, "flicker_mdps": world.flicker,
@@ -125,7 +127,9 @@ def one(world: World, history_variance: np.ndarray, seed: Sequence[int]) -> Resu
         mean = bias + rng.normal(0, np.sqrt(history_variance))
         up = np.array([0, 0, 1.0]) if world.accel_ug else None
         warmth = 25 + rng.normal(0, 0.5) if world.ramp else None
-        past.append(Calibration(mean * MDPS, history_variance * MDPS**2, temperature_c=warmth, up=up))
+        past.append(
+            Calibration(mean * MDPS, history_variance * MDPS**2, temperature_c=warmth, up=up)
+        )
     heading = rng.uniform(0, 2 * np.pi) if world.turn is None else heading + np.radians(world.turn)
     bias = level + rng.normal(0, world.tau, 3) + earth(heading) + world.step
     return measured(rng, world, past, bias)
@@ -187,7 +191,17 @@ def measured(rng, world: World, past, bias: np.ndarray) -> Result:
     final = calibrator.finish()
     dropped = np.array([outcome == "dropped" for outcome in final.history])
     codes = tuple(reason.code for reason in final.reasons)
-    return Result(np.array(error), np.array(sigma), np.array(plain), stop, stop_s, dropped, seen_s, final.rest, codes)
+    return Result(
+        np.array(error),
+        np.array(sigma),
+        np.array(plain),
+        stop,
+        stop_s,
+        dropped,
+        seen_s,
+        final.rest,
+        codes,
+    )
 
 
 def many(pool, world: World, count: int, seed: int) -> list[Result]:
@@ -234,7 +248,9 @@ COVERAGE = {
 
 def coverage(pool, count: int) -> None:
     print("\n## Coverage of 95 % intervals at the stop, per axis; must be 0.935 to 0.965\n")
-    print("| world | target | median stop, s | coverage x / y / z | all, 99 % interval | dropped | used / dropped / none |\n|---|---|---|---|---|---|---|")
+    print(
+        "| world | target | median stop, s | coverage x / y / z | all, 99 % interval | dropped | used / dropped / none |\n|---|---|---|---|---|---|---|"
+    )
     for number, (name, world) in enumerate(COVERAGE.items()):
         results = many(pool, world, count, 100 + number)
         stops = [r for r in results if r.stop is not None]
@@ -244,7 +260,10 @@ def coverage(pool, count: int) -> None:
         used = f"{inside[~drops].mean():.3f} (n {int((~drops).sum())}) / {inside[drops].mean() if drops.any() else np.nan:.3f} (n {int(drops.sum())})"
         lost = np.mean([r.dropped.any() for r in results])
         moving = sum(r.rest != "still" for r in results)
-        print(f"| {name} | {world.target:g} | {np.median([r.stop_s for r in results]):g} | {of} | {share(inside)} | {lost:.4f} | {used}; {moving} not at rest |", flush=True)
+        print(
+            f"| {name} | {world.target:g} | {np.median([r.stop_s for r in results]):g} | {of} | {share(inside)} | {lost:.4f} | {used}; {moving} not at rest |",
+            flush=True,
+        )
 
 
 TURNED = {
@@ -258,29 +277,54 @@ TURNED = {
 def turned(pool, count: int) -> None:
     print("\n## History that is wrong: RMSE, mdps / over the mean's / coverage, all axes\n")
     marks = [m for m in MARKS if m <= World().longest_s]
-    print("| world | " + " | ".join(f"{m} s" for m in marks) + " | dropped | seen by 10 s |\n|---|" + "---|" * (len(marks) + 2))
+    print(
+        "| world | "
+        + " | ".join(f"{m} s" for m in marks)
+        + " | dropped | seen by 10 s |\n|---|"
+        + "---|" * (len(marks) + 2)
+    )
     for number, (name, world) in enumerate(TURNED.items()):
         results = many(pool, world, count, 200 + number)
-        error, sigma, plain = (np.array([getattr(r, key) for r in results]) for key in ("error", "sigma", "mean"))
+        error, sigma, plain = (
+            np.array([getattr(r, key) for r in results]) for key in ("error", "sigma", "mean")
+        )
         cells = [
             f"{rms(error[:, i]):.2f} / {rms(error[:, i]) / rms(plain[:, i]):.2f} / {covered(error[:, i], sigma[:, i]).mean():.3f}"
             for i in range(len(marks))
         ]
         seen = np.mean([r.seen_s <= 10 for r in results])
-        print(f"| {name} | {' | '.join(cells)} | {np.mean([r.dropped.any() for r in results]):.4f} | {seen:.3f} |", flush=True)
+        print(
+            f"| {name} | {' | '.join(cells)} | {np.mean([r.dropped.any() for r in results]):.4f} | {seen:.3f} |",
+            flush=True,
+        )
 
 
 def drops(pool, count: int) -> None:
-    print("\n## History dropped where it holds, up to 60 s; must be at most 0.005 of calibrations\n")
-    for name, world in {"base": World(longest_s=60), "flicker 3": World(longest_s=60, flicker=3, target=2.5)}.items():
+    print(
+        "\n## History dropped where it holds, up to 60 s; must be at most 0.005 of calibrations\n"
+    )
+    for name, world in {
+        "base": World(longest_s=60),
+        "flicker 3": World(longest_s=60, flicker=3, target=2.5),
+    }.items():
         results = many(pool, world, count, 300)
         error, sigma = (np.array([getattr(r, key) for r in results]) for key in ("error", "sigma"))
-        print(f"{name}: {share(np.array([r.dropped.any() for r in results]))}; RMSE at 10 s {rms(error[:, 2]):.3f}, at 1 s {rms(error[:, 0]):.3f}", flush=True)
+        print(
+            f"{name}: {share(np.array([r.dropped.any() for r in results]))}; RMSE at 10 s {rms(error[:, 2]):.3f}, at 1 s {rms(error[:, 0]):.3f}",
+            flush=True,
+        )
 
 
 def filters(pool, count: int) -> None:
-    print("\n## The filter alone: RMSE over the exact best linear estimate; must be at most 1.005\n")
-    worlds = {"white": World(), "flicker 3": World(flicker=3), "walk 1": World(walk=1), "warm-up 5±2, 20 s": World(warm_up=(5, 2, 20))}
+    print(
+        "\n## The filter alone: RMSE over the exact best linear estimate; must be at most 1.005\n"
+    )
+    worlds = {
+        "white": World(),
+        "flicker 3": World(flicker=3),
+        "walk 1": World(walk=1),
+        "warm-up 5±2, 20 s": World(warm_up=(5, 2, 20)),
+    }
     print("| world | prior | 1 s | 3 s | 10 s | 30 s |\n|---|---|---|---|---|---|")
     for name, world in worlds.items():
         for prior in (None, 0.31):
@@ -301,7 +345,9 @@ def against_exact(world: World, seconds: int, prior: float | None) -> float:
     spread = 1e8 if prior is None else prior**2
     total = covariance + spread
     weights = np.linalg.solve(total, now + spread)
-    squares = lambda w: w @ covariance @ w - 2 * w @ now + seconds * world.walk**2 + spread * (1 - w.sum()) ** 2  # noqa: E731
+    squares = lambda w: (
+        w @ covariance @ w - 2 * w @ now + seconds * world.walk**2 + spread * (1 - w.sum()) ** 2
+    )  # noqa: E731
     filter_, columns = Filter.start(kind_of(replace(world)).noise, 0.5, np.zeros(3), 0.0), []
     for unit_block in [None, *range(blocks)]:
         current = filter_
@@ -325,7 +371,9 @@ def slow_rotation(rng, samples, rate, accel=None, *, rate_mdps: float, axis: int
 
 def rocking(rng, samples, rate, accel=None, *, size_dps: float, period_s: float) -> None:
     phase = rng.uniform(0, 2 * np.pi)
-    samples[:, 0] += size_dps * np.sin(2 * np.pi * np.arange(len(samples)) / rate / period_s + phase)
+    samples[:, 0] += size_dps * np.sin(
+        2 * np.pi * np.arange(len(samples)) / rate / period_s + phase
+    )
 
 
 def knock(rng, samples, rate, accel=None, *, size_dps: float = 2.0) -> None:
@@ -354,13 +402,20 @@ REST = {
 
 
 def rest(pool, count: int) -> None:
-    print("\n## At rest or not; at rest 'moving' must be at most 6 in 3,000, 3.13 mdps about x seen in 0.95\n")
-    print("| world | still | moving | unsure | a motion cut | rotation seen |\n|---|---|---|---|---|---|")
+    print(
+        "\n## At rest or not; at rest 'moving' must be at most 6 in 3,000, 3.13 mdps about x seen in 0.95\n"
+    )
+    print(
+        "| world | still | moving | unsure | a motion cut | rotation seen |\n|---|---|---|---|---|---|"
+    )
     for number, (name, world) in enumerate(REST.items()):
         results = many(pool, world, count, 400 + number)
         rests = [r.rest for r in results]
         cut, turn = (sum(code in r.codes for r in results) for code in ("cut", "rotation"))
-        print(f"| {name} | {rests.count('still')} | {rests.count('moving')} | {rests.count('unsure')} | {cut} | {turn} of {len(results)} |", flush=True)
+        print(
+            f"| {name} | {rests.count('still')} | {rests.count('moving')} | {rests.count('unsure')} | {cut} | {turn} of {len(results)} |",
+            flush=True,
+        )
 
 
 def speed(pool, count: int) -> None:
@@ -386,7 +441,9 @@ SECTIONS: dict[str, Callable[..., None]] = {
 
 
 def main(arguments: Iterable[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("sections", nargs="*", choices=list(SECTIONS), default=list(SECTIONS))
     parser.add_argument("--count", type=int, default=1000, help="calibrations a world")
     parser.add_argument("--full", action="store_true", help="4,000 calibrations a world")

@@ -95,7 +95,7 @@ def test_innovations_are_white_and_of_unit_variance():
     noise, innovations = noise_of(*WORLDS["all"][:3], None), []
     for _ in range(200):
         filter_ = Filter.start(noise, BLOCK_S, np.zeros(3))
-        for mean in (root @ rng.standard_normal((20, 3))):
+        for mean in root @ rng.standard_normal((20, 3)):
             filter_, innovation = filter_.update(mean)
             innovations.append(innovation)
     innovations = np.reshape(innovations, (200, 20, 3))[:, 1:]

@@ -20,6 +20,7 @@ from gyro_pipeline.calibrator.history import (
     noise_of,
     prior_of,
 )
+from gyro_pipeline.calibrator.rest import BRIEF
 from gyro_pipeline.calibrator.state import (
     DROPPED,
     MOVING,
@@ -30,8 +31,7 @@ from gyro_pipeline.calibrator.state import (
     Array,
     State,
 )
-from gyro_pipeline.calibrator.stretch import Blocks, Stretch
-from gyro_pipeline.calibrator.rest import BRIEF
+from gyro_pipeline.calibrator.stretch import Blocks, Setting, Stretch
 from gyro_pipeline.calibrator.words import Facts, reasons_of
 from gyro_pipeline.conventions import MDPS, InputError
 
@@ -75,6 +75,9 @@ class Calibrator:
         self._rest_of_block = np.empty((0, _COLUMNS))
         self._last_time: float | None = None
         self._last_values = np.full(3, np.nan)
+        self.setting = Setting(
+            kind, self._prior_of, self.scale, self.freedom, self.size, self.block_s, known_still
+        )
         self.stretch = self._new_stretch()
         self.kept: Stretch | None = None
 
@@ -103,9 +106,7 @@ class Calibrator:
         """
         from gyro_pipeline.calibrator.registry import opened  # noqa: PLC0415 - files, not needed below
 
-        given = opened(
-            device, registry, device_type, same_heading, latitude_deg, started_at
-        )
+        given = opened(device, registry, device_type, same_heading, latitude_deg, started_at)
         target = None if target_mdps is None else target_mdps * MDPS
         return cls(given.kind, rate_hz, given.history, given.now, target, since_power_on_s)
 
@@ -239,16 +240,12 @@ class Calibrator:
             self.facts.ended.append((self.time_s, alarm))
             if alarm.kind == BRIEF:  # what came before it was at rest
                 self._rest_s += self.stretch.seconds
-                if self.kept is None or self.stretch.blocks > self.kept.blocks:
-                    self.kept = self.stretch
+                self.kept = self._best()
             self.stretch = self._new_stretch()
 
     def _new_stretch(self) -> Stretch:
         age = None if self.since_power_on_s is None else self.since_power_on_s + self.time_s
-        return Stretch(
-            self.kind, self._prior_of, self.scale, self.freedom, self.size, self.block_s,
-            self.time_s, age, self.known_still,
-        )  # fmt: skip
+        return Stretch(self.setting, self.time_s, age)
 
     def _prior_of(self, up: Array | None, temperature_c: float | None, believed: bool) -> Prior:
         same = self.now.same_heading and believed
@@ -256,17 +253,17 @@ class Calibrator:
         return prior_of(self.history, self.kind, now)
 
     def _best(self) -> Stretch:
-        """The longest stretch that was at rest."""
-        if self.kept is not None and self.kept.blocks > self.stretch.blocks:
-            return self.kept
-        return self.stretch
+        """Of the stretches that were at rest, the one that knows most."""
+        if self.kept is None or np.sum(self.stretch.own().variance - self.kept.own().variance) < 0:
+            return self.stretch
+        return self.kept
 
     @property
     def _least_s(self) -> float:
         return LEAST_S if np.all(self.freedom > 0) else LEAST_UNKNOWN_S
 
     def _rest(self, stretch: Stretch, finished: bool) -> str:
-        """Now; of a finished calibration, whether half of the time, and enough of it, was at rest."""
+        """Now; of a finished calibration, whether half of it, and enough, was at rest."""
         if self.known_still:
             return STILL if stretch.blocks else UNSURE
         enough = stretch.seconds >= min(self._least_s, 2 * LEAST_S)

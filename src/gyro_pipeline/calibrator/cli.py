@@ -27,10 +27,12 @@ from gyro_pipeline.calibrator.history import describe
 from gyro_pipeline.calibrator.registry import (
     Device,
     RegistryError,
-    devices as all_devices,
     line_of,
     opened,
     registry_folder,
+)
+from gyro_pipeline.calibrator.registry import (
+    devices as all_devices,
 )
 from gyro_pipeline.calibrator.state import DROPPED, STILL, USED, State
 from gyro_pipeline.conventions import AXES, MDPS, InputError
@@ -70,7 +72,9 @@ def _reader_options(command: Callable[..., Any]) -> Callable[..., Any]:
         text = field.description or {"rate_tolerance_pct": "that rates may differ"}.get(name, "")
         if name in {"time_column"}:
             text = "a name, or a number from 0"
-        command = click.option(flag, name, help=f"{text}", metavar="VALUE", hidden=name == "rate_tolerance_pct")(command)
+        command = click.option(
+            flag, name, help=f"{text}", metavar="VALUE", hidden=name == "rate_tolerance_pct"
+        )(command)
     return command
 
 
@@ -204,7 +208,9 @@ def _log(path: Path, settings: Settings) -> int:
             raise InputError(f"{path}: {finding.check}: {finding.detail}")
     rate_hz = recording.rate_hz or settings.rate
     if rate_hz is None:
-        raise InputError(f"{path}: expected times in the file, or the rate, got neither; give --rate")
+        raise InputError(
+            f"{path}: expected times in the file, or the rate, got neither; give --rate"
+        )
     calibrator = _calibrator(settings, rate_hz, source)
     count = len(recording.samples)
     times = np.arange(count) / rate_hz
@@ -221,7 +227,9 @@ def _log(path: Path, settings: Settings) -> int:
                 None if warmth is None else warmth[part],
             )
         )  # fmt: skip
-    notes = [finding.detail for finding in recording.findings if finding.check == "unreadable cells"]
+    notes = [
+        finding.detail for finding in recording.findings if finding.check == "unreadable cells"
+    ]
     return _report(calibrator, settings, states, device, source, str(path), notes)
 
 
@@ -258,7 +266,9 @@ def _posix(text: str | None) -> float | None:
     try:
         return datetime.fromisoformat(text).timestamp()
     except ValueError as error:
-        raise InputError(f"--started-at: expected 2026-01-31T12:00:00+00:00 or POSIX seconds, got {text!r}") from error
+        raise InputError(
+            f"--started-at: expected 2026-01-31T12:00:00+00:00 or POSIX seconds, got {text!r}"
+        ) from error
 
 
 def _report(
@@ -380,18 +390,26 @@ def _stream(port: str | None, baud: int, timeout_s: float, settings: Settings) -
             for part in _seconds(samples, calibrator.rate_hz):
                 states.append(calibrator.update(*part))
                 if not states[:-1] or int(states[-1].time_s) > int(states[-2].time_s):
-                    click.echo(json.dumps(output.as_json(states[-1], settings.device), allow_nan=False))
+                    click.echo(
+                        json.dumps(output.as_json(states[-1], settings.device), allow_nan=False)
+                    )
                 if states[-1].done and settings.target is not None:
                     break
         if some is None:
             break
     if calibrator is None:
-        raise InputError(f"standard input: expected lines of samples, got none{'; ' * bool(ended)}{ended}")
+        raise InputError(
+            f"standard input: expected lines of samples, got none{'; ' * bool(ended)}{ended}"
+        )
     if ended:
         click.secho(ended, fg="yellow", err=True)
     if parser.bad:
-        click.secho(f"{parser.bad} lines were of another shape and were left out", fg="yellow", err=True)
-    return _report(calibrator, settings, states, device, digest.hexdigest(), port or "standard input")
+        click.secho(
+            f"{parser.bad} lines were of another shape and were left out", fg="yellow", err=True
+        )
+    return _report(
+        calibrator, settings, states, device, digest.hexdigest(), port or "standard input"
+    )
 
 
 def _seconds(samples: Any, rate_hz: float) -> Any:
@@ -413,7 +431,9 @@ def _descriptor(port: str | None, baud: int) -> int:
     try:
         opened_port = serial.Serial(port, baud)
     except (OSError, ValueError) as error:
-        raise InputError(f"--port {port}: {error}; check its name and that nothing else reads it") from error
+        raise InputError(
+            f"--port {port}: {error}; check its name and that nothing else reads it"
+        ) from error
     _open_ports.append(opened_port)
     return int(opened_port.fileno())
 
@@ -434,7 +454,9 @@ def _existing(registry: str | None, name: str) -> Device:
     device = Device(registry_folder(registry), name)
     if not device.folder.is_dir():
         known = ", ".join(d.name for d in all_devices(registry_folder(registry))) or "none"
-        raise InputError(f"device: expected one of {known}, got {name!r}; see gyro-calibrate devices list")
+        raise InputError(
+            f"device: expected one of {known}, got {name!r}; see gyro-calibrate devices list"
+        )
     return device
 
 
@@ -521,10 +543,16 @@ def _forget(name: str, source: str | None, all_: bool, registry: str | None) -> 
         device.remove()
         return DONE
     lines = [line for line in device.lines() if line["event"] == "calibration"]
-    of = [line["hash"] for line in lines if source and (line["source"] == source or line["hash"].startswith(source))]
+    of = [
+        line["hash"]
+        for line in lines
+        if source and (line["source"] == source or line["hash"].startswith(source))
+    ]
     if not of:
         shown = ", ".join(line["source"] for line in lines) or "none"
-        raise InputError(f"forget: expected one of {shown}, or a hash, got {source!r}; or give --all")
+        raise InputError(
+            f"forget: expected one of {shown}, or a hash, got {source!r}; or give --all"
+        )
     for hash_ in of:
         device.append({"event": "forget", "time": time.time(), "of": hash_})
     return DONE
@@ -561,7 +589,9 @@ def _load(path: Path, name: str | None, registry: str | None) -> int:
         content = json.loads(path.read_text("utf-8"))
         lines, settings = content["lines"], content["device_toml"]
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: expected a file that devices save wrote, but: {error!r}") from error
+        raise InputError(
+            f"{path}: expected a file that devices save wrote, but: {error!r}"
+        ) from error
     device = Device(registry_folder(registry), name or content["device"])
     device.check_writable()
     if settings and not device.settings_path.exists():
@@ -596,16 +626,22 @@ def _plan(
     calibrator = Calibrator(given.kind, 100.0, given.history, given.now, target_mdps * MDPS)
     if not np.all(calibrator.freedom > 0):
         known = ", ".join(names(registry_folder(registry)))
-        raise InputError(f"plan: expected a device of known noise; give --type ({known}) or a --device with history")
+        raise InputError(
+            f"plan: expected a device of known noise; give --type ({known}) or a --device with history"
+        )
     state = calibrator.state()
     if json_:
-        click.echo(json.dumps({"target_mdps": target_mdps, "seconds": output._numbers(state.seconds_left)}))
+        click.echo(
+            json.dumps({"target_mdps": target_mdps, "seconds": output._numbers(state.seconds_left)})
+        )
     floor = given.kind.noise.floor_dps / MDPS
     for axis, (name, seconds) in enumerate(zip(AXES, state.seconds_left, strict=True)):
         if json_:
             break
         if np.isfinite(seconds):
-            click.echo(f"{name}: {seconds:.1f} s at rest for {target_mdps:.3g} mdps ({target_mdps * 3.6:.3g}° an hour)")
+            click.echo(
+                f"{name}: {seconds:.1f} s at rest for {target_mdps:.3g} mdps ({target_mdps * 3.6:.3g}° an hour)"
+            )
         elif floor[axis] > target_mdps:
             click.echo(f"{name}: not with this sensor: its floor is {floor[axis]:.2g} mdps")
         else:

@@ -12,7 +12,7 @@ are in mdps, s and degrees Celsius, of x, y, z:
 | ``walk_mdps_per_rtday``, ``walk_factor`` | walk of the level, and its factor |
 | ``conflict_mdps`` | standard deviation of the wide prior, 5 where it is left out |
 | ``temperature_slope_mdps_per_c``, ``temperature_spread_mdps_per_c`` | and its standard deviation |
-| ``warm_up`` | ``amplitude_mdps``, ``spread_mdps``, ``time_constant_s``; left out where there is none |
+| ``warm_up`` | ``amplitude_mdps``, ``spread_mdps``, ``time_constant_s``; or left out |
 | ``least_change_mdps`` | smaller changes of the rate within half a minute are no motion, 20 |
 | ``sources`` | where each number is from |
 """
@@ -123,10 +123,9 @@ def type_of(content: Mapping[str, Any], where: str) -> DeviceType:
         raise InputError(f"{where}: expected the keys {known}, got {sorted(extra)}; correct them")
     v = {key: _triple(content.get(key, default), key, where) for key, default in _TRIPLES.items()}
     n = {key: float(content.get(key, default)) for key, default in _NUMBERS.items()}
-    known = content.get("noise_mdps_rts") is not None
-    spread = n["noise_spread"]
-    freedom = 0.0 if not known else 1 / (2 * spread**2) if spread else np.inf
-    white = v["noise_mdps_rts"] if known else np.ones(3)
+    has_noise, spread = content.get("noise_mdps_rts") is not None, n["noise_spread"]
+    freedom = 0.0 if not has_noise else 1 / (2 * spread**2) if spread else np.inf
+    white = v["noise_mdps_rts"] if has_noise else np.ones(3)
     noise = Noise(white, v["flicker_mdps"], v["random_walk_mdps_per_rts"], _warm_up(content, where))
     return DeviceType(
         str(content.get("type", UNKNOWN)), noise, freedom, v["turn_on_mdps"], n["turn_on_factor"],
@@ -170,7 +169,9 @@ def type_of_models(
             them; flicker slower than ``FLICKER_S`` goes from one figure to the other.
         source: Which recordings they were fitted to.
     """
-    figures = [[(m.noise.white, m.noise.instability, m.noise.random_walk) for m in d] for d in models]
+    figures = [
+        [(m.noise.white, m.noise.instability, m.noise.random_walk) for m in d] for d in models
+    ]
     white, instability, walk = np.moveaxis(np.array(figures), -1, 0) / MDPS
     slower = [[np.log(m.samples / m.rate_hz / FLICKER_S) / np.pi for m in d] for d in models]
     spreads = [[m.covariance[0, 0] for m in device] for device in models]
@@ -181,7 +182,10 @@ def type_of_models(
     return {
         "schema": 1,
         "type": name,
-        **{key: np.sqrt(np.mean(values**2, axis=0)).round(4).tolist() for key, values in rms.items()},
+        **{
+            key: np.sqrt(np.mean(values**2, axis=0)).round(4).tolist()
+            for key, values in rms.items()
+        },
         "noise_spread": round(float(max(relative.max(), 0.02)), 3),
         "turn_on_mdps": np.exp(logs.mean(axis=0)).round(4).tolist(),
         "turn_on_factor": round(float(np.clip(np.exp(logs.std()), 1.5, 4)), 2),

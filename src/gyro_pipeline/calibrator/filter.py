@@ -204,7 +204,7 @@ class Filter:
         return np.asarray((of_y - np.sum(of_x * c, axis=1)) / np.sqrt(spread))
 
     def constants(self) -> tuple[Array, Array]:
-        """c by the data alone, (3, p), about the reference, and its covariance, (3, p, p)."""
+        """The constants c by the data alone, (3, p), about the reference, and its covariance, (3, p, p)."""
         uncertainty = _inverse(self.information)
         return _times(uncertainty, self.weighted), uncertainty
 
@@ -253,7 +253,7 @@ def own(filters: Sequence[Filter]) -> Own:
 
 
 def _inverse(matrices: Array) -> Array:
-    return 1 / matrices if matrices.shape[-1] == 1 else np.linalg.inv(matrices)
+    return np.asarray(1 / matrices if matrices.shape[-1] == 1 else np.linalg.inv(matrices))
 
 
 def _times(matrices: Array, vectors: Array) -> Array:

@@ -104,9 +104,7 @@ class Prior:
 NO_PRIOR = Prior(np.full(3, np.nan), np.full(3, np.inf), np.full(3, np.inf))
 
 
-def prior_of(
-    calibrations: Sequence[Calibration], kind: DeviceType, now: Circumstances
-) -> Prior:
+def prior_of(calibrations: Sequence[Calibration], kind: DeviceType, now: Circumstances) -> Prior:
     """The prior of a calibration under these circumstances, by those before it."""
     past = list(calibrations)[-_MOST:]
     if not past:
@@ -179,9 +177,16 @@ def _axis_prior(
     among = covariance[:, :-1, :-1] + np.array([c.variance[axis] for c in past]) * np.eye(len(past))
     among = among + tau[:, None, None] ** 2 * np.eye(len(past))
     slope = np.broadcast_to(kind.slope_spread[axis] ** 2 * warmth[:-1], (len(tau), len(past)))
-    cross = np.stack([covariance[:, :-1, -1], walk[:, None] ** 2 * days[:-1].clip(max=days[-1]), slope], -1)
+    cross = np.stack(
+        [covariance[:, :-1, -1], walk[:, None] ** 2 * days[:-1].clip(max=days[-1]), slope], -1
+    )
     own = np.stack(
-        [covariance[:, -1, -1] + tau**2, walk**2 * days[-1], np.full(len(tau), kind.slope_spread[axis] ** 2)], -1
+        [
+            covariance[:, -1, -1] + tau**2,
+            walk**2 * days[-1],
+            np.full(len(tau), kind.slope_spread[axis] ** 2),
+        ],
+        -1,
     )
     deviance, mean, variance = _krige(among, cross, own, means, np.array([1.0, 1.0, 0.0]))
     weights = np.exp(logs - deviance / 2 - np.max(logs - deviance / 2))
@@ -216,7 +221,9 @@ def _krige(
         flat: (k,), by how much a target moves with the level.
     """
     reference = y.mean()
-    columns = np.broadcast_to(np.stack([np.ones(len(y)), y - reference], -1), (len(among), len(y), 2))
+    columns = np.broadcast_to(
+        np.stack([np.ones(len(y)), y - reference], -1), (len(among), len(y), 2)
+    )
     root = np.linalg.cholesky(among)
     white = np.linalg.solve(root, np.concatenate([columns, cross], -1))
     ones, data, to_targets = white[:, :, 0], white[:, :, 1], white[:, :, 2:]

@@ -77,19 +77,28 @@ def _left(state: State, target_mdps: float | None) -> list[str]:
     floors = {r.axis: r.value for r in state.reasons if r.code == "floor"}
     for name, seconds in zip(AXES, state.seconds_left, strict=True):
         if np.isinf(seconds) and floors.get(name):
-            parts.append(f"{name} does not reach {target_mdps:g} mdps: its floor is {floors[name]:.2g}")
+            parts.append(
+                f"{name} does not reach {target_mdps:g} mdps: its floor is {floors[name]:.2g}"
+            )
         elif np.isinf(seconds):
             parts.append(f"{name} does not reach {target_mdps:g} mdps within an hour")
         elif seconds:
-            parts.append(f"{name} needs {math.ceil(seconds):d} s more at rest for {target_mdps:g} mdps")
-    return [f"{'; '.join(parts)}."] if parts else [f"The target of {target_mdps:g} mdps is reached."]
+            parts.append(
+                f"{name} needs {math.ceil(seconds):d} s more at rest for {target_mdps:g} mdps"
+            )
+    return (
+        [f"{'; '.join(parts)}."] if parts else [f"The target of {target_mdps:g} mdps is reached."]
+    )
 
 
 def _drift(state: State) -> list[str]:
     """What the standard deviations mean for a heading."""
     if not np.isfinite(state.sigma_dps).all():
         return []
-    drifts = [f"{s / MDPS * HEADING_DEG:.2g}° about {n}" for s, n in zip(state.sigma_dps, AXES, strict=True)]
+    drifts = [
+        f"{s / MDPS * HEADING_DEG:.2g}° about {n}"
+        for s, n in zip(state.sigma_dps, AXES, strict=True)
+    ]
     return [f"In one hour the heading drifts by {', '.join(drifts)} (1 σ of the bias alone)."]
 
 
@@ -117,8 +126,17 @@ def plot(path: Path, states: Sequence[State], target_mdps: float | None) -> None
         ax.fill_between(times, bias - band, bias + band, alpha=0.25, label="95 %")
         ax.plot(times, bias, label="estimate")
         if last.history[axis] != "none":
-            past, width = (last.history_dps[axis] - centre) / MDPS, last.history_sigma_dps[axis] / MDPS
-            ax.axhspan(past - 1.96 * width, past + 1.96 * width, color="C1", alpha=0.2, label="history, 95 %")
+            past, width = (
+                (last.history_dps[axis] - centre) / MDPS,
+                last.history_sigma_dps[axis] / MDPS,
+            )
+            ax.axhspan(
+                past - 1.96 * width,
+                past + 1.96 * width,
+                color="C1",
+                alpha=0.2,
+                label="history, 95 %",
+            )
         for reason in last.reasons:
             if reason.code == "cut" and reason.value is not None:
                 ax.axvline(reason.value, color="C3", label="cut")

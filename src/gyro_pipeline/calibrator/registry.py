@@ -121,10 +121,14 @@ class Device:
         except FileNotFoundError:
             return {}
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise InputError(f"{self.settings_path}: expected TOML, but: {error}; correct it") from error
+            raise InputError(
+                f"{self.settings_path}: expected TOML, but: {error}; correct it"
+            ) from error
         if extra := set(said) - _KEYS:
             expected = ", ".join(sorted(_KEYS))
-            raise InputError(f"{self.settings_path}: expected {expected}, got {sorted(extra)}; correct it")
+            raise InputError(
+                f"{self.settings_path}: expected {expected}, got {sorted(extra)}; correct it"
+            )
         return said
 
     def lines(self) -> list[dict[str, Any]]:
@@ -178,7 +182,10 @@ class Device:
     def write_model(self, prior: Prior, noise_mdps: list[float | None]) -> None:
         """Replace ``model.json``, which people and other programs read, by what is known now."""
         axes = [
-            {key: [round(value / MDPS, 4), round(sigma / MDPS, 4)] for key, (value, sigma) in axis.items()}
+            {
+                key: [round(value / MDPS, 4), round(sigma / MDPS, 4)]
+                for key, (value, sigma) in axis.items()
+            }
             for axis in prior.fitted
         ]
         units = "mdps, mdps a square root of a day, mdps a degree; each with its standard deviation"
@@ -195,7 +202,7 @@ class Device:
         kind = f'type = "{device_type}"' if device_type else '# type = "consumer"'
         text = (
             f"{kind}\n# mounted = true     # the heading repeats at each calibration\n"
-            "# latitude = 32.1    # degrees\n# notes = \"\"\n"
+            '# latitude = 32.1    # degrees\n# notes = ""\n'
         )
         with self._locked():
             self.settings_path.write_text(text, "utf-8")
@@ -280,7 +287,9 @@ def line_of(
         "gravity": None if evidence.up is None else evidence.up.tolist(),
         "rest": state.rest,
         "outcome": list(evidence.outcome),
-        "noise_mdps_rts": (evidence.noise / MDPS).tolist() if evidence.freedom and evidence.noise is not None else None,
+        "noise_mdps_rts": (evidence.noise / MDPS).tolist()
+        if evidence.freedom and evidence.noise is not None
+        else None,
         "noise_freedom": evidence.freedom,
         "reasons": [reason.sentence for reason in state.reasons],
     }
@@ -290,5 +299,9 @@ def devices(registry: Path) -> list[Device]:
     """All devices of a registry, by name."""
     if not registry.is_dir():
         return []
-    names = sorted(path.name for path in registry.iterdir() if (path / "device.toml").exists() or (path / "calibrations.jsonl").exists())
+    names = sorted(
+        path.name
+        for path in registry.iterdir()
+        if (path / "device.toml").exists() or (path / "calibrations.jsonl").exists()
+    )
     return [Device(registry, name) for name in names]

@@ -114,18 +114,19 @@ class RestMonitor:
         Gravity turns in the axes of the device by the rate -w x g, so w = g x slope / g^2 but for
         its part along g. Two normal components exceed z sigma with probability exp(-z^2 / 2).
         """
-        known = np.isfinite(gravity).all(axis=1)
-        rows = len(known) if known.all() else int(known.argmin())
-        gravity, variances = gravity[: rows * self._measured], variances[: rows * self._measured]
-        self._measured = self._measured and rows == len(known)
-        if not len(gravity):
+        missing = np.flatnonzero(~np.isfinite(gravity).all(axis=1))
+        rows = int(missing[0]) if missing.size else len(gravity)
+        rows = rows if self._measured else 0
+        self._measured = self._measured and not missing.size
+        if not rows:
             return []
+        gravity, variances = gravity[:rows], variances[:rows]
         count = self.blocks + 1 + np.arange(len(gravity))
         t = (count - 0.5)[:, None] * self.block_s
         steps = np.diff(gravity, axis=0, prepend=gravity[:1] if self._last is None else self._last)
         own = np.sum(steps**2, axis=1, keepdims=True)
-        rows = np.hstack([t, t**2, gravity, gravity * t, variances[:, None], own])
-        sums = np.add.accumulate(np.vstack([self._slopes, rows]))[1:]
+        terms = np.hstack([t, t**2, gravity, gravity * t, variances[:, None], own])
+        sums = np.add.accumulate(np.vstack([self._slopes, terms]))[1:]
         self._slopes, self._last = sums[-1], gravity[-1:]
         n = count[:, None]
         of_t = sums[:, 1:2] - sums[:, :1] ** 2 / n

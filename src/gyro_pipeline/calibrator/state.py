@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 STILL, MOVING, UNSURE = "still", "moving", "unsure"
 """At rest, not at rest, or too few blocks to say."""

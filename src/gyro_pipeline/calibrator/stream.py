@@ -83,7 +83,10 @@ class Parser:
         table = np.array([row for row in rows if row is not None], np.float64)
         if not len(table):
             return None
-        parts = {name: self._part(table, name) for name in ("time", "rate", "acceleration", "temperature")}
+        parts = {
+            name: self._part(table, name)
+            for name in ("time", "rate", "acceleration", "temperature")
+        }
         time_s, warmth = parts["time"], parts["temperature"]
         rates = parts["rate"]
         if rates is None:
@@ -121,7 +124,10 @@ class Parser:
         file.settle()
         zero = -(self.options.offset or 0.0) * scale
         self._columns = {"rate": (numbers, scale, zero), "time": self._times(file)}
-        for name, (found, unit) in (("acceleration", acceleration_of(file, numbers)), ("temperature", temperature_of(file))):
+        for name, (found, unit) in (
+            ("acceleration", acceleration_of(file, numbers)),
+            ("temperature", temperature_of(file)),
+        ):
             self._columns[name] = list(found), unit.factor, unit.offset
         self._tell_rate(columns)
 

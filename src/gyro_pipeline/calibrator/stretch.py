@@ -1,16 +1,16 @@
 """A stretch in one attitude: the filter, the test of rest, and the history with its conflict."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gyro_pipeline.calibrator.device_types import DeviceType
 from gyro_pipeline.calibrator.filter import Filter, Own, own
 from gyro_pipeline.calibrator.history import Prior, angle_deg
 from gyro_pipeline.calibrator.rest import BRIEF, WHOLE, Alarm, RestMonitor
-from gyro_pipeline.calibrator.state import Array
+from gyro_pipeline.calibrator.state import Array, Mask
 from gyro_pipeline.physics.mixture import Posterior, mixture_posterior
 from gyro_pipeline.quality.rest import student_limits
 
@@ -54,41 +54,53 @@ class Taken(NamedTuple):
     prior: Prior
     warmth: float  # degrees Celsius that the prior is of, NaN where it is of none
     believed: bool  # that a declared heading repeats
-    dropped: NDArray[np.bool_]  # (3,), axes whose history was dropped
+    dropped: Mask  # (3,), axes whose history was dropped
     log_ratio: Array  # (3,), wide over narrow prior
     sums: Array  # (9,), of variances within blocks, gravity and its count, temperature and its
     range_c: tuple[float, float]  # of the temperature
 
 
-class Stretch:
-    """What is known from blocks at rest in one attitude.
+@dataclass(frozen=True)
+class Setting:
+    """What all stretches of a calibration share.
 
-    Args:
+    Attributes:
         kind: Type of the device.
         prior_of: The history's word.
         scale: (3,), N^2 over that of the type, as it is known beforehand.
         freedom: (3,), degrees of freedom of that; infinite where N is known, 0 where it is not.
         size: Samples of a block.
         block_s: Its length, seconds.
-        start_s: When it starts, seconds since the first sample.
-        age_s: Of the device then, seconds since power-on; None where it is not known.
-        known_still: It is declared to be at rest: nothing is tested.
+        known_still: The device is declared to be at rest: nothing is tested.
     """
 
-    def __init__(
-        self, kind: DeviceType, prior_of: PriorOf, scale: Array, freedom: Array, size: int,
-        block_s: float, start_s: float = 0.0, age_s: float | None = None,
-        known_still: bool = False,
-    ) -> None:  # fmt: skip
-        self.kind, self.prior_of, self.scale, self.freedom = kind, prior_of, scale, freedom
-        self.size, self.block_s, self.start_s = size, block_s, start_s
-        self.known_still = known_still
-        empty = Filter.start(kind.noise, block_s, np.zeros(3), age_s)
-        self.taken = Taken(
-            empty, prior_of(None, None, True), np.nan, True, np.zeros(3, bool), np.zeros(3), np.zeros(9),
-            (np.inf, -np.inf),
-        )  # fmt: skip
+    kind: DeviceType
+    prior_of: PriorOf
+    scale: Array
+    freedom: Array
+    size: int
+    block_s: float
+    known_still: bool = False
+
+
+class Stretch:
+    """What is known from blocks at rest in one attitude.
+
+    Args:
+        setting: What all stretches share.
+        start_s: When it starts, seconds since the first sample.
+        age_s: Of the device then, seconds since power-on; None where it is not known.
+    """
+
+    def __init__(self, setting: Setting, start_s: float = 0.0, age_s: float | None = None) -> None:
+        self.setting, self.kind, self.start_s = setting, setting.kind, start_s
+        self.scale, self.freedom, self.block_s = setting.scale, setting.freedom, setting.block_s
+        empty = Filter.start(self.kind.noise, self.block_s, np.zeros(3), age_s)
+        prior, none, zeros = setting.prior_of(None, None, True), np.zeros(3, bool), np.zeros
+        no_range = np.inf, -np.inf
+        self.taken = Taken(empty, prior, np.nan, True, none, zeros(3), zeros(9), no_range)
         self._before: Taken | None = None  # the last block
+        self._last_mean = np.zeros(3)  # of that block
         self._looked: tuple[Taken, tuple[Array, Array, Own]] | None = None
         self.moving = 0  # blocks of motion that just came
         self._turned = np.zeros(3)  # deg, over them
@@ -97,7 +109,7 @@ class Stretch:
 
     def _monitor(self, noise_dps: Array | None) -> RestMonitor:
         least = self.kind.least_change
-        return RestMonitor(self.size, self.block_s, least, self.freedom, noise_dps)
+        return RestMonitor(self.setting.size, self.block_s, least, self.freedom, noise_dps)
 
     @property
     def blocks(self) -> int:
@@ -160,10 +172,12 @@ class Stretch:
 
     def _alarm(self, part: Blocks, innovations: Array) -> Alarm | None:
         """The first alarm; after a motion also a block that is far from the level before it."""
-        if self.known_still:
+        if self.setting.known_still:
             return None
         white = self.kind.noise.white / np.sqrt(self.block_s)
-        alarm = self.monitor.update(innovations / np.sqrt(self.scale), white * np.sqrt(self.scale), part)
+        alarm = self.monitor.update(
+            innovations / np.sqrt(self.scale), white * np.sqrt(self.scale), part
+        )
         if alarm is None and self.moving and self.blocks >= _REFERENCE:
             limit = self.kind.least_change + 6 * np.sqrt(self.noise()[0]) * white
             if np.any(np.abs(innovations[0]) * white > limit):
@@ -191,7 +205,7 @@ class Stretch:
 
     def _set_prior(self, up: Array | None, warmth: float) -> None:
         known = warmth if np.isfinite(warmth) else None
-        prior = self.prior_of(up, known, self.taken.believed)
+        prior = self.setting.prior_of(up, known, self.taken.believed)
         self.taken = self.taken._replace(prior=prior, warmth=warmth)
 
     def _add(self, part: Blocks, filters: list[Filter]) -> int:
@@ -216,11 +230,12 @@ class Stretch:
                 filter=filters[row], log_ratio=log_ratio[row], sums=sums[row + 1],
                 range_c=(lows[row + 1], highs[row + 1]),
             )  # fmt: skip
+        self._last_mean = part.means[-1]
         if against.any():
             self._drop(against)
         return count
 
-    def _drop(self, against: NDArray[np.bool_]) -> None:
+    def _drop(self, against: Mask) -> None:
         """Drop the history on axes; a heading that one of them contradicts is not believed."""
         self.taken = self.taken._replace(dropped=self.taken.dropped | against)
         up = self.up
@@ -228,7 +243,7 @@ class Stretch:
             self.taken = self.taken._replace(believed=False)
             self._set_prior(up, self.taken.warmth)
 
-    def _conflict(self, filters: list[Filter]) -> tuple[int, NDArray[np.bool_], Array]:
+    def _conflict(self, filters: list[Filter]) -> tuple[int, Mask, Array]:
         """Blocks until the history is dropped, or all; axes on which it is; the log of the ratio.
 
         The e-value says of all axes together that the history is wrong. It is then dropped on the
@@ -240,7 +255,7 @@ class Stretch:
         alone = own(filters)
         variance = alone.start_variance * _factor(*self._noise_of(alone))
         seen = _with_history(alone.start, variance, prior, usable)
-        wrong = np.flatnonzero(seen.log_e > np.log(CONFLICT))
+        wrong = np.flatnonzero(np.asarray(seen.log_e) > np.log(CONFLICT))
         if not wrong.size:
             return len(filters), np.zeros(3, bool), seen.log_ratio
         row = int(wrong[0])
@@ -253,16 +268,16 @@ class Stretch:
             self._accept(part.rows(0, row - 1), filters[:row])
         elif row == 0 and not moving and self._before is not None:
             self.taken = self._before  # the block before came with an earlier call
-        left_out = 1 if moving or not (self.blocks or row) else 2
-        current = self.taken.filter
-        if current.blocks:
-            self._turned = self._turned + np.sum(motion - own([current]).bias[0], axis=0) * self.block_s
-            for _ in range(left_out):
+            motion = np.vstack([self._last_mean, motion])
+        if self.blocks:
+            current = self.taken.filter
+            turned = np.sum(motion - own([current]).bias, axis=0) * self.block_s
+            for _ in motion:
                 current = current.skip(self.block_s)
-            self.taken = self.taken._replace(filter=current)
+            self._turned, self.taken = self._turned + turned, self.taken._replace(filter=current)
         if not moving:
-            self.motions.append(self.start_s + current.time_s)
-        self.moving, self._before = moving + left_out, None
+            self.motions.append(self.start_s + self.taken.filter.time_s)
+        self.moving, self._before = moving + len(motion), None
         enough = self.blocks >= _REFERENCE
         self.monitor = self._monitor(np.sqrt(self.taken.sums[:3] / self.blocks) if enough else None)
 
@@ -303,13 +318,14 @@ class Stretch:
         if self.blocks < 3:  # noqa: PLR2004 - a warm-up takes two
             return np.full(3, np.nan), 0.0
         alone = own([self.taken.filter]).row(0)
-        return self.kind.noise.white * np.sqrt(alone.squares / alone.freedom), float(alone.freedom[0])
+        noise = self.kind.noise.white * np.sqrt(alone.squares / alone.freedom)
+        return noise, float(alone.freedom[0])
 
     def own(self) -> Own:
         """The estimate by this stretch alone, with the noise as known, and Student's interval."""
         return self._look()[2]
 
-    def _posterior(self, alone: Own, usable: Array) -> tuple[Array, Array]:
+    def _posterior(self, alone: Own, usable: Mask) -> tuple[Array, Array]:
         """Bias and variance with the history where it is usable."""
         prior = self.taken.prior
         at_start = _with_history(alone.start, alone.start_variance, prior, usable)
@@ -326,18 +342,18 @@ class Stretch:
         return self._posterior(self.own(), self.usable)
 
     @property
-    def usable(self) -> Array:
+    def usable(self) -> Mask:
         """(3,), axes with a history that was not dropped."""
         return np.isfinite(self.taken.prior.narrow) & ~self.taken.dropped
 
-    def hopeless(self, target_dps: float) -> NDArray[np.bool_]:
+    def hopeless(self, target_dps: float) -> Mask:
         """(3,), axes whose target is below the floor of the sensor, and that have no history."""
         floor = self.kind.noise.floor_dps * np.sqrt(self.noise()[0])
         return np.asarray((floor > target_dps) & ~self.usable)
 
-    def reached(self, target_dps: float) -> NDArray[np.bool_]:
+    def reached(self, target_dps: float) -> Mask:
         """(3,), axes whose standard deviation is at the target or below."""
-        return (self.answer()[1] <= target_dps**2) & ~self.hopeless(target_dps)
+        return np.asarray(self.answer()[1] <= target_dps**2) & ~self.hopeless(target_dps)
 
     def seconds_left(self, target_dps: float, most_s: float) -> Array:
         """(3,), seconds at rest until the target; infinite where it is not within ``most_s``.
@@ -362,9 +378,7 @@ class Stretch:
         return left
 
 
-def _with_history(
-    start: Array, variance: Array, prior: Prior, usable: NDArray[np.bool_]
-) -> Posterior:
+def _with_history(start: Array, variance: Array, prior: Prior, usable: Mask) -> Posterior:
     """The posterior of the bias at the start; meaningless on axes whose history is not usable."""
     mean, narrow, wide = (np.where(usable, x, 1.0) for x in (prior.mean, prior.narrow, prior.wide))
     return mixture_posterior(start, np.where(usable, variance, np.inf), mean, narrow, wide)

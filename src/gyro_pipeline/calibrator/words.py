@@ -7,7 +7,7 @@ from statistics import NormalDist
 import numpy as np
 
 from gyro_pipeline.calibrator.rest import Alarm
-from gyro_pipeline.calibrator.state import Array, Reason
+from gyro_pipeline.calibrator.state import Array, Mask, Reason
 from gyro_pipeline.calibrator.stretch import VERTICAL, Stretch
 from gyro_pipeline.conventions import AXES, MDPS
 
@@ -31,7 +31,7 @@ class Facts:
     gap_s: float = 0.0
     jumps: int = 0
     constant: Array = field(default_factory=lambda: np.zeros(3))  # blocks in a row
-    dead: Array = field(default_factory=lambda: np.zeros(3, bool))
+    dead: Mask = field(default_factory=lambda: np.zeros(3, bool))
     ended: list[tuple[float, Alarm]] = field(default_factory=list)  # stretches: when, and why
     factor: float = 1.0  # of the noise over the known one, where a stretch ended by it
 
@@ -64,7 +64,9 @@ def unit_reason(factor: float, name: str) -> Reason | None:
     ratio = max(factor, 1 / factor)
     near = min(_UNITS, key=lambda unit: abs(np.log(ratio / unit)))
     way = "above" if factor > 1 else "below"
-    text = f"the noise is {ratio:.3g} times {way} that of {name}: a wrong unit? {_UNITS[near]} differ "
+    text = (
+        f"the noise is {ratio:.3g} times {way} that of {name}: a wrong unit? {_UNITS[near]} differ "
+    )
     text += f"by {near:g}; give --units, or another --type"
     return Reason("unit", text, None, factor, _FAR)
 
@@ -90,7 +92,9 @@ def _of_rest(facts: Facts, stretch: Stretch) -> Iterator[Reason]:
             if reason := unit_reason(alarm.value, stretch.kind.name):
                 yield reason
                 continue
-            text = f"up to {at:.1f} s the rates scatter {alarm.value:.1f} times as much as those of "
+            text = (
+                f"up to {at:.1f} s the rates scatter {alarm.value:.1f} times as much as those of "
+            )
             text += f"{stretch.kind.name} at rest: not at rest, or another --type"
         elif alarm.code == "attitude":
             text = f"the device was turned before {at:.1f} s; the longest stretch counts"
@@ -134,7 +138,9 @@ def _of_noise(stretch: Stretch, target_dps: float | None) -> Iterator[Reason]:
     if noise.warm_up is not None and stretch.blocks:
         left, sigma = stretch.taken.filter.warm_up()
         for axis in np.flatnonzero(np.abs(left) > np.maximum(2 * sigma, MDPS)):
-            text = f"warming up, still {left[axis] / MDPS:+.1f} mdps; the bias is what it settles to"
+            text = (
+                f"warming up, still {left[axis] / MDPS:+.1f} mdps; the bias is what it settles to"
+            )
             yield Reason("warm_up", text, AXES[axis], float(left[axis] / MDPS))
 
 
@@ -156,7 +162,9 @@ def _of_samples(facts: Facts) -> Iterator[Reason]:
 def _of_temperature(stretch: Stretch) -> Iterator[Reason]:
     count, (least, most) = stretch.taken.sums[8], stretch.taken.range_c
     if 0 < count < stretch.blocks:
-        text = f"the temperature is missing in {stretch.blocks - count:.0f} of {stretch.blocks} blocks"
+        text = (
+            f"the temperature is missing in {stretch.blocks - count:.0f} of {stretch.blocks} blocks"
+        )
         yield Reason("temperature", text, None, float(stretch.blocks - count))
     if count and most - least > _WARMER_C:
         text = f"the temperature moved by {most - least:.1f} °C; the bias may have moved with it"
@@ -164,14 +172,18 @@ def _of_temperature(stretch: Stretch) -> Iterator[Reason]:
 
 
 def _of_rotation(stretch: Stretch) -> Iterator[Reason]:
-    """The bound of a rotation that nothing sees: on vertical axes, or without accelerations on all."""
+    """The bound of a rotation that nothing sees: about the vertical, or any axis where no
+    acceleration is measured.
+    """
     if not stretch.blocks:
         return
     up, usable = stretch.up, stretch.usable
     unseen = np.ones(3, bool) if up is None else np.abs(up) > VERTICAL
     which = "the vertical" if up is not None else "any axis"
     if not (usable & unseen).any():
-        yield Reason("rotation_bound", f"A steady rotation about {which} cannot be told from a bias.")
+        yield Reason(
+            "rotation_bound", f"A steady rotation about {which} cannot be told from a bias."
+        )
         return
     spread = stretch.taken.prior.narrow + stretch.own().start_variance
     bound = 1.96 * float(np.sqrt(spread[usable & unseen].max())) / MDPS

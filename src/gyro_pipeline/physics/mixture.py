@@ -72,7 +72,10 @@ def mixture_posterior(
     own = np.where(unseen, 1.0, own)
     off = np.where(unseen, 0.0, estimates - centre)
     gains = [np.where(unseen, 0.0, prior / (prior + own)) for prior in (small, large)]
-    left = [np.where(unseen, prior, gain * own) for prior, gain in zip((small, large), gains, strict=True)]
+    left = [
+        np.where(unseen, prior, gain * own)
+        for prior, gain in zip((small, large), gains, strict=True)
+    ]
     squares = off**2 * (1 / (small + own) - 1 / (large + own))
     log_ratio = np.where(unseen, 0.0, (squares - np.log((large + own) / (small + own))) / 2)
     sets = _sets(off.shape[-1])
@@ -88,8 +91,8 @@ def mixture_posterior(
     means = [gain * off for gain in gains]
     result = (1 - of_wide) * means[0] + of_wide * means[1]
     spreads = [v + (m - result) ** 2 for v, m in zip(left, means, strict=True)]
-    variances = [(1 - w) * spreads[0] + w * spreads[1] for w in (of_wide, counted)]
-    return Posterior(centre + result, *variances, of_wide, log_ratio, log_e)
+    total, charged = ((1 - w) * spreads[0] + w * spreads[1] for w in (of_wide, counted))
+    return Posterior(centre + result, total, charged, of_wide, log_ratio, np.asarray(log_e))
 
 
 @lru_cache
