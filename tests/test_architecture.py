@@ -26,7 +26,15 @@ ALLOWED = {
     "physics": {"conventions"},
     "estimators": {"conventions", "learning", "physics"},
     "quality": {"conventions", "logs", "parameters", "physics"},
-    "calibrator": {"conventions", "logs", "parameters", "physics", "quality", "readers"},
+    "calibrator": {
+        "__init__",  # the version
+        "conventions",
+        "parameters",
+        "physics",
+        "quality",
+        "readers",
+        "units",
+    },
     "protocol": {"conventions", "fingerprints", "logs", "parameters", "physics", "quality"},
     "learning": {"conventions", "executors", "parameters", "protocol"},
     "datasets": {

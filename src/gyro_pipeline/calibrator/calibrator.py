@@ -82,7 +82,7 @@ class Calibrator:
         self.kept: Stretch | None = None
 
     @classmethod
-    def open(
+    def open(  # noqa: PLR0913 - what can be known beforehand
         cls, device: str | None = None, *, rate_hz: float, target_mdps: float | None = None,
         registry: str | Path | None = None, started_at: float | None = None,
         since_power_on_s: float | None = None, device_type: str | None = None,
@@ -148,6 +148,12 @@ class Calibrator:
             _outcome(stretch), noise, freedom,
         )  # fmt: skip
 
+    @property
+    def prior(self) -> Prior:
+        """What the history says of the answer's stretch."""
+        return self._best().taken.prior
+
+    @property
     def temperature_range(self) -> tuple[float, float]:
         """The least and the most temperature of the answer's stretch, degrees Celsius."""
         return self._best().taken.range_c

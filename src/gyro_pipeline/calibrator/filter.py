@@ -166,10 +166,11 @@ class Filter:
         covariance -= (variance[:, None] * gain)[:, :, None] * gain[:, None, :]
         of_y, of_x = left[:, 0], left[:, 1:]
         scaled = of_x / variance[:, None]
+        states = steps.keep[:, None] * self.states + gain[:, :, None] * left[:, None, :]
         following = type(self)(
             self.noise, self.block_s, self.age_s, self.reference, self.time_s + self.block_s,
-            self.blocks + 1, steps.keep[:, None] * self.states + gain[:, :, None] * left[:, None, :],
-            covariance, self.information + scaled[:, :, None] * of_x[:, None, :],
+            self.blocks + 1, states, covariance,
+            self.information + scaled[:, :, None] * of_x[:, None, :],
             self.weighted + scaled * of_y[:, None], self.squares + of_y**2 / variance,
         )  # fmt: skip
         return following, self._innovation(of_y, of_x, variance)
@@ -204,7 +205,7 @@ class Filter:
         return np.asarray((of_y - np.sum(of_x * c, axis=1)) / np.sqrt(spread))
 
     def constants(self) -> tuple[Array, Array]:
-        """The constants c by the data alone, (3, p), about the reference, and its covariance, (3, p, p)."""
+        """The constants c by the data alone, (3, p), and their covariance, (3, p, p)."""
         uncertainty = _inverse(self.information)
         return _times(uncertainty, self.weighted), uncertainty
 

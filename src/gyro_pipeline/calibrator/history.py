@@ -22,7 +22,7 @@ import numpy as np
 
 from gyro_pipeline.calibrator.device_types import DeviceType
 from gyro_pipeline.calibrator.state import DROPPED, Array, Reason
-from gyro_pipeline.conventions import AXES, MDPS
+from gyro_pipeline.conventions import MDPS
 
 EARTH_DPS = 4.178e-3
 """The Earth's rate, 15.041 deg/h."""
@@ -335,17 +335,3 @@ def noise_of(calibrations: Sequence[Calibration], kind: DeviceType) -> tuple[Arr
             total += past.freedom * (past.noise / kind.noise.white) ** 2
             freedom += past.freedom
     return np.where(freedom > 0, total / np.maximum(freedom, 1), 1.0), freedom
-
-
-def describe(count: Sequence[int], same_heading: bool) -> str:
-    """The history in a few words."""
-    most = max(count)
-    plural = "calibration" if most == 1 else "calibrations"
-    heading = "declared to repeat" if same_heading else "not declared to repeat"
-    return f"{most} {plural}, heading {heading}" if most else "none"
-
-
-__all__ = [
-    "AXES", "Calibration", "Circumstances", "NO_PRIOR", "Prior", "angle_deg", "describe",
-    "level_members", "noise_of", "prior_of",
-]  # fmt: skip

@@ -1,41 +1,42 @@
 """Answers as text for people and as JSON for programs, and a picture of how one came about."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gyro_pipeline.calibrator.state import DROPPED, USED, Array, State
-from gyro_pipeline.conventions import AXES, MDPS
-
-NOT_IN_TEXT = {"conflict", "rotation_bound", "floor"}
-"""Reasons that the text says in another place."""
+from gyro_pipeline.calibrator.state import DROPPED, NONE, STILL, USED, Array, State
+from gyro_pipeline.conventions import AXES, MDPS, InputError
 
 HEADING_DEG = 3.6
 """Degrees of heading an hour in one mdps."""
 
+_IN_TEXT = {"conflict", "cut", "floor", "rotation_bound"}  # reasons that the text says itself
+
 
 def as_json(state: State, device: str | None, **more: Any) -> dict[str, Any]:
     """One object for a program; null stands where there is no number."""
+    reasons = [
+        {"code": r.code, "axis": r.axis, "value": _number(r.value), "limit": _number(r.limit),
+         "sentence": r.sentence} for r in state.reasons
+    ]  # fmt: skip
     return {
         "device": device,
-        "bias_dps": _numbers(state.bias_dps),
-        "sigma_dps": _numbers(state.sigma_dps),
+        "bias_dps": numbers(state.bias_dps),
+        "sigma_dps": numbers(state.sigma_dps),
         "rest": state.rest,
         "seconds_at_rest": state.seconds_at_rest,
-        "seconds_left": _numbers(state.seconds_left),
+        "seconds_left": numbers(state.seconds_left),
         "history": list(state.history),
-        "reasons": [
-            {"code": r.code, "axis": r.axis, "value": _number(r.value), "limit": _number(r.limit), "text": r.sentence}
-            for r in state.reasons
-        ],
+        "reasons": reasons,
         **more,
-    }  # fmt: skip
+    }
 
 
-def _numbers(values: Array) -> list[float | None]:
+def numbers(values: Array) -> list[float | None]:
+    """Numbers of JSON."""
     return [_number(value) for value in values.tolist()]
 
 
@@ -43,42 +44,63 @@ def _number(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else float(value)
 
 
+def describe(count: Sequence[int], same_heading: bool) -> str:
+    """The history in a few words."""
+    most = max(count)
+    heading = f"heading {'' if same_heading else 'not '}declared to repeat"
+    return f"{most} calibration{'s' * (most != 1)}, {heading}" if most else "none"
+
+
 def as_text(state: State, target_mdps: float | None, temperature_c: float | None, past: str) -> str:
     """A table of the axes, with a line above and what is left to do below."""
     warmth = "" if temperature_c is None else f"; {temperature_c:.1f} °C"
-    cut = [f"{r.value:.1f} s" for r in state.reasons if r.code == "cut" and r.value is not None]
+    cut = [f"{r.value:.1f} s" for r in state.reasons if r.code == "cut"]
     knocks = f" (a motion at {', '.join(cut)} was cut)" if cut else ""
-    at_rest = f"at rest for {state.seconds_at_rest:.1f} of {state.time_s:.1f} s"
-    head = f"{at_rest if state.rest == 'still' else f'not at rest: {state.rest}, {at_rest}'}"
-    lines = [f"{head}{knocks}{warmth}; history: {past}"]
-    lines.append(f"{'bias, deg/s':>17}{'σ, mdps':>11}   from")
+    moving = "" if state.rest == STILL else f"not at rest ({state.rest}): "
+    rest = f"{moving}at rest for {state.seconds_at_rest:.1f} of {state.time_s:.1f} s"
+    lines = [
+        f"{rest}{knocks}{warmth}; history: {past}",
+        f"{'bias, deg/s':>17}{'σ, mdps':>11}   from",
+    ]
     for axis, name in enumerate(AXES):
         sigma = state.sigma_dps[axis] / MDPS
         lines.append(f"{name}{state.bias_dps[axis]:+16.6f}{sigma:11.2f}   {_from(state, axis)}")
-    return "\n".join([*lines, *_left(state, target_mdps), *_drift(state), *_bound(state)])
+    if target_mdps is not None:
+        lines.append(_left(state, target_mdps))
+    if np.isfinite(state.sigma_dps).all():
+        drifts = zip(state.sigma_dps / MDPS * HEADING_DEG, AXES, strict=True)
+        listed = ", ".join(f"{drift:.2g}° about {name}" for drift, name in drifts)
+        lines.append(f"In one hour the heading drifts by {listed} (1 σ of the bias alone).")
+    bounds = [r.sentence for r in state.reasons if r.code == "rotation_bound"]
+    return "\n".join([*lines, *bounds])
+
+
+def notes(state: State) -> Iterator[str]:
+    """What should be known and the text does not say."""
+    for reason in state.reasons:
+        if reason.code not in _IN_TEXT:
+            yield f"{reason.axis}: {reason.sentence}" if reason.axis else reason.sentence
 
 
 def _from(state: State, axis: int) -> str:
     """What an axis's answer is made of."""
-    alone = state.own_sigma_dps[axis] / MDPS
     if state.history[axis] == USED:
-        return f"this log {alone:.2f}, history {state.history_sigma_dps[axis] / MDPS:.2f}"
+        own, past = state.own_sigma_dps[axis] / MDPS, state.history_sigma_dps[axis] / MDPS
+        return f"this log {own:.2f}, history {past:.2f}"
     if state.history[axis] == DROPPED:
-        why = (r.sentence for r in state.reasons if r.code == "conflict" and r.axis == AXES[axis])
-        return f"this log alone: {next(why, 'the history was dropped')}"
+        of_axis = (r for r in state.reasons if r.code == "conflict" and r.axis == AXES[axis])
+        return f"this log alone: {next(of_axis).sentence}"
     return "this log"
 
 
-def _left(state: State, target_mdps: float | None) -> list[str]:
+def _left(state: State, target_mdps: float) -> str:
     """How long it still takes."""
-    if target_mdps is None:
-        return []
-    parts = []
     floors = {r.axis: r.value for r in state.reasons if r.code == "floor"}
+    parts = []
     for name, seconds in zip(AXES, state.seconds_left, strict=True):
         if np.isinf(seconds) and floors.get(name):
             parts.append(
-                f"{name} does not reach {target_mdps:g} mdps: its floor is {floors[name]:.2g}"
+                f"{name} does not reach {target_mdps:g} mdps, below its floor of {floors[name]:.2g}"
             )
         elif np.isinf(seconds):
             parts.append(f"{name} does not reach {target_mdps:g} mdps within an hour")
@@ -86,24 +108,46 @@ def _left(state: State, target_mdps: float | None) -> list[str]:
             parts.append(
                 f"{name} needs {math.ceil(seconds):d} s more at rest for {target_mdps:g} mdps"
             )
-    return (
-        [f"{'; '.join(parts)}."] if parts else [f"The target of {target_mdps:g} mdps is reached."]
-    )
+    return f"{'; '.join(parts)}." if parts else f"The target of {target_mdps:g} mdps is reached."
 
 
-def _drift(state: State) -> list[str]:
-    """What the standard deviations mean for a heading."""
-    if not np.isfinite(state.sigma_dps).all():
-        return []
-    drifts = [
-        f"{s / MDPS * HEADING_DEG:.2g}° about {n}"
-        for s, n in zip(state.sigma_dps, AXES, strict=True)
-    ]
-    return [f"In one hour the heading drifts by {', '.join(drifts)} (1 σ of the bias alone)."]
+def planned(seconds: Array, floors_mdps: Array, target_mdps: float) -> Iterator[str]:
+    """A line an axis: the seconds that a target takes, or why it is not reached."""
+    same = f"{target_mdps:.3g} mdps ({target_mdps * HEADING_DEG:.3g}° of heading an hour)"
+    for name, needed, floor in zip(AXES, seconds, floors_mdps, strict=True):
+        if np.isfinite(needed):
+            yield f"{name}: {needed:.1f} s at rest for {same}"
+        elif floor > target_mdps:
+            yield f"{name}: not with this sensor: its floor is {floor:.2g} mdps"
+        else:
+            yield f"{name}: not within an hour"
 
 
-def _bound(state: State) -> list[str]:
-    return [r.sentence for r in state.reasons if r.code == "rotation_bound"]
+def device_row(row: Mapping[str, Any]) -> str:
+    """A line of the list of devices."""
+    return f"{row['device']:<24} {row['type'] or '-':<12} {row['calibrations']:>4}"
+
+
+def device_table(
+    lines: Sequence[Mapping[str, Any]], counting: Collection[str], model: Mapping[str, Any] | None
+) -> Iterator[str]:
+    """The history of a device, and what is derived from it."""
+    yield f"{'source':<24}{'rest':>8}{'s':>8}  {'bias, deg/s':^36}{'σ, mdps':^20}  history"
+    for line in lines:
+        if line["event"] == "note":
+            yield f"note: {line['text']}"
+        elif line["event"] == "calibration":
+            head = f"{line['source'][:23]:<24}{line['rest']:>8}{line['seconds']:8.1f}"
+            mean = "".join(f"{m:+12.6f}" for m in line["mean_dps"] or [])
+            sigma = "".join(f"{v**0.5 / MDPS:7.2f}" for v in line["variance_dps2"] or [])
+            out = "" if line["hash"] in counting else "  (does not count)"
+            yield f"{head}{mean}{sigma}  {'/'.join(line['outcome'])}{out}"
+    for name, fitted, noise in zip(AXES, *(model or {"a": [], "n": []}).values(), strict=False):
+        figures = ", ".join(
+            f"{key} {value:.3g} ± {sigma:.2g}" for key, (value, sigma) in fitted.items()
+        )
+        known = "not known" if noise is None else f"{noise:.3g} mdps·√s"
+        yield f"{name}: noise {known}; {figures} (mdps, √day, °C)"
 
 
 def plot(path: Path, states: Sequence[State], target_mdps: float | None) -> None:
@@ -113,39 +157,43 @@ def plot(path: Path, states: Sequence[State], target_mdps: float | None) -> None
         path: Of the picture; its ending says of which kind.
         states: One a second or so, the last one finished.
         target_mdps: To mark the stop.
-    """
-    from matplotlib.figure import Figure  # noqa: PLC0415 - the extra [plot]
 
+    Raises:
+        InputError: matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure  # noqa: PLC0415 - the extra [plot]
+    except ImportError as error:
+        text = "--plot needs matplotlib: pip install 'gyro-pipeline[plot]'"
+        raise InputError(text) from error
     figure = Figure(figsize=(8, 7), layout="constrained")
-    axes = figure.subplots(3, 1, sharex=True)
-    last, times = states[-1], np.array([state.time_s for state in states])
-    for axis, (name, ax) in enumerate(zip(AXES, axes, strict=True)):
-        centre = last.bias_dps[axis]
-        bias = np.array([state.bias_dps[axis] - centre for state in states]) / MDPS
-        band = 1.96 * np.array([state.sigma_dps[axis] for state in states]) / MDPS
-        ax.fill_between(times, bias - band, bias + band, alpha=0.25, label="95 %")
-        ax.plot(times, bias, label="estimate")
-        if last.history[axis] != "none":
-            past, width = (
-                (last.history_dps[axis] - centre) / MDPS,
-                last.history_sigma_dps[axis] / MDPS,
-            )
-            ax.axhspan(
-                past - 1.96 * width,
-                past + 1.96 * width,
-                color="C1",
-                alpha=0.2,
-                label="history, 95 %",
-            )
-        for reason in last.reasons:
-            if reason.code == "cut" and reason.value is not None:
-                ax.axvline(reason.value, color="C3", label="cut")
+    panels = figure.subplots(3, 1, sharex=True)
+    for axis, panel in enumerate(panels):
+        _draw(panel, states, axis)
         stop = next((state.time_s for state in states if state.done), None)
-        if target_mdps and stop is not None:
-            ax.axvline(stop, color="C2", linestyle="--", label=f"{target_mdps:g} mdps reached")
-        usual = np.median(band[np.isfinite(band)]) if np.isfinite(band).any() else 1.0
-        ax.set_ylim(-5 * usual, 5 * usual)
-        ax.set_ylabel(f"{name}, mdps about {centre:+.5f} deg/s")
-    axes[0].legend(loc="upper right", fontsize="small")
-    axes[-1].set_xlabel("time, s")
+        if target_mdps is not None and stop is not None:
+            label = f"{target_mdps:g} mdps reached"
+            panel.axvline(stop, color="C2", linestyle="--", label=label)
+    panels[0].legend(loc="upper right", fontsize="small")
+    panels[-1].set_xlabel("time, s")
     figure.savefig(path)
+
+
+def _draw(panel: Any, states: Sequence[State], axis: int) -> None:
+    """One axis, in mdps about its last estimate."""
+    last, times = states[-1], [state.time_s for state in states]
+    centre = last.bias_dps[axis]
+    bias = np.array([state.bias_dps[axis] - centre for state in states]) / MDPS
+    band = 1.96 * np.array([state.sigma_dps[axis] for state in states]) / MDPS
+    panel.fill_between(times, bias - band, bias + band, alpha=0.25, label="95 %")
+    panel.plot(times, bias, label="estimate")
+    if last.history[axis] != NONE:
+        past, width = last.history_dps[axis] - centre, 1.96 * last.history_sigma_dps[axis]
+        low, high = (past - width) / MDPS, (past + width) / MDPS
+        panel.axhspan(low, high, color="C1", alpha=0.2, label="history, 95 %")
+    for reason in last.reasons:
+        if reason.code == "cut":
+            panel.axvline(reason.value, color="C3", label="cut")
+    usual = np.median(band[np.isfinite(band)]) if np.isfinite(band).any() else 1.0
+    panel.set_ylim(-5 * usual, 5 * usual)
+    panel.set_ylabel(f"{AXES[axis]}, mdps about {centre:+.5f} deg/s")

@@ -14,7 +14,7 @@ import os
 import re
 import shutil
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,9 +23,10 @@ from typing import Any
 import numpy as np
 from filelock import FileLock, Timeout
 
+from gyro_pipeline.calibrator.calibrator import Calibrator
 from gyro_pipeline.calibrator.device_types import DeviceType, read_type
-from gyro_pipeline.calibrator.history import Calibration, Circumstances, Prior
-from gyro_pipeline.calibrator.state import State
+from gyro_pipeline.calibrator.history import Calibration, Circumstances
+from gyro_pipeline.calibrator.state import STILL, State
 from gyro_pipeline.conventions import MDPS, InputError
 
 VARIABLE = "GYRO_CALIBRATE_REGISTRY"
@@ -36,6 +37,10 @@ DAY_S = 86400.0
 
 _NAME = re.compile(r"[\w][\w.-]{0,63}")
 _LOCK_S = 10.0
+_TEMPLATE = """# mounted = true     # the heading repeats at each calibration
+# latitude = 32.1    # degrees
+# notes = ""
+"""
 _KEYS = {"type", "mounted", "latitude", "frame", "notes"}
 
 
@@ -113,6 +118,7 @@ class Device:
         self.name, self.folder = name, registry / name
         self.lines_path = self.folder / "calibrations.jsonl"
         self.settings_path = self.folder / "device.toml"
+        self.model_path = self.folder / "model.json"
 
     def settings(self) -> dict[str, Any]:
         """What ``device.toml`` says; nothing where there is none."""
@@ -121,14 +127,12 @@ class Device:
         except FileNotFoundError:
             return {}
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise InputError(
-                f"{self.settings_path}: expected TOML, but: {error}; correct it"
-            ) from error
+            text = f"{self.settings_path}: expected TOML, but: {error}; correct it"
+            raise InputError(text) from error
         if extra := set(said) - _KEYS:
             expected = ", ".join(sorted(_KEYS))
-            raise InputError(
-                f"{self.settings_path}: expected {expected}, got {sorted(extra)}; correct it"
-            )
+            text = f"{self.settings_path}: expected {expected}, got {sorted(extra)}; correct it"
+            raise InputError(text)
         return said
 
     def lines(self) -> list[dict[str, Any]]:
@@ -142,7 +146,7 @@ class Device:
 
     def calibrations(self) -> list[dict[str, Any]]:
         """Those that count: at rest, and not withdrawn since."""
-        return [line for line in self._kept().values() if line["rest"] == "still"]
+        return [line for line in self._kept().values() if line["rest"] == STILL]
 
     def _kept(self) -> dict[str, dict[str, Any]]:
         """All that are not withdrawn, by their hashes."""
@@ -153,15 +157,6 @@ class Device:
             elif line["event"] == "forget":
                 kept.pop(line["of"], None)
         return kept
-
-    def check_writable(self) -> None:
-        """Say before anything is measured if nothing can be stored.
-
-        Raises:
-            RegistryError: With the reason.
-        """
-        with self._locked(), open(self.lines_path, "ab"):
-            pass
 
     def append(self, line: Mapping[str, Any]) -> bool:
         """Write a line, synced; not if there is a calibration of the same hash.
@@ -179,33 +174,55 @@ class Device:
             _append(self.lines_path, data)
         return True
 
-    def write_model(self, prior: Prior, noise_mdps: list[float | None]) -> None:
-        """Replace ``model.json``, which people and other programs read, by what is known now."""
+    def write_model(self, calibrator: Calibrator) -> None:
+        """Replace ``model.json``, for people and other programs, by what is known now."""
+        noise = np.sqrt(calibrator.scale) * calibrator.kind.noise.white / MDPS
         axes = [
-            {
-                key: [round(value / MDPS, 4), round(sigma / MDPS, 4)]
-                for key, (value, sigma) in axis.items()
-            }
-            for axis in prior.fitted
+            {key: [value / MDPS, sigma / MDPS] for key, (value, sigma) in axis.items()}
+            for axis in calibrator.prior.fitted
         ]
-        units = "mdps, mdps a square root of a day, mdps a degree; each with its standard deviation"
-        model = {"schema": SCHEMA, "units": units, "noise_mdps_rts": noise_mdps, "axes": axes}
+        known = np.where(calibrator.freedom > 0, noise, np.nan)
+        model = {
+            "axes": axes,
+            "noise_mdps_rts": [None if np.isnan(n) else n for n in known.tolist()],
+        }
         with self._locked():
-            temporary = self.folder / "model.json.new"
+            temporary = self.model_path.with_suffix(".new")
             temporary.write_text(json.dumps(model, indent=1) + "\n", "utf-8")
-            os.replace(temporary, self.folder / "model.json")
+            os.replace(temporary, self.model_path)
 
-    def create(self, device_type: str | None) -> None:
-        """Start ``device.toml`` for people to go on with, where there is none."""
-        if self.settings_path.exists():
-            return
+    def model(self) -> dict[str, Any] | None:
+        """What ``model.json`` holds, if it is there."""
+        return json.loads(self.model_path.read_text("utf-8")) if self.model_path.exists() else None
+
+    def create(self, device_type: str | None = None, settings: str = "") -> None:
+        """Make the folder and the file for people, where they are not there.
+
+        Raises:
+            RegistryError: Nothing can be written; this is said before anything is measured.
+        """
         kind = f'type = "{device_type}"' if device_type else '# type = "consumer"'
-        text = (
-            f"{kind}\n# mounted = true     # the heading repeats at each calibration\n"
-            '# latitude = 32.1    # degrees\n# notes = ""\n'
-        )
-        with self._locked():
-            self.settings_path.write_text(text, "utf-8")
+        with self._locked(), open(self.lines_path, "ab"):
+            if not self.settings_path.exists():
+                self.settings_path.write_text(settings or f"{kind}\n{_TEMPLATE}", "utf-8")
+
+    def content(self) -> dict[str, Any]:
+        """All of it, for one file."""
+        settings = self.settings_path.read_text("utf-8") if self.settings_path.exists() else ""
+        return {
+            "schema": SCHEMA,
+            "device": self.name,
+            "device_toml": settings,
+            "lines": self.lines(),
+        }
+
+    def restore(self, lines: Sequence[Mapping[str, Any]], settings: str) -> None:
+        """Add what such a file holds and is not there yet."""
+        self.create(settings=settings)
+        there = self.lines()
+        for line in lines:
+            if line not in there:
+                self.append(line)
 
     def remove(self) -> None:
         """Remove the folder and all that is in it."""
@@ -267,16 +284,16 @@ def _evidence(line: Mapping[str, Any]) -> Calibration:
 def line_of(
     evidence: Calibration, state: State, source: Mapping[str, Any], range_c: tuple[float, float]
 ) -> dict[str, Any]:
-    """The line of a calibration.
+    """The line of a calibration, or of an attempt.
 
     Args:
         evidence: Its own data's word.
         state: Its answer.
-        source: ``hash``, ``time`` (POSIX), ``since_power_on_s``, ``name`` and ``version``.
+        source: ``hash``, ``time`` (POSIX), ``source`` and what else is to be kept of it.
         range_c: The least and the most temperature.
     """
-    warmth = evidence.temperature_c
-    usable = state.rest == "still" and bool(np.isfinite(evidence.variance).all())
+    usable = state.rest == STILL and bool(np.isfinite(evidence.variance).all())
+    warmth, up, noise = evidence.temperature_c, evidence.up, evidence.noise
     return {
         "event": "calibration",
         **source,
@@ -284,11 +301,11 @@ def line_of(
         "mean_dps": evidence.mean.tolist() if usable else None,
         "variance_dps2": evidence.variance.tolist() if usable else None,
         "temperature_c": None if warmth is None else [warmth, *range_c],
-        "gravity": None if evidence.up is None else evidence.up.tolist(),
+        "gravity": None if up is None else up.tolist(),
         "rest": state.rest,
         "outcome": list(evidence.outcome),
-        "noise_mdps_rts": (evidence.noise / MDPS).tolist()
-        if evidence.freedom and evidence.noise is not None
+        "noise_mdps_rts": (noise / MDPS).tolist()
+        if noise is not None and evidence.freedom
         else None,
         "noise_freedom": evidence.freedom,
         "reasons": [reason.sentence for reason in state.reasons],
@@ -297,11 +314,5 @@ def line_of(
 
 def devices(registry: Path) -> list[Device]:
     """All devices of a registry, by name."""
-    if not registry.is_dir():
-        return []
-    names = sorted(
-        path.name
-        for path in registry.iterdir()
-        if (path / "device.toml").exists() or (path / "calibrations.jsonl").exists()
-    )
-    return [Device(registry, name) for name in names]
+    folders = sorted(registry.iterdir()) if registry.is_dir() else []
+    return [Device(registry, path.name) for path in folders if (path / "device.toml").exists()]

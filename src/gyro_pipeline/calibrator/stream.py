@@ -1,10 +1,11 @@
-"""Samples from a pipe or a serial port, line by line: CSV with a header, or a JSON object a line."""
+"""Samples from a pipe or a serial port, line by line: CSV, or one JSON object a line."""
 
 import json
 import os
 import select
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -15,38 +16,46 @@ from gyro_pipeline.conventions import InputError
 _FIRST = 20  # lines that columns, units and the rate are told from
 _CHUNK = 1 << 16
 
-
-@dataclass
-class Samples:
-    """Some samples: times (n,) or None, rates (n, 3) in deg/s, accelerations, temperatures."""
-
-    time_s: NDArray[np.float64] | None
-    gyro_dps: NDArray[np.float64]
-    accel_g: NDArray[np.float64] | None
-    temperature_c: NDArray[np.float64] | None
+Samples = tuple[Any, Any, Any, Any]
+"""Times (n,), rates (n, 3) in deg/s, accelerations (n, 3) in g, temperatures (n,), or None each."""
 
 
-class Silence(Exception):
-    """Nothing came for too long."""
-
-
-def lines_of(descriptor: int, timeout_s: float) -> Iterator[list[str]]:
-    """Whole lines as they come, some at a time.
+@contextmanager
+def source(port: str | None, baud: int) -> Iterator[int]:
+    """The descriptor of a serial port, or of standard input.
 
     Raises:
-        Silence: Nothing came within the timeout.
+        InputError: The port cannot be opened.
     """
+    if port is None:
+        yield sys.stdin.fileno()
+        return
+    try:
+        import serial  # noqa: PLC0415 - the extra [serial]
+    except ImportError as error:
+        text = "--port needs pyserial: pip install 'gyro-pipeline[serial]'"
+        raise InputError(text) from error
+    try:
+        with serial.Serial(port, baud) as opened:
+            yield int(opened.fileno())
+    except serial.SerialException as error:
+        raise InputError(
+            f"--port {port}: {error}; check its name, and who else reads it"
+        ) from error
+
+
+def lines_of(descriptor: int, timeout_s: float, say: Callable[[str], None]) -> Iterator[list[str]]:
+    """Whole lines, some at a time as they come; silence ends them, and is said."""
     left = b""
     while True:
         if not select.select([descriptor], [], [], timeout_s)[0]:
-            raise Silence
+            say(f"nothing came for {timeout_s:g} s; this is what there is")
+            return
         data = os.read(descriptor, _CHUNK)
-        parts = (left + data).split(b"\n")
-        left = parts.pop()
-        if not data and left:
-            parts.append(left)
-        if parts:
-            yield [part.decode("utf-8", "replace").strip() for part in parts]
+        *whole, left = (left + data).split(b"\n")
+        if not data:
+            whole.append(left)
+        yield [line.decode("utf-8", "replace").strip() for line in whole if line.strip()]
         if not data:
             return
 
@@ -55,140 +64,124 @@ class Parser:
     """Finds the columns in the first lines, as the readers of files do, then reads on.
 
     Args:
-        options: Options of the readers.
-        rate_hz: Samples per second, where the option says so.
+        options: Of the readers.
+        rate_hz: Samples per second; None: as the times say.
     """
 
     def __init__(self, options: Any, rate_hz: float | None) -> None:
         self.options, self.rate_hz, self.bad = options, rate_hz, 0
         self._names: list[str] = []
-        self._waiting: list[str] = []
-        self._json = False
-        self._separator = ","
-        self._columns: dict[str, tuple[list[int], float, float]] = {}
+        self._separator = ""  # of JSON there is none
+        self._parts: list[tuple[list[int], float, float]] = []  # columns, factor, offset
 
-    def feed(self, lines: Sequence[str], ended: bool = False) -> Samples | None:
-        """Take lines; nothing comes back until there are enough to tell the columns from.
+    def seconds(self, lines: Iterable[Sequence[str]]) -> Iterator[Samples]:
+        """Samples of a second at most at a time.
 
         Raises:
-            InputError: The columns or the rate cannot be told; says which option is lacking.
+            InputError: Columns, units or rate cannot be told; says which option is lacking.
         """
-        self._waiting += [line for line in lines if line]
-        if not self._columns:
-            if len(self._waiting) <= _FIRST and not ended:
-                return None
-            self._start()
-        rows = [self._row(line) for line in self._waiting]
-        self._waiting = []
-        table = np.array([row for row in rows if row is not None], np.float64)
-        if not len(table):
-            return None
-        parts = {
-            name: self._part(table, name)
-            for name in ("time", "rate", "acceleration", "temperature")
-        }
-        time_s, warmth = parts["time"], parts["temperature"]
-        rates = parts["rate"]
-        if rates is None:
-            return None
-        return Samples(
-            None if time_s is None else time_s[:, 0], rates, parts["acceleration"],
-            None if warmth is None else warmth[:, 0],
-        )  # fmt: skip
+        waiting: list[str] = []
+        for some in _and_last(lines):
+            waiting += some or []
+            if not self._parts and waiting and (some is None or len(waiting) > _FIRST):
+                waiting = waiting[self._start(waiting) :]
+            if not self._parts:
+                continue
+            rows = [row for row in map(self._row, waiting) if row]
+            waiting, step = [], max(round(self.rate_hz or 1), 1)
+            for first in range(0, len(rows), step):
+                yield self._samples(np.array(rows[first : first + step]))
 
-    def _part(self, table: NDArray[np.float64], name: str) -> NDArray[np.float64] | None:
-        numbers, factor, offset = self._columns[name]
-        return table[:, numbers] * factor + offset if numbers else None
+    def _samples(self, table: NDArray[np.float64]) -> Samples:
+        time_s, rates, accel, warmth = (
+            table[:, columns] * factor + offset if columns else None
+            for columns, factor, offset in self._parts
+        )
+        one, other = (None if x is None else x[:, 0] for x in (time_s, warmth))
+        return one, rates, accel, other
 
-    def _start(self) -> None:
-        """Tell the names, the columns, their units and the rate from the first lines."""
+    def _start(self, lines: Sequence[str]) -> int:
+        """Tell columns, units and rate from the first lines; returns how many are a header."""
         from gyro_pipeline.readers.beside import acceleration_of, temperature_of  # noqa: PLC0415
         from gyro_pipeline.readers.columns import rate_columns  # noqa: PLC0415
         from gyro_pipeline.readers.file import File  # noqa: PLC0415
         from gyro_pipeline.readers.scales import scale_of  # noqa: PLC0415
         from gyro_pipeline.readers.table import Table  # noqa: PLC0415
 
-        if not self._waiting:
-            raise InputError("standard input: expected lines of samples, got none")
-        self._tell_names()
-        rows = [row for row in map(self._row, self._waiting) if row is not None]
+        header = self._tell_names(lines[0])
+        rows = [row for row in map(self._row, lines[header:]) if row]
         if not rows:
-            first = self._waiting[0][:60]
-            raise InputError(
-                f"standard input: expected numbers in rows of {len(self._names)} columns, got {first!r}"
-            )
-        columns = tuple(np.array(rows, np.float64).T)
-        file = File(Table("standard input", tuple(self._names), columns), self.options)
-        numbers = list(rate_columns(file, None))
-        scale, _ = scale_of(file, numbers)
+            text = f"expected numbers in {len(self._names)} columns, got {lines[-1][:60]!r}"
+            raise InputError(f"stream: {text}; correct what sends them")
+        columns = tuple(np.array(rows).T)
+        file = File(Table("stream", tuple(self._names), columns), self.options)
+        rates = list(rate_columns(file, None))
+        scale, _ = scale_of(file, rates)
         file.settle()
-        zero = -(self.options.offset or 0.0) * scale
-        self._columns = {"rate": (numbers, scale, zero), "time": self._times(file)}
-        for name, (found, unit) in (
-            ("acceleration", acceleration_of(file, numbers)),
-            ("temperature", temperature_of(file)),
-        ):
-            self._columns[name] = list(found), unit.factor, unit.offset
+        self._parts = [_times(file), (rates, scale, -(self.options.offset or 0.0) * scale)]
+        for found, unit in (acceleration_of(file, rates), temperature_of(file)):
+            self._parts.append((list(found), unit.factor, unit.offset))
         self._tell_rate(columns)
+        self.bad = 0
+        return header
 
-    def _tell_names(self) -> None:
-        first = self._waiting[0]
-        self._json = first.startswith("{")
-        if self._json:
+    def _tell_names(self, first: str) -> int:
+        if first.startswith("{"):
             self._names = list(json.loads(first))
-            return
+            return 0
         self._separator = next((mark for mark in ",;\t" if mark in first), " ")
         cells = [cell.strip() for cell in first.split(self._separator)]
-        if any(_number(cell) is None for cell in cells if cell):
-            self._names = cells
-            self._waiting.pop(0)
-        else:
-            self._names = [""] * len(cells)
+        header = any(np.isnan(_number(cell)) for cell in cells if cell)
+        self._names = cells if header else [""] * len(cells)
+        return int(header)
 
     def _row(self, line: str) -> list[float] | None:
         """Numbers of a line, NaN for what is none; None for a line of another shape."""
-        if self._json:
+        cells: list[Any] = line.split(self._separator) if self._separator else []
+        if not self._separator:
             try:
                 content = json.loads(line)
-                cells = [content.get(name) for name in self._names]
-            except (ValueError, AttributeError):
-                self.bad += 1
-                return None
-        else:
-            cells = line.split(self._separator)
+                cells = [content[name] for name in self._names]
+            except (ValueError, TypeError, KeyError):
+                cells = []
         if len(cells) != len(self._names):
             self.bad += 1
             return None
-        values = [_number(cell) for cell in cells]
-        return [np.nan if value is None else value for value in values]
-
-    def _times(self, file: Any) -> tuple[list[int], float, float]:
-        """The column of time: the option's, or the first that is named so and has a unit."""
-        from gyro_pipeline.readers.stamps import _candidates, _options_s  # noqa: PLC0415
-
-        for number, unit_s, _ in _candidates(file):
-            if (seconds := _options_s(file) or unit_s) is not None:
-                return [number], seconds, 0.0
-        return [], 1.0, 0.0
+        return [_number(cell) for cell in cells]
 
     def _tell_rate(self, columns: Sequence[NDArray[np.float64]]) -> None:
-        """The rate of the option, or of the first lines' times."""
-        numbers, unit_s, _ = self._columns["time"]
-        if self.rate_hz is not None:
-            return
-        if not numbers:
-            raise InputError(
-                "standard input: expected a column of times with a unit, or the rate, got neither; "
-                "give --rate, or --time-column and --time-units"
-            )
-        step = float(np.median(np.diff(columns[numbers[0]]))) * unit_s
-        if not step > 0:
-            raise InputError("standard input: expected times that increase; give --rate")
-        self.rate_hz = float(f"{1 / step:.4g}")
+        """The rate of the first lines' times, where no option says it."""
+        (numbers, unit_s, _), step = self._parts[0], 0.0
+        if self.rate_hz is None and numbers:
+            step = float(np.nanmedian(np.diff(columns[numbers[0]]))) * unit_s
+        if self.rate_hz is None and not step > 0:
+            text = "expected times that increase, in a column with a unit, or the rate, got neither"
+            raise InputError(f"stream: {text}; give --rate, or --time-column and --time-units")
+        self.rate_hz = self.rate_hz or float(f"{1 / step:.4g}")
 
 
-def _number(cell: Any) -> float | None:
+def _and_last(lines: Iterable[Sequence[str]]) -> Iterator[Sequence[str] | None]:
+    """Lines, and None after the last."""
+    yield from lines
+    yield None
+
+
+def _times(file: Any) -> tuple[list[int], float, float]:
+    """The column of times: the option's, or the first of such a name, if its unit is known."""
+    from gyro_pipeline.readers.stamps import names_time  # noqa: PLC0415
+    from gyro_pipeline.units import read_unit  # noqa: PLC0415
+
+    column, given = file.options.time_column, file.options.time_units
+    named = [number for number, header in enumerate(file.headers) if names_time(header)]
+    for number in named if column is None else [file.find(column)]:
+        unit = read_unit(given) if isinstance(given, str) else file.headers[number].unit
+        if isinstance(given, float) or (unit and unit.quantity == "time"):
+            return [number], given if isinstance(given, float) else unit.factor, 0.0
+    return [], 1.0, 0.0
+
+
+def _number(cell: Any) -> float:
     try:
         return float(cell)
     except (TypeError, ValueError):
-        return None
+        return np.nan

@@ -255,10 +255,10 @@ class Stretch:
         alone = own(filters)
         variance = alone.start_variance * _factor(*self._noise_of(alone))
         seen = _with_history(alone.start, variance, prior, usable)
-        wrong = np.flatnonzero(np.asarray(seen.log_e) > np.log(CONFLICT))
-        if not wrong.size:
+        wrong: Mask = np.asarray(seen.log_e) > np.log(CONFLICT)
+        if not wrong.any():
             return len(filters), np.zeros(3, bool), seen.log_ratio
-        row = int(wrong[0])
+        row = int(wrong.argmax())
         return row + 1, usable & (seen.log_ratio[row] > 0), seen.log_ratio
 
     def _leave_out(self, part: Blocks, filters: list[Filter], row: int) -> None:

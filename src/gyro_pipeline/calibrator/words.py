@@ -172,9 +172,7 @@ def _of_temperature(stretch: Stretch) -> Iterator[Reason]:
 
 
 def _of_rotation(stretch: Stretch) -> Iterator[Reason]:
-    """The bound of a rotation that nothing sees: about the vertical, or any axis where no
-    acceleration is measured.
-    """
+    """The bound of a rotation that nothing sees, about the vertical where there is gravity."""
     if not stretch.blocks:
         return
     up, usable = stretch.up, stretch.usable
