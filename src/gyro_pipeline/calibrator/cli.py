@@ -19,7 +19,7 @@ from typing import Any
 import click
 import numpy as np
 
-from gyro_pipeline import __version__
+import gyro_pipeline
 from gyro_pipeline.calibrator import output, registry
 from gyro_pipeline.calibrator.calibrator import BLOCK_S, Calibrator
 from gyro_pipeline.calibrator.device_types import names
@@ -129,8 +129,10 @@ def _reader_options(given: dict[str, Any]) -> Any:
         return ReaderOptions(**given)
     except ValidationError as error:
         first = error.errors()[0]
-        where = f"{_flag(str(first['loc'][0]))}: " if first["loc"] else ""
-        raise InputError(where + first["msg"].removeprefix("Value error, ")) from error
+        text = first["msg"].removeprefix("Value error, ")
+        name, _, what = text.partition(": ")
+        name, what = (str(first["loc"][0]), text) if first["loc"] else (name, what)
+        raise InputError(f"{_flag(name)}: {what}") from error
 
 
 def _in_options(message: str) -> str:
@@ -140,7 +142,7 @@ def _in_options(message: str) -> str:
 
     if IN_READER not in message:
         return message
-    said, _, advice = message.replace(f" {IN_READER}", "").rpartition("; ")
+    said, _, advice = message.replace(f" {IN_READER}", "").partition("; ")
     for name in sorted(ReaderOptions.model_fields, key=len, reverse=True):
         advice = re.sub(rf"(?<![\w-])`?{name}\b(?!-):?`?", _flag(name), advice)
     return f"{said}; {advice}"
@@ -167,7 +169,7 @@ class Commands(click.Group):
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(__version__)
+@click.version_option(gyro_pipeline.__version__)
 def main() -> None:
     """Calibrate a gyroscope at rest: its bias, a standard deviation, the seconds still needed."""
 
@@ -187,8 +189,9 @@ def _log(path: Path, options: Options) -> int:
     from gyro_pipeline.readers.table import IN_READER  # noqa: PLC0415
 
     device, source = options.folder(), hashlib.sha256(path.read_bytes()).hexdigest()
+    reader_options = _reader_options(options.reader)
     try:
-        recording = read_log(path, _reader_options(options.reader), options.rate)
+        recording = read_log(path, reader_options, options.rate)
     except InputError as error:
         _say(_in_options(str(error)), "red")
         return USAGE if IN_READER in str(error) else UNUSABLE
@@ -254,7 +257,7 @@ def _report(  # noqa: PLR0917 - what an answer is made of
     if device is not None and options.store and code != UNUSABLE:
         said = {
             "hash": source, "source": name, "time": _posix(options.started_at),
-            "since_power_on_s": options.since_power_on, "version": __version__,
+            "since_power_on_s": options.since_power_on, "version": gyro_pipeline.__version__,
             "same_heading": calibrator.now.same_heading, "known_still": options.known_still,
         }  # fmt: skip
         if device.append(registry.line_of(evidence, state, said, calibrator.temperature_range)):

@@ -124,7 +124,7 @@ class Device:
         """What ``device.toml`` says; nothing where there is none."""
         try:
             said = tomllib.loads(self.settings_path.read_text("utf-8"))
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return {}
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             text = f"{self.settings_path}: expected TOML, but: {error}; correct it"
@@ -139,7 +139,7 @@ class Device:
         """All whole lines of its history, the oldest first."""
         try:
             content = self.lines_path.read_bytes()
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return []
         parsed = (_parsed(line) for line in content.split(b"\n"))
         return [line for line in parsed if line is not None]

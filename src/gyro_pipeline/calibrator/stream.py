@@ -174,9 +174,11 @@ def _times(file: Any) -> tuple[list[int], float, float]:
     column, given = file.options.time_column, file.options.time_units
     named = [number for number, header in enumerate(file.headers) if names_time(header)]
     for number in named if column is None else [file.find(column)]:
-        unit = read_unit(given) if isinstance(given, str) else file.headers[number].unit
-        if isinstance(given, float) or (unit and unit.quantity == "time"):
-            return [number], given if isinstance(given, float) else unit.factor, 0.0
+        if isinstance(given, float):
+            return [number], given, 0.0
+        unit = read_unit(given) if given else file.headers[number].unit
+        if unit is not None and unit.quantity == "time":
+            return [number], unit.factor, 0.0
     return [], 1.0, 0.0
 
 

@@ -217,7 +217,7 @@ class Stretch:
         count, against, log_ratio = self._conflict(filters)
         filters, part = filters[:count], part.rows(0, count)
         known = np.isfinite(part.temperature)[:, None]
-        felt = np.isfinite(part.gravity).all(axis=1)[:, None]
+        felt = np.isfinite(part.gravity).all(axis=1, keepdims=True)
         warmth = np.where(known, part.temperature[:, None], 0)
         rows = np.hstack([part.variances, np.where(felt, part.gravity, 0), felt, warmth, known])
         sums = np.add.accumulate(np.vstack([self.taken.sums, rows]))
@@ -255,11 +255,11 @@ class Stretch:
         alone = own(filters)
         variance = alone.start_variance * _factor(*self._noise_of(alone))
         seen = _with_history(alone.start, variance, prior, usable)
-        wrong: Mask = np.asarray(seen.log_e) > np.log(CONFLICT)
-        if not wrong.any():
+        wrong = np.flatnonzero(seen.log_e > np.log(CONFLICT))
+        if not wrong.size:
             return len(filters), np.zeros(3, bool), seen.log_ratio
-        row = int(wrong.argmax())
-        return row + 1, usable & (seen.log_ratio[row] > 0), seen.log_ratio
+        row = int(wrong[0])
+        return row + 1, usable & np.greater(seen.log_ratio[row], 0), seen.log_ratio
 
     def _leave_out(self, part: Blocks, filters: list[Filter], row: int) -> None:
         """Leave out a block of motion and the one before it."""

@@ -83,7 +83,8 @@ def reasons_of(facts: Facts, stretch: Stretch, target_dps: float | None) -> tupl
 def _of_rest(facts: Facts, stretch: Stretch) -> Iterator[Reason]:
     for start in stretch.motions:
         yield Reason("cut", f"a motion at {start:.1f} s was cut", None, start)
-    for at, alarm in facts.ended:
+    last = {alarm.code: (at, alarm) for at, alarm in facts.ended}
+    for at, alarm in last.values():
         if alarm.code == "rotation":
             rate, sigma = alarm.value / MDPS, alarm.sigma / MDPS
             text = f"the accelerometer sees a rotation of {rate:.2g} mdps (σ {sigma:.2g}) about a "
