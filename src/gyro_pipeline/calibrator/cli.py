@@ -111,11 +111,16 @@ def _typed(name: str, text: str) -> Any:
     def column(part: str) -> str | int:
         return int(part) if part.strip().isdigit() else part.strip()
 
+    def number(part: str) -> str | float:
+        return float(part) if re.fullmatch(r"[-+.\deE]*\d[-+.\deE]*", part) else part
+
     if name in _TRIPLES:
         return tuple(map(column, text.split(",")))
     if name == "rows":
         pairs = (part.partition("=") for part in text.split(","))
-        return {column(key): value for key, _, value in pairs}
+        return {column(key): number(value) for key, _, value in pairs}
+    if name == "time_units":
+        return number(text)
     return column(text) if name.endswith("_column") else text
 
 
