@@ -83,6 +83,17 @@ class Setting:
     known_still: bool = False
 
 
+class Known(NamedTuple):
+    """What follows from the blocks taken so far, (3,) each."""
+
+    alone: Own  # with N as of the type
+    own: Own  # with N as known
+    scale: Array  # N^2 over that of the type
+    freedom: Array  # degrees of freedom of that
+    bias: Array
+    variance: Array
+
+
 class Stretch:
     """What is known from blocks at rest in one attitude.
 
@@ -101,7 +112,7 @@ class Stretch:
         self.taken = Taken(empty, prior, np.nan, True, none, zeros(3), zeros(9), no_range)
         self._before: Taken | None = None  # the last block
         self._last_mean = np.zeros(3)  # of that block
-        self._looked: tuple[Taken, tuple[Array, Array, Own]] | None = None
+        self._worked_out: tuple[Taken, Known] | None = None
         self.moving = 0  # blocks of motion that just came
         self._turned = np.zeros(3)  # deg, over them
         self.motions: list[float] = []  # when each started, seconds since the first sample
@@ -179,7 +190,7 @@ class Stretch:
             innovations / np.sqrt(self.scale), white * np.sqrt(self.scale), part
         )
         if alarm is None and self.moving and self.blocks >= _REFERENCE:
-            limit = self.kind.least_change + 6 * np.sqrt(self.noise()[0]) * white
+            limit = self.kind.least_change + 6 * np.sqrt(self.noise_scale()) * white
             if np.any(np.abs(innovations[0]) * white > limit):
                 return Alarm(0, BRIEF, "motion")
         return alarm
@@ -301,32 +312,41 @@ class Stretch:
         freedom = self.freedom + alone.freedom
         return (self.freedom * self.scale + alone.squares) / np.maximum(freedom, 1e-9), freedom
 
-    def _look(self) -> tuple[Array, Array, Own]:
-        """N^2 over that of the type, its degrees of freedom, and the estimate, each (3,)."""
-        if self._looked is None or self._looked[0] is not self.taken:
+    @property
+    def _known(self) -> Known:
+        """What follows from the blocks taken so far, worked out once."""
+        if self._worked_out is None or self._worked_out[0] is not self.taken:
             alone = own([self.taken.filter])
             scale, freedom = (np.reshape(x, (-1, 3))[0] for x in self._noise_of(alone))
-            self._looked = self.taken, (scale, freedom, _scaled(alone.row(0), scale, freedom))
-        return self._looked[1]
-
-    def noise(self) -> tuple[Array, Array]:
-        """N^2 over that of the type, (3,), with this log's blocks, and its degrees of freedom."""
-        return self._look()[:2]
+            alone = alone.row(0)
+            scaled = _scaled(alone, scale, freedom)
+            answer = self._posterior(scaled, self.usable)
+            self._worked_out = self.taken, Known(alone, scaled, scale, freedom, *answer)
+        return self._worked_out[1]
 
     def log_noise(self) -> tuple[Array, float]:
         """N of this stretch alone, (3,), deg/s * sqrt(s), and its degrees of freedom."""
-        if self.blocks < 3:  # noqa: PLR2004 - a warm-up takes two
+        squares, freedom = self._known.alone.squares, float(self._known.alone.freedom[0])
+        if freedom < 1:
             return np.full(3, np.nan), 0.0
-        alone = own([self.taken.filter]).row(0)
-        noise = self.kind.noise.white * np.sqrt(alone.squares / alone.freedom)
-        return noise, float(alone.freedom[0])
+        return self.kind.noise.white * np.sqrt(squares / freedom), freedom
+
+    def noise_scale(self) -> Array:
+        """N^2 over that of the type, (3,), as known beforehand and by these blocks."""
+        return self._known.scale
 
     def own(self) -> Own:
         """The estimate by this stretch alone, with the noise as known, and Student's interval."""
-        return self._look()[2]
+        return self._known.own
+
+    def answer(self) -> tuple[Array, Array]:
+        """The bias and its variance, by the stretch and the history."""
+        return self._known.bias, self._known.variance
 
     def _posterior(self, alone: Own, usable: Mask) -> tuple[Array, Array]:
         """Bias and variance with the history where it is usable."""
+        if not usable.any():
+            return alone.bias, alone.variance
         prior = self.taken.prior
         at_start = _with_history(alone.start, alone.start_variance, prior, usable)
         unknown = np.isinf(alone.variance)
@@ -337,10 +357,6 @@ class Stretch:
         later = np.where(unknown, 0.0, rest) + alone.follows**2 * at_start.charged
         return bias, np.where(usable, later, alone.variance)
 
-    def answer(self) -> tuple[Array, Array]:
-        """The bias and its variance, by the stretch and the history."""
-        return self._posterior(self.own(), self.usable)
-
     @property
     def usable(self) -> Mask:
         """(3,), axes with a history that was not dropped."""
@@ -348,7 +364,7 @@ class Stretch:
 
     def hopeless(self, target_dps: float) -> Mask:
         """(3,), axes whose target is below the floor of the sensor, and that have no history."""
-        floor = self.kind.noise.floor_dps * np.sqrt(self.noise()[0])
+        floor = self.kind.noise.floor_dps * np.sqrt(self.noise_scale())
         return np.asarray((floor > target_dps) & ~self.usable)
 
     def reached(self, target_dps: float) -> Mask:
@@ -361,15 +377,15 @@ class Stretch:
         The variances of blocks to come do not depend on the data. What does, the distance from the
         history and the noise where it is not known, is taken as it is now.
         """
-        now, (scale, freedom), usable = self.own(), self.noise(), self.usable
+        known, usable = self._known, self.usable
         seen, hopeless = self.blocks > 0, self.hopeless(target_dps)
         left = np.where(self.reached(target_dps), 0.0, np.inf)
         following, done = self.taken.filter, 0
         while np.any(np.isinf(left) & ~hopeless) and done * self.block_s < most_s:
             filters = following.ahead(_AHEAD)
             following, number = filters[-1], done + 1 + np.arange(_AHEAD)[:, None]
-            later = _scaled(own(filters), scale, freedom + number)
-            start = now.start if seen else np.where(usable, self.taken.prior.mean, 0.0)
+            later = _scaled(own(filters), known.scale, known.freedom + number)
+            start = known.own.start if seen else np.where(usable, self.taken.prior.mean, 0.0)
             later = later._replace(start=np.broadcast_to(start, (_AHEAD, 3)))
             reached = self._posterior(later, usable)[1] <= target_dps**2
             first = np.where(reached.any(axis=0), done + 1 + reached.argmax(axis=0), np.inf)

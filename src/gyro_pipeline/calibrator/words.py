@@ -108,8 +108,8 @@ def _of_unit(stretch: Stretch) -> Iterator[Reason]:
     """Too little noise is no motion, and no alarm of the test of rest."""
     if stretch.blocks < _ENOUGH or not np.all(stretch.freedom > 0):
         return
-    known = np.sqrt(stretch.scale) * stretch.kind.noise.white
-    if reason := unit_reason(float(np.median(stretch.log_noise()[0] / known)), stretch.kind.name):
+    factors = stretch.log_noise()[0] / (np.sqrt(stretch.scale) * stretch.kind.noise.white)
+    if reason := unit_reason(sorted(factors.tolist())[1], stretch.kind.name):
         yield reason
 
 
@@ -131,7 +131,7 @@ def _of_noise(stretch: Stretch, target_dps: float | None) -> Iterator[Reason]:
     if unknown:
         text = "the colour of the noise is not known, and σ holds for white noise; give --type"
         yield Reason("colour", text)
-    floor = noise.floor_dps * np.sqrt(stretch.noise()[0])
+    floor = noise.floor_dps * np.sqrt(stretch.noise_scale())
     for axis in np.flatnonzero(floor > (target_dps or np.inf)):
         text = f"the target is below the floor of {floor[axis] / MDPS:.2g} mdps, which no longer "
         text += "average of this sensor goes below"
