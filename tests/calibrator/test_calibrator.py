@@ -262,3 +262,27 @@ def test_shipped_types_are_read_and_an_unknown_one_is_refused():
         assert read_type(name).noise_freedom > 0
     with pytest.raises(InputError, match="expected consumer, dot, memsense, got 'dott'"):
         read_type("dott")
+
+
+def test_a_temperature_that_moves_makes_the_bias_now_less_certain():
+    spread = type_of({"noise_mdps_rts": [3, 4, 5], "temperature_spread_mdps_per_c": 10}, "here")
+    samples, warmth = still(20), np.linspace(20, 24, 2000)
+    states = []
+    for kind in (KIND, spread):
+        calibrator = Calibrator(kind, RATE)
+        calibrator.update(None, samples, temperature_c=warmth)
+        states.append((calibrator.finish(), calibrator.evidence()))
+    (plain, _), (warm, evidence) = states
+    added = warm.sigma_dps**2 - plain.sigma_dps**2
+    np.testing.assert_allclose(np.sqrt(added), 10e-3 * 2, rtol=0.03)  # 2 degrees from the mean
+    np.testing.assert_allclose(evidence.variance, plain.sigma_dps**2)
+    assert "temperature" in codes(warm)
+
+
+def test_a_temperature_that_is_missing_half_way_is_said():
+    samples, warmth = still(20), np.full(2000, 25.0)
+    warmth[1000:] = np.nan
+    calibrator = Calibrator(KIND, RATE)
+    calibrator.update(None, samples, temperature_c=warmth)
+    (reason,) = [r for r in calibrator.finish().reasons if r.code == "temperature"]
+    assert reason.sentence == "the temperature is missing in 20 of 40 blocks"

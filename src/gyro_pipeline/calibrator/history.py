@@ -87,6 +87,8 @@ class Prior:
         mean: Of the bias, deg/s.
         narrow: Variance where the history is right, (deg/s)^2.
         wide: Variance where it is wrong.
+        slope: Of the bias, deg/s a degree Celsius; the type's where there is no history.
+        slope_sigma: Its standard deviation.
         count: Calibrations of the level.
         reasons: What widened it.
         fitted: By axis, what ``model.json`` shows: level, tau, walk and slope, each with its
@@ -96,34 +98,36 @@ class Prior:
     mean: Array
     narrow: Array
     wide: Array
+    slope: Array
+    slope_sigma: Array
     count: tuple[int, ...] = (0, 0, 0)
     reasons: tuple[Reason, ...] = ()
     fitted: tuple[dict[str, tuple[float, float]], ...] = field(default=(), repr=False)
-
-
-NO_PRIOR = Prior(np.full(3, np.nan), np.full(3, np.inf), np.full(3, np.inf))
 
 
 def prior_of(calibrations: Sequence[Calibration], kind: DeviceType, now: Circumstances) -> Prior:
     """The prior of a calibration under these circumstances, by those before it."""
     past = list(calibrations)[-_MOST:]
     if not past:
-        return NO_PRIOR
+        none, infinite = np.full(3, np.nan), np.full(3, np.inf)
+        return Prior(none, infinite, infinite, kind.slope, kind.slope_spread)
     days = _days(past, now)
     heading, reasons = _earth(past, now)
     axes = []
     for axis in range(3):
         members = level_members(past, axis, kind.turn_on[axis])
         axes.append(_axis_prior([past[i] for i in members], days[[*members, -1]], axis, kind, now))
-    mean, variance, tau, fitted = map(np.array, zip(*axes, strict=True))
+    mean, variance, tau, fitted = zip(*axes, strict=True)
+    slope, slope_sigma = np.array([of_axis["slope"] for of_axis in fitted]).T
     # a fitted tau holds what calibrations at several headings differ by
     differ = _spread_deg(past) > SAME_ATTITUDE_DEG
-    narrow = variance + (np.maximum(heading - tau, 0) if differ else heading)
+    narrow = np.array(variance) + (np.maximum(heading - np.array(tau), 0) if differ else heading)
     more, too_warm = _beyond(past, kind, now)
     narrow = narrow + more
     counts = tuple(len(level_members(past, axis, kind.turn_on[axis])) for axis in range(3))
     wide = np.maximum(kind.wide**2, 9 * narrow)  # of three narrow standard deviations, at least
-    return Prior(mean, narrow, wide, counts, (*reasons, *too_warm), tuple(fitted))
+    said = *reasons, *too_warm
+    return Prior(np.array(mean), narrow, wide, slope, slope_sigma, counts, said, fitted)
 
 
 def level_members(past: Sequence[Calibration], axis: int, turn_on: float) -> list[int]:

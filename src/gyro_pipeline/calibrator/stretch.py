@@ -1,7 +1,7 @@
 """A stretch in one attitude: the filter, the test of rest, and the history with its conflict."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -58,6 +58,7 @@ class Taken(NamedTuple):
     log_ratio: Array  # (3,), wide over narrow prior
     sums: Array  # (9,), of variances within blocks, gravity and its count, temperature and its
     range_c: tuple[float, float]  # of the temperature
+    last_c: float  # temperature of the last block, NaN where it is not known
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ class Stretch:
         empty = Filter.start(self.kind.noise, self.block_s, np.zeros(3), age_s)
         prior, none, zeros = setting.prior_of(None, None, True), np.zeros(3, bool), np.zeros
         no_range = np.inf, -np.inf
-        self.taken = Taken(empty, prior, np.nan, True, none, zeros(3), zeros(9), no_range)
+        self.taken = Taken(empty, prior, np.nan, True, none, zeros(3), zeros(9), no_range, np.nan)
         self._before: Taken | None = None  # the last block
         self._last_mean = np.zeros(3)  # of that block
         self._worked_out: tuple[Taken, Known] | None = None
@@ -225,8 +226,6 @@ class Stretch:
         Returns:
             How many; what was known one block before the last is kept as well.
         """
-        count, against, log_ratio = self._conflict(filters)
-        filters, part = filters[:count], part.rows(0, count)
         known = np.isfinite(part.temperature)[:, None]
         felt = np.isfinite(part.gravity).all(axis=1, keepdims=True)
         warmth = np.where(known, part.temperature[:, None], 0)
@@ -235,11 +234,13 @@ class Stretch:
         least, most = np.where(known, warmth, np.inf), np.where(known, warmth, -np.inf)
         lows = np.minimum.accumulate(np.append(self.taken.range_c[0], least))
         highs = np.maximum.accumulate(np.append(self.taken.range_c[1], most))
+        count, against, log_ratio = self._conflict(filters, sums[1:])
+        part = part.rows(0, count)
         for row in range(max(count - 2, 0), count):
             self._before = self.taken
             self.taken = self.taken._replace(
                 filter=filters[row], log_ratio=log_ratio[row], sums=sums[row + 1],
-                range_c=(lows[row + 1], highs[row + 1]),
+                range_c=(lows[row + 1], highs[row + 1]), last_c=float(part.temperature[row]),
             )  # fmt: skip
         self._last_mean = part.means[-1]
         if against.any():
@@ -254,18 +255,18 @@ class Stretch:
             self.taken = self.taken._replace(believed=False)
             self._set_prior(up, self.taken.warmth)
 
-    def _conflict(self, filters: list[Filter]) -> tuple[int, Mask, Array]:
+    def _conflict(self, filters: list[Filter], sums: Array) -> tuple[int, Mask, Array]:
         """Blocks until the history is dropped, or all; axes on which it is; the log of the ratio.
 
         The e-value says of all axes together that the history is wrong. It is then dropped on the
         axes that speak against it, for the rest of the stretch.
         """
-        prior, usable = self.taken.prior, self.usable
+        usable = self.usable
         if not usable.any():
             return len(filters), np.zeros(3, bool), np.zeros((len(filters), 3))
         alone = own(filters)
         variance = alone.start_variance * _factor(*self._noise_of(alone))
-        seen = _with_history(alone.start, variance, prior, usable)
+        seen = _with_history(alone.start, variance, self._prior_at(sums), usable)
         wrong = np.flatnonzero(seen.log_e > np.log(CONFLICT))
         if not wrong.size:
             return len(filters), np.zeros(3, bool), seen.log_ratio
@@ -320,9 +321,25 @@ class Stretch:
             scale, freedom = (np.reshape(x, (-1, 3))[0] for x in self._noise_of(alone))
             alone = alone.row(0)
             scaled = _scaled(alone, scale, freedom)
-            answer = self._posterior(scaled, self.usable)
+            answer = self._warmed(*self._posterior(scaled, self.usable))
             self._worked_out = self.taken, Known(alone, scaled, scale, freedom, *answer)
         return self._worked_out[1]
+
+    def _prior_at(self, sums: Array) -> Prior:
+        """The prior at the mean temperature of blocks, by their sums (..., 9)."""
+        total, count = sums[..., 7:8], sums[..., 8:]
+        known = (count > 0) & np.isfinite(self.taken.warmth)
+        warmer = np.where(known, total / np.maximum(count, 1) - self.taken.warmth, 0.0)
+        prior = self.taken.prior
+        return replace(prior, mean=prior.mean + prior.slope * warmer)
+
+    def _warmed(self, bias: Array, variance: Array) -> tuple[Array, Array]:
+        """A bias at the temperature of the last block, from one at the mean of the blocks'."""
+        mean, prior = self.temperature_c, self.taken.prior
+        if mean is None or np.isnan(self.taken.last_c):
+            return bias, variance
+        warmer = self.taken.last_c - mean
+        return bias + prior.slope * warmer, variance + (prior.slope_sigma * warmer) ** 2
 
     def log_noise(self) -> tuple[Array, float]:
         """N of this stretch alone, (3,), deg/s * sqrt(s), and its degrees of freedom."""
@@ -347,7 +364,7 @@ class Stretch:
         """Bias and variance with the history where it is usable."""
         if not usable.any():
             return alone.bias, alone.variance
-        prior = self.taken.prior
+        prior = self._prior_at(self.taken.sums)
         at_start = _with_history(alone.start, alone.start_variance, prior, usable)
         unknown = np.isinf(alone.variance)
         with np.errstate(invalid="ignore"):
