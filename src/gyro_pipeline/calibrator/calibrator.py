@@ -74,7 +74,8 @@ class Calibrator:
         self.facts, self._rest_s = Facts(), 0.0  # of stretches that ended
         self._rest_of_block = np.empty((0, _COLUMNS))
         self._last_time: float | None = None
-        self._last_values = np.full(3, np.nan)
+        self._end: float | None = None  # of the last block, on the clock of the samples
+        self._proof_s = 0.0  # at rest that a rest must last, after one that was none
         self.setting = Setting(
             kind, self._prior_of, self.scale, self.freedom, self.size, self.block_s, known_still
         )
@@ -136,7 +137,7 @@ class Calibrator:
         return self.state()
 
     def finish(self) -> State:
-        """The answer, from the longest stretch."""
+        """The answer, from the stretch that knows most."""
         return self.state(finished=True)
 
     def evidence(self) -> Calibration:
@@ -217,8 +218,6 @@ class Calibrator:
             self._end = rows[count * self.size - 1, 0] + 1 / self.rate_hz
         return rows[count * self.size :]
 
-    _end: float | None = None  # on the clock of the samples, of the last block
-
     def _gap(self, start: float) -> None:
         """Move on to where rows start, if that is not where the last block ended."""
         gap = 0.0 if self._end is None else start - self._end
@@ -247,6 +246,8 @@ class Calibrator:
             if alarm.kind == BRIEF:  # what came before it was at rest
                 self._rest_s += self.stretch.seconds
                 self.kept = self._best()
+            else:
+                self._proof_s = max(self._proof_s, self.time_s - self.stretch.start_s)
             self.stretch = self._new_stretch()
 
     def _new_stretch(self) -> Stretch:
@@ -272,7 +273,7 @@ class Calibrator:
         """Now; of a finished calibration, whether half of it, and enough, was at rest."""
         if self.known_still:
             return STILL if stretch.blocks else UNSURE
-        enough = stretch.seconds >= min(self._least_s, 2 * LEAST_S)
+        enough = stretch.seconds >= max(min(self._least_s, 2 * LEAST_S), self._proof_s)
         ended = any(alarm.code != "attitude" for _, alarm in self.facts.ended)
         if finished:
             half = self._rest_s + self.stretch.seconds >= self.time_s / 2

@@ -111,23 +111,21 @@ def prior_of(calibrations: Sequence[Calibration], kind: DeviceType, now: Circums
     if not past:
         none, infinite = np.full(3, np.nan), np.full(3, np.inf)
         return Prior(none, infinite, infinite, kind.slope, kind.slope_spread)
-    days = _days(past, now)
-    heading, reasons = _earth(past, now)
-    axes = []
-    for axis in range(3):
-        members = level_members(past, axis, kind.turn_on[axis])
-        axes.append(_axis_prior([past[i] for i in members], days[[*members, -1]], axis, kind, now))
+    days, members = _days(past, now), [level_members(past, i, kind.turn_on[i]) for i in range(3)]
+    axes = [
+        _axis_prior([past[i] for i in chosen], days[[*chosen, -1]], axis, kind, now)
+        for axis, chosen in enumerate(members)
+    ]
     mean, variance, tau, fitted = zip(*axes, strict=True)
     slope, slope_sigma = np.array([of_axis["slope"] for of_axis in fitted]).T
-    # a fitted tau holds what calibrations at several headings differ by
-    differ = _spread_deg(past) > SAME_ATTITUDE_DEG
-    narrow = np.array(variance) + (np.maximum(heading - np.array(tau), 0) if differ else heading)
-    more, too_warm = _beyond(past, kind, now)
-    narrow = narrow + more
-    counts = tuple(len(level_members(past, axis, kind.turn_on[axis])) for axis in range(3))
+    heading, reasons = _earth(past, now)
+    if _spread_deg(past) > SAME_ATTITUDE_DEG:  # then tau holds it already
+        heading = np.maximum(heading - np.array(tau), 0)
+    beyond, too_warm = _beyond(past, kind, now)
+    narrow = np.array(variance) + heading + beyond
     wide = np.maximum(kind.wide**2, 9 * narrow)  # of three narrow standard deviations, at least
-    said = *reasons, *too_warm
-    return Prior(np.array(mean), narrow, wide, slope, slope_sigma, counts, said, fitted)
+    count, said = tuple(map(len, members)), (*reasons, *too_warm)
+    return Prior(np.array(mean), narrow, wide, slope, slope_sigma, count, said, fitted)
 
 
 def level_members(past: Sequence[Calibration], axis: int, turn_on: float) -> list[int]:
@@ -168,39 +166,42 @@ def _axis_prior(
     past: Sequence[Calibration], days: Array, axis: int, kind: DeviceType, now: Circumstances
 ) -> tuple[float, float, float, dict[str, tuple[float, float]]]:
     """Mean and variance of the next bias without the Earth, tau squared, and what was fitted."""
-    warmth = _warmth(past, now)
-    latitude = now.latitude_deg
-    means = np.array([c.mean[axis] for c in past]) - kind.slope[axis] * warmth[:-1]
-    if latitude is not None and now.up is not None:
-        ups = [now.up[axis] if c.up is None else c.up[axis] for c in past]
-        means += EARTH_DPS * np.sin(np.radians(latitude)) * (now.up[axis] - np.array(ups))
+    warmth, spread = _warmth(past, now), kind.slope_spread[axis] ** 2
     tau, walk, logs = _grid(kind, axis)
     days = days - days[0]
-    covariance = walk[:, None, None] ** 2 * np.minimum(days[:, None], days)
-    covariance = covariance + kind.slope_spread[axis] ** 2 * np.outer(warmth, warmth)
-    among = covariance[:, :-1, :-1] + np.array([c.variance[axis] for c in past]) * np.eye(len(past))
-    among = among + tau[:, None, None] ** 2 * np.eye(len(past))
-    slope = np.broadcast_to(kind.slope_spread[axis] ** 2 * warmth[:-1], (len(tau), len(past)))
-    cross = np.stack(
-        [covariance[:, :-1, -1], walk[:, None] ** 2 * days[:-1].clip(max=days[-1]), slope], -1
-    )
-    own = np.stack(
-        [
-            covariance[:, -1, -1] + tau**2,
-            walk**2 * days[-1],
-            np.full(len(tau), kind.slope_spread[axis] ** 2),
-        ],
-        -1,
-    )
-    deviance, mean, variance = _krige(among, cross, own, means, np.array([1.0, 1.0, 0.0]))
-    weights = np.exp(logs - deviance / 2 - np.max(logs - deviance / 2))
-    weights /= weights.sum()
-    figures = _moments(weights, mean, variance)
-    spreads = _moments(weights, np.stack([tau, walk], -1), np.zeros((len(tau), 2)))
-    (bias, sigma), level, (extra, slope_sigma) = figures
-    fitted = {"level": level, "tau": spreads[0], "walk": spreads[1]}
-    fitted["slope"] = (kind.slope[axis] + extra, slope_sigma)
+    of_walk = walk[:, None, None] ** 2 * np.minimum(days[:, None], days)
+    moving = of_walk + spread * np.outer(warmth, warmth)
+    variances = _variances(past, axis, spread) + tau[:, None] ** 2
+    among = moving[:, :-1, :-1] + variances[:, :, None] * np.eye(len(past))
+    slope = np.broadcast_to(spread * warmth[:-1], variances.shape)
+    cross = np.stack([moving[:, :-1, -1], of_walk[:, :-1, -1], slope], axis=-1)
+    own = [moving[:, -1, -1] + tau**2, of_walk[:, -1, -1], np.full(len(tau), spread)]
+    y = _levelled(past, axis, now) - kind.slope[axis] * warmth[:-1]
+    flat = np.array([1.0, 1.0, 0.0])  # the bias and the level move with the level, the slope not
+    deviance, mean, variance = _krige(among, cross, np.stack(own, axis=-1), y, flat)
+    logs = logs - deviance / 2
+    weights = np.exp(logs - logs.max()) / np.exp(logs - logs.max()).sum()
+    (bias, sigma), level, (extra, slope_sigma) = _moments(weights, mean, variance)
+    of_tau, of_walk_size = _moments(weights, np.stack([tau, walk], -1), np.zeros((len(tau), 2)))
+    fitted = {"level": level, "tau": of_tau, "walk": of_walk_size}
+    fitted["slope"] = (float(kind.slope[axis] + extra), slope_sigma)
     return bias + kind.slope[axis] * warmth[-1], sigma**2, float(weights @ tau**2), fitted
+
+
+def _variances(past: Sequence[Calibration], axis: int, spread: float) -> Array:
+    """Of the evidence, (n,); more where the temperature is not known, and in others it is."""
+    known = [c.temperature_c for c in past if c.temperature_c is not None]
+    unknown = spread * float(np.var(known)) if known else 0.0
+    return np.array([c.variance[axis] + (c.temperature_c is None) * unknown for c in past])
+
+
+def _levelled(past: Sequence[Calibration], axis: int, now: Circumstances) -> Array:
+    """Evidence (n,) with the Earth's vertical rate as in the attitude of now, where it is known."""
+    means = np.array([c.mean[axis] for c in past])
+    if now.latitude_deg is None or now.up is None:
+        return means
+    ups = np.array([now.up[axis] if c.up is None else c.up[axis] for c in past])
+    return means + EARTH_DPS * np.sin(np.radians(now.latitude_deg)) * (now.up[axis] - ups)
 
 
 def _grid(kind: DeviceType, axis: int) -> tuple[Array, Array, Array]:
@@ -225,11 +226,10 @@ def _krige(
         flat: (k,), by how much a target moves with the level.
     """
     reference = y.mean()
-    columns = np.broadcast_to(
-        np.stack([np.ones(len(y)), y - reference], -1), (len(among), len(y), 2)
-    )
+    columns = np.stack([np.ones(len(y)), y - reference], axis=-1)
+    columns = np.broadcast_to(columns, (len(among), *columns.shape))
     root = np.linalg.cholesky(among)
-    white = np.linalg.solve(root, np.concatenate([columns, cross], -1))
+    white = np.linalg.solve(root, np.concatenate([columns, cross], axis=-1))
     ones, data, to_targets = white[:, :, 0], white[:, :, 1], white[:, :, 2:]
     information = np.sum(ones**2, axis=1)
     level = np.sum(ones * data, axis=1) / information
@@ -338,4 +338,4 @@ def noise_of(calibrations: Sequence[Calibration], kind: DeviceType) -> tuple[Arr
         if past.noise is not None and past.freedom > 0:
             total += past.freedom * (past.noise / kind.noise.white) ** 2
             freedom += past.freedom
-    return np.where(freedom > 0, total / np.maximum(freedom, 1), 1.0), freedom
+    return np.where(freedom > 0, total / np.maximum(freedom, 1e-9), 1.0), freedom
