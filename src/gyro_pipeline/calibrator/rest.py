@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gyro_pipeline.calibrator.state import Array
 from gyro_pipeline.conventions import MDPS
@@ -70,9 +71,8 @@ class RestMonitor:
         self.blocks = 0
         self._squares = np.zeros(3)
         self._measured = True  # so far gravity was, in every block
-        self._slopes = np.zeros(10)  # of t, t^2, a (3), a t (3), variance, squared differences
+        self._slopes = np.zeros(10)  # sums that the slope is told from
         self._last: Array | None = None
-        self.factor = np.ones(3)
 
     def update(self, innovations: Array, scales: Array, blocks: "Blocks") -> Alarm | None:
         """Take blocks, and tell the first alarm.
@@ -95,7 +95,6 @@ class RestMonitor:
         sums = np.add.accumulate(np.vstack([self._squares, innovations**2]))[1:]
         count = self.blocks + 1 + np.arange(len(sums))
         self._squares = sums[-1]
-        self.factor = np.sqrt(sums[-1] / count[-1])
         known = self.freedom > 2  # noqa: PLR2004 - of less there is nothing to compare with
         if not known.any():
             return []
@@ -109,36 +108,47 @@ class RestMonitor:
         return [Alarm(int(rows[0]), WHOLE, "noise", factor)]
 
     def _rotation(self, gravity: Array, variances: Array) -> list[Alarm]:
-        """A slope of the direction of gravity, fitted by least squares to all blocks so far.
+        """A rate by the slope of gravity that noise does not make; until gravity is missing.
 
-        Gravity turns in the axes of the device by the rate -w x g, so w = g x slope / g^2 but for
-        its part along g. Two normal components exceed z sigma with probability exp(-z^2 / 2).
+        Two normal components exceed z sigma with probability exp(-z^2 / 2), of which a share of
+        1 / (k (k + 1)) is spent on block k.
         """
         missing = np.flatnonzero(~np.isfinite(gravity).all(axis=1))
         rows = int(missing[0]) if missing.size else len(gravity)
-        rows = rows if self._measured else 0
-        self._measured = self._measured and not missing.size
+        rows, self._measured = rows * self._measured, self._measured and not missing.size
         if not rows:
             return []
-        gravity, variances = gravity[:rows], variances[:rows]
-        count = self.blocks + 1 + np.arange(len(gravity))
+        gravity, count = gravity[:rows], self.blocks + 1.0 + np.arange(rows)
         t = (count - 0.5)[:, None] * self.block_s
         steps = np.diff(gravity, axis=0, prepend=gravity[:1] if self._last is None else self._last)
-        own = np.sum(steps**2, axis=1, keepdims=True)
-        terms = np.hstack([t, t**2, gravity, gravity * t, variances[:, None], own])
-        sums = np.add.accumulate(np.vstack([self._slopes, terms]))[1:]
+        squares = np.sum(steps**2, axis=1, keepdims=True)
+        terms = [t, t**2, gravity, gravity * t, variances[:rows, None] / self.size, squares]
+        sums = np.add.accumulate(np.vstack([self._slopes, np.hstack(terms)]))[1:]
         self._slopes, self._last = sums[-1], gravity[-1:]
-        n = count[:, None]
-        of_t = sums[:, 1:2] - sums[:, :1] ** 2 / n
-        slope = (sums[:, 5:8] - sums[:, :1] * sums[:, 2:5] / n) / np.maximum(of_t, 1e-12)
-        mean = sums[:, 2:5] / n
-        rates = np.cross(mean, slope) / np.sum(mean**2, axis=1, keepdims=True)
-        rate = np.degrees(np.linalg.norm(rates, axis=1))
-        white = sums[:, 8] / count / self.size
-        shown = sums[:, 9] / 6 / np.maximum(count - 1, 1) / (1 + 2 * np.sqrt(3 / count))
-        weight = np.linalg.norm(mean, axis=1) * np.sqrt(np.maximum(of_t[:, 0], 1e-12))
-        sigma = np.degrees(np.sqrt(np.maximum(white, shown)) / weight)
-        limit = np.sqrt(-2 * np.log(_FALSE_ROTATION / (count * (count + 1.0))))
+        rate, sigma = _rotations(sums, count)
+        limit = np.sqrt(-2 * np.log(_FALSE_ROTATION / (count * (count + 1))))
         alarm = (rate > np.maximum(limit * sigma, _LEAST_ROTATION)) & (count >= _FEWEST)
-        found = np.flatnonzero(alarm)[:1]
-        return [Alarm(int(i), WHOLE, "rotation", float(rate[i]), float(sigma[i])) for i in found]
+        first = np.flatnonzero(alarm)[:1]
+        return [Alarm(int(i), WHOLE, "rotation", float(rate[i]), float(sigma[i])) for i in first]
+
+
+def _rotations(sums: Array, count: NDArray[np.floating]) -> tuple[Array, Array]:
+    """Rates about horizontal axes and their standard deviation, (n,), deg/s, by least squares.
+
+    Gravity turns in the axes of the device by -w x g, so w = g x slope / g^2 but for its part along
+    g. The noise of a block is that of its samples, or more where neighbours differ by more.
+
+    Args:
+        sums: (n, 10), over the blocks so far, of t, t^2, g, g t, the variance of a block's mean
+            and the squared difference from the block before.
+        count: (n,), blocks so far.
+    """
+    n = count[:, None]
+    of_time = np.maximum(sums[:, 1:2] - sums[:, :1] ** 2 / n, 1e-12)
+    slope = (sums[:, 5:8] - sums[:, :1] * sums[:, 2:5] / n) / of_time
+    mean = sums[:, 2:5] / n
+    size = np.linalg.norm(mean, axis=1)
+    rate = np.linalg.norm(np.cross(mean, slope), axis=1) / size**2
+    shown = sums[:, 9] / 6 / np.maximum(count - 1, 1) / (1 + 2 * np.sqrt(3 / count))
+    variance = np.maximum(sums[:, 8] / count, shown) / of_time[:, 0]
+    return np.degrees(rate), np.degrees(np.sqrt(variance) / size)

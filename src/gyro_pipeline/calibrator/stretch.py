@@ -47,6 +47,14 @@ class Blocks(NamedTuple):
         return Blocks(*(column[first:last] for column in self))
 
 
+class Conflict(NamedTuple):
+    """Where data and history contradict each other so much that the history is dropped."""
+
+    axes: Mask  # (3,)
+    away: Array  # (3,), data less history, deg/s
+    sigma: Array  # (3,), of that, if the history were right
+
+
 class Taken(NamedTuple):
     """What the blocks taken so far come to; a motion goes back to an earlier one."""
 
@@ -55,7 +63,7 @@ class Taken(NamedTuple):
     warmth: float  # degrees Celsius that the prior is of, NaN where it is of none
     believed: bool  # that a declared heading repeats
     dropped: Mask  # (3,), axes whose history was dropped
-    log_ratio: Array  # (3,), wide over narrow prior
+    conflicts: tuple[Conflict, ...]
     sums: Array  # (9,), of variances within blocks, gravity and its count, temperature and its
     range_c: tuple[float, float]  # of the temperature
     last_c: float  # temperature of the last block, NaN where it is not known
@@ -108,9 +116,9 @@ class Stretch:
         self.setting, self.kind, self.start_s = setting, setting.kind, start_s
         self.scale, self.freedom, self.block_s = setting.scale, setting.freedom, setting.block_s
         empty = Filter.start(self.kind.noise, self.block_s, np.zeros(3), age_s)
-        prior, none, zeros = setting.prior_of(None, None, True), np.zeros(3, bool), np.zeros
+        prior, none = setting.prior_of(None, None, True), np.zeros(3, bool)
         no_range = np.inf, -np.inf
-        self.taken = Taken(empty, prior, np.nan, True, none, zeros(3), zeros(9), no_range, np.nan)
+        self.taken = Taken(empty, prior, np.nan, True, none, (), np.zeros(9), no_range, np.nan)
         self._before: Taken | None = None  # the last block
         self._last_mean = np.zeros(3)  # of that block
         self._worked_out: tuple[Taken, Known] | None = None
@@ -234,44 +242,47 @@ class Stretch:
         least, most = np.where(known, warmth, np.inf), np.where(known, warmth, -np.inf)
         lows = np.minimum.accumulate(np.append(self.taken.range_c[0], least))
         highs = np.maximum.accumulate(np.append(self.taken.range_c[1], most))
-        count, against, log_ratio = self._conflict(filters, sums[1:])
+        count, conflict = self._conflict(filters, sums[1:])
         part = part.rows(0, count)
         for row in range(max(count - 2, 0), count):
             self._before = self.taken
             self.taken = self.taken._replace(
-                filter=filters[row], log_ratio=log_ratio[row], sums=sums[row + 1],
+                filter=filters[row], sums=sums[row + 1],
                 range_c=(lows[row + 1], highs[row + 1]), last_c=float(part.temperature[row]),
             )  # fmt: skip
         self._last_mean = part.means[-1]
-        if against.any():
-            self._drop(against)
+        if conflict is not None:
+            self._drop(conflict)
         return count
 
-    def _drop(self, against: Mask) -> None:
+    def _drop(self, conflict: Conflict) -> None:
         """Drop the history on axes; a heading that one of them contradicts is not believed."""
-        self.taken = self.taken._replace(dropped=self.taken.dropped | against)
-        up = self.up
-        if self.taken.believed and (up is None or np.any(against & (np.abs(up) < VERTICAL))):
+        dropped, conflicts = self.taken.dropped | conflict.axes, (*self.taken.conflicts, conflict)
+        self.taken, up = self.taken._replace(dropped=dropped, conflicts=conflicts), self.up
+        horizontal = conflict.axes if up is None else conflict.axes & (np.abs(up) < VERTICAL)
+        if self.taken.believed and horizontal.any():
             self.taken = self.taken._replace(believed=False)
             self._set_prior(up, self.taken.warmth)
 
-    def _conflict(self, filters: list[Filter], sums: Array) -> tuple[int, Mask, Array]:
-        """Blocks until the history is dropped, or all; axes on which it is; the log of the ratio.
+    def _conflict(self, filters: list[Filter], sums: Array) -> tuple[int, Conflict | None]:
+        """How many blocks until the history is dropped, or all of them; and that conflict.
 
         The e-value says of all axes together that the history is wrong. It is then dropped on the
         axes that speak against it, for the rest of the stretch.
         """
         usable = self.usable
         if not usable.any():
-            return len(filters), np.zeros(3, bool), np.zeros((len(filters), 3))
-        alone = own(filters)
+            return len(filters), None
+        alone, prior = own(filters), self._prior_at(sums)
         variance = alone.start_variance * _factor(*self._noise_of(alone))
-        seen = _with_history(alone.start, variance, self._prior_at(sums), usable)
+        seen = _with_history(alone.start, variance, prior, usable)
         wrong = np.flatnonzero(seen.log_e > np.log(CONFLICT))
         if not wrong.size:
-            return len(filters), np.zeros(3, bool), seen.log_ratio
+            return len(filters), None
         row = int(wrong[0])
-        return row + 1, usable & np.greater(seen.log_ratio[row], 0), seen.log_ratio
+        against = usable & np.greater(seen.log_ratio[row], 0)
+        away = alone.start[row] - prior.mean[row]
+        return row + 1, Conflict(against, away, np.sqrt(prior.narrow + variance[row]))
 
     def _leave_out(self, part: Blocks, filters: list[Filter], row: int) -> None:
         """Leave out a block of motion and the one before it."""

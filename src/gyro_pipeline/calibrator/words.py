@@ -33,7 +33,6 @@ class Facts:
     constant: Array = field(default_factory=lambda: np.zeros(3))  # blocks in a row
     dead: Mask = field(default_factory=lambda: np.zeros(3, bool))
     ended: list[tuple[float, Alarm]] = field(default_factory=list)  # stretches: when, and why
-    factor: float = 1.0  # of the noise over the known one, where a stretch ended by it
 
     def look(self, variances: Array) -> None:
         """Count blocks (block, 3) in which an axis holds one value."""
@@ -93,14 +92,12 @@ def _of_rest(facts: Facts, stretch: Stretch) -> Iterator[Reason]:
             if reason := unit_reason(alarm.value, stretch.kind.name):
                 yield reason
                 continue
-            text = (
-                f"up to {at:.1f} s the rates scatter {alarm.value:.1f} times as much as those of "
-            )
-            text += f"{stretch.kind.name} at rest: not at rest, or another --type"
+            text = f"up to {at:.1f} s the rates scatter {alarm.value:.1f} times as much as "
+            text += f"{stretch.kind.name} does at rest: not at rest, or another --type"
         elif alarm.code == "attitude":
-            text = f"the device was turned before {at:.1f} s; the longest stretch counts"
+            text = f"the device was turned before {at:.1f} s; the stretch that knows most counts"
         else:
-            text = f"in motion up to {at:.1f} s; the longest stretch counts"
+            text = f"in motion up to {at:.1f} s; the stretch that knows most counts"
         yield Reason(alarm.code, text, None, at)
 
 
@@ -114,16 +111,16 @@ def _of_unit(stretch: Stretch) -> Iterator[Reason]:
 
 
 def _of_history(stretch: Stretch) -> Iterator[Reason]:
-    prior, own = stretch.taken.prior, stretch.own()
-    if np.isfinite(prior.narrow).any():
-        yield from prior.reasons
-    for axis in np.flatnonzero(stretch.taken.dropped):
-        away = (own.start - prior.mean)[axis]
-        z = abs(away) / np.sqrt(prior.narrow[axis] + own.start_variance[axis])
-        chance = 2 * NormalDist().cdf(-z)
-        rarely = f"1 in {1 / chance:,.0f}" if chance > 1e-9 else "never by chance"  # noqa: PLR2004
-        text = f"the history is {abs(away) / MDPS:.1f} mdps away ({rarely}) and was dropped"
-        yield Reason("conflict", text, AXES[axis], float(away / MDPS), float(z))
+    if np.isfinite(stretch.taken.prior.narrow).any():
+        yield from stretch.taken.prior.reasons
+    for conflict in stretch.taken.conflicts:
+        for axis in np.flatnonzero(conflict.axes):
+            away, z = float(conflict.away[axis] / MDPS), abs(conflict.away / conflict.sigma)[axis]
+            chance = max(2 * NormalDist().cdf(-float(z)), 1e-12)
+            text = (
+                f"the history is {abs(away):.1f} mdps away (1 in {1 / chance:,.0f}) and was dropped"
+            )
+            yield Reason("conflict", text, AXES[axis], away, float(z))
 
 
 def _of_noise(stretch: Stretch, target_dps: float | None) -> Iterator[Reason]:
