@@ -260,16 +260,27 @@ def _report(  # noqa: PLR0917 - what an answer is made of
     if options.plot:
         output.plot(Path(options.plot), [*states, state], options.target)
     if device is not None and options.store and code != UNUSABLE:
-        said = {
-            "hash": source, "source": name, "time": _posix(options.started_at),
-            "since_power_on_s": options.since_power_on, "version": gyro_pipeline.__version__,
-            "same_heading": calibrator.now.same_heading, "known_still": options.known_still,
-        }  # fmt: skip
-        if device.append(registry.line_of(evidence, state, said, calibrator.temperature_range)):
-            device.write_model(options.calibrator(calibrator.rate_hz))
-        else:
-            _say(f"{name} is stored already; it is not stored again")
+        _store(calibrator, state, options, device, source, name)
     return code
+
+
+def _store(  # noqa: PLR0917 - what a line is made of
+    calibrator: Calibrator, state: State, options: Options, device: Device, source: str, name: str
+) -> None:
+    """Add the calibration, or the attempt, to the device's history."""
+    said = {
+        "hash": source, "source": name, "time": _posix(options.started_at),
+        "since_power_on_s": options.since_power_on, "version": gyro_pipeline.__version__,
+        "same_heading": calibrator.now.same_heading, "known_still": options.known_still,
+    }  # fmt: skip
+    line = registry.line_of(calibrator.evidence(), state, said, calibrator.temperature_range)
+    if not device.append(line):
+        _say(f"{name} is stored already; it is not stored again")
+        return
+    try:
+        device.write_model(options.calibrator(calibrator.rate_hz))
+    except RegistryError as error:
+        _say(f"{name} is stored, but model.json is not made anew: {error}")
 
 
 def _code(calibrator: Calibrator, state: State, options: Options) -> int:

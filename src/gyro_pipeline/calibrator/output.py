@@ -5,6 +5,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 
 from gyro_pipeline.calibrator.state import DROPPED, NONE, STILL, USED, Array, State
@@ -52,7 +53,7 @@ def describe(count: Sequence[int], same_heading: bool) -> str:
 
 
 def as_text(state: State, target_mdps: float | None, temperature_c: float | None, past: str) -> str:
-    """A table of the axes, with a line above and what is left to do below."""
+    """A table of the axes, with a line above and what is left to do below; coloured."""
     warmth = "" if temperature_c is None else f"; {temperature_c:.1f} °C"
     cut = [f"{r.value:.1f} s" for r in state.reasons if r.code == "cut"]
     knocks = f" (a motion at {', '.join(cut)} was cut)" if cut else ""
@@ -72,6 +73,10 @@ def as_text(state: State, target_mdps: float | None, temperature_c: float | None
         listed = ", ".join(f"{drift:.2g}° about {name}" for drift, name in drifts)
         lines.append(f"In one hour the heading drifts by {listed} (1 σ of the bias alone).")
     bounds = [r.sentence for r in state.reasons if r.code == "rotation_bound"]
+    lines[0] = click.style(lines[0], fg="green" if state.rest == STILL else "red")
+    dropped = [axis for axis in range(3) if state.history[axis] == DROPPED]
+    for number in (2 + axis for axis in dropped):
+        lines[number] = click.style(lines[number], fg="yellow")
     return "\n".join([*lines, *bounds])
 
 
@@ -196,4 +201,5 @@ def _draw(panel: Any, states: Sequence[State], axis: int) -> None:
             panel.axvline(reason.value, color="C3", label="cut")
     usual = np.median(band[np.isfinite(band)]) if np.isfinite(band).any() else 1.0
     panel.set_ylim(-5 * usual, 5 * usual)
-    panel.set_ylabel(f"{AXES[axis]}, mdps about {centre:+.5f} deg/s")
+    panel.set_ylabel(f"{AXES[axis]}, mdps")
+    panel.set_title(f"{AXES[axis]} about {centre:+.6f} deg/s", loc="left", fontsize="small")

@@ -188,8 +188,11 @@ class Device:
         }
         with self._locked():
             temporary = self.model_path.with_suffix(".new")
-            temporary.write_text(json.dumps(model, indent=1) + "\n", "utf-8")
-            os.replace(temporary, self.model_path)
+            try:
+                temporary.write_text(json.dumps(model, indent=1) + "\n", "utf-8")
+                os.replace(temporary, self.model_path)
+            finally:
+                temporary.unlink(missing_ok=True)
 
     def model(self) -> dict[str, Any] | None:
         """What ``model.json`` holds, if it is there."""
