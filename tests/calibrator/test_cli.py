@@ -172,8 +172,9 @@ def streamed(*arguments, send=None, close=True):
 
 def test_a_stream_ends_when_the_target_is_reached():
     out, _, code = streamed("--target", "2", "--json", send=text(rates(60)))
-    *_, last = map(json.loads, out.splitlines())
+    first, *_, last = map(json.loads, out.splitlines())
     assert code == 0
+    assert (first["bias_dps"], first["seconds_left"]) == ([None] * 3, [7.0, 6.0, 9.5])
     assert 8 <= last["seconds_at_rest"] <= 10  # 6.0^2 / 2^2 = 9 s
 
 

@@ -169,7 +169,7 @@ class Calibrator:
 
         def look_ahead() -> Array:
             if target is None:
-                return np.zeros(3)
+                return np.full(3, np.nan)
             return np.maximum(snapshot.seconds_left(target, LONGEST_S), left_s)
 
         reached = target is None or bool(stretch.reached(target).all())

@@ -307,12 +307,19 @@ def stream(port: str | None, baud: int, timeout: float, **values: Any) -> int:
     device, parser = options.folder(), lines.Parser(_reader_options(options.reader), options.rate)
     options.started_at = options.started_at or str(time.time())
     calibrator, states, ended = None, [], False
+
+    def show(state: State) -> None:
+        click.echo(json.dumps(output.as_json(state, options.device), allow_nan=False))
+
     with lines.source(port, baud) as descriptor:
         for samples in parser.seconds(lines.lines_of(descriptor, timeout, _say)):
-            calibrator = calibrator or options.calibrator(parser.rate_hz or 0.0)
+            if calibrator is None:  # the first answer is the history's
+                calibrator = options.calibrator(parser.rate_hz or 0.0)
+                states.append(calibrator.state())
+                show(states[-1])
             states.append(calibrator.update(*samples))
-            if len(states) == 1 or int(states[-1].time_s) > int(states[-2].time_s):
-                click.echo(json.dumps(output.as_json(states[-1], options.device), allow_nan=False))
+            if int(states[-1].time_s) > int(states[-2].time_s):
+                show(states[-1])
             ended = options.target is not None and states[-1].done
             if ended:
                 break

@@ -72,7 +72,7 @@ class State:
 
     @cached_property
     def seconds_left(self) -> Array:
-        """(3,), seconds at rest until the target is reached; infinite where it never is."""
+        """(3,), seconds at rest until the target; infinite where never, NaN without a target."""
         return self.look_ahead()
 
     @property
