@@ -168,11 +168,10 @@ def _and_last(lines: Iterable[Sequence[str]]) -> Iterator[Sequence[str] | None]:
 
 def _times(file: Any) -> tuple[list[int], float, float]:
     """The column of times: the option's, or the first of such a name, if its unit is known."""
-    from gyro_pipeline.readers.stamps import names_time  # noqa: PLC0415
     from gyro_pipeline.units import read_unit  # noqa: PLC0415
 
     column, given = file.options.time_column, file.options.time_units
-    named = [number for number, header in enumerate(file.headers) if names_time(header)]
+    named = [number for number, header in enumerate(file.headers) if header.names_time]
     for number in named if column is None else [file.find(column)]:
         if isinstance(given, float):
             return [number], given, 0.0
