@@ -24,7 +24,7 @@ from scipy import stats
 
 from gyro_pipeline.calibrator import Calibration, Calibrator, Circumstances, State
 from gyro_pipeline.calibrator.device_types import type_of
-from gyro_pipeline.calibrator.filter import FLICKER_S, Filter, own
+from gyro_pipeline.calibrator.filter import FLICKER_S, Estimate, Filter, estimates
 from gyro_pipeline.conventions import MDPS
 from gyro_pipeline.physics.noise import simulate_noise, warm_up
 from gyro_pipeline.physics.recording_model import (
@@ -122,8 +122,8 @@ def earth(heading: float) -> np.ndarray:
 
 
 def own_variance(world: World, seconds: float) -> np.ndarray:
-    filter_ = Filter.start(kind_of(replace(world, known=True)).noise, 0.5, np.zeros(3))
-    return own(filter_.ahead(round(seconds / 0.5))).variance[-1] / MDPS**2
+    filter_ = Filter.start(kind_of(replace(world, known=True)).noise, 0.5)
+    return estimates(filter_.ahead(round(seconds / 0.5))).variance[-1] / MDPS**2
 
 
 def noise(rng, world: World) -> np.ndarray:
@@ -404,12 +404,12 @@ def against_exact(world: World, seconds: int, prior: float | None) -> float:
         own_part = w @ covariance @ w - 2 * w @ now + seconds * world.walk**2
         return own_part + spread * (1 - w.sum()) ** 2
 
-    filter_, columns = Filter.start(kind_of(replace(world)).noise, 0.5, np.zeros(3), 0.0), []
+    filter_, columns = Filter.start(kind_of(replace(world)).noise, 0.5, 0.0), []
     for unit_block in [None, *range(blocks)]:
         current = filter_
         for block in range(blocks):
             current, _ = current.update(np.full(3, 1.0 if block == unit_block else 0.0))
-        last = own([current]).row(0)
+        last = Estimate(*(x[0] for x in estimates([current])))
         gain = 1.0 if prior is None else spread / (spread + last.start_variance[0] / MDPS**2)
         columns.append(last.bias[0] + last.follows[0] * (gain - 1) * last.start[0])
     own_weights = np.array(columns[1:]) - columns[0]

@@ -211,7 +211,7 @@ def test_warm_up_settles_and_is_said():
     [
         (np.zeros_like, "dead"),
         (lambda x: np.round(x) + 1, "dead"),
-        (lambda x: np.full_like(x, np.nan), "not_finite"),
+        (lambda x: np.full_like(x, np.nan), "dead"),
         (lambda x: x * np.degrees(1), "unit"),
         (np.radians, "unit"),
     ],

@@ -92,7 +92,7 @@ def test_the_same_log_is_stored_once_and_does_not_count_for_itself(csv):
         (["--require-history"], 5, ""),
         (["--units", "rad/s", "--trust", "options"], 6, "a wrong unit?"),
         (["--type", "nope"], 2, "expected consumer, dot, memsense"),
-        (["--started-at", "yesterday"], 2, "--started-at: expected"),
+        (["--started-at", "yesterday"], 2, "expected 2026-01-31"),
         (["--units", "m"], 2, "--units: "),
         (["--columns", "a,b,c"], 2, "expected a column 'a', got 4 columns"),
     ],

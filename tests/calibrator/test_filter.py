@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gyro_pipeline.calibrator.filter import FLICKER_S, Filter, Noise, own
+from gyro_pipeline.calibrator.filter import FLICKER_S, Filter, Noise, estimates
 from gyro_pipeline.physics.recording_model import noise_covariances, profiles
 
 RATE, BLOCK = 100, 50
@@ -41,13 +41,13 @@ def exact(world, seconds):
 
 def run(world, means, age_s=0.0):
     """Estimates of the bias now, from (n, blocks), three at a time; and its variance."""
-    noise, estimates = noise_of(*WORLDS[world]), []
+    noise, biases = noise_of(*WORLDS[world]), []
     for three in means.reshape(-1, 3, means.shape[-1]):
-        filter_ = Filter.start(noise, BLOCK_S, np.zeros(3), age_s)
+        filter_ = Filter.start(noise, BLOCK_S, age_s)
         for mean in three.T:
             filter_, _ = filter_.update(mean)
-        estimates.append(own([filter_]).bias[0])
-    return np.concatenate(estimates), own([filter_])
+        biases.append(estimates([filter_]).bias[0])
+    return np.concatenate(biases), estimates([filter_])
 
 
 def best(world, seconds):
@@ -94,7 +94,7 @@ def test_innovations_are_white_and_of_unit_variance():
     root = np.linalg.cholesky(covariance)
     noise, innovations = noise_of(*WORLDS["all"][:3], None), []
     for _ in range(200):
-        filter_ = Filter.start(noise, BLOCK_S, np.zeros(3))
+        filter_ = Filter.start(noise, BLOCK_S)
         for mean in root @ rng.standard_normal((20, 3)):
             filter_, innovation = filter_.update(mean)
             innovations.append(innovation)
@@ -105,20 +105,20 @@ def test_innovations_are_white_and_of_unit_variance():
 
 def test_a_gap_lets_the_flicker_be_forgotten():
     noise, block = noise_of(*WORLDS["flicker"]), np.full(3, 1e-3)
-    together = Filter.start(noise, BLOCK_S, block).update(block)[0]
+    together = Filter.start(noise, BLOCK_S).update(block)[0]
     apart = together.skip(1000.0).update(block)[0]
     together = together.update(block)[0]
-    one = own([Filter.start(noise, BLOCK_S, block).update(block)[0]]).variance
-    np.testing.assert_allclose(own([apart]).variance, one / 2, rtol=1e-6)
-    assert np.all(own([together]).variance > 1.2 * own([apart]).variance)
+    one = estimates([Filter.start(noise, BLOCK_S).update(block)[0]]).variance
+    np.testing.assert_allclose(estimates([apart]).variance, one / 2, rtol=1e-6)
+    assert np.all(estimates([together]).variance > 1.2 * estimates([apart]).variance)
 
 
 def test_the_variance_ahead_is_the_one_that_comes():
     rng = np.random.default_rng(3)
-    filter_ = Filter.start(noise_of(*WORLDS["all"]), BLOCK_S, np.zeros(3), None)
+    filter_ = Filter.start(noise_of(*WORLDS["all"]), BLOCK_S, None)
     for mean in rng.normal(0, 5e-3, (6, 3)):
         filter_, _ = filter_.update(mean)
-    ahead = own(filter_.ahead(10)).variance
+    ahead = estimates(filter_.ahead(10)).variance
     for mean, variance in zip(rng.normal(0, 5e-3, (10, 3)), ahead, strict=True):
         filter_, _ = filter_.update(mean)
-        np.testing.assert_allclose(own([filter_]).variance[0], variance, rtol=1e-12)
+        np.testing.assert_allclose(estimates([filter_]).variance[0], variance, rtol=1e-12)

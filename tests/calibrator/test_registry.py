@@ -10,9 +10,13 @@ import time
 import numpy as np
 import pytest
 
-from gyro_pipeline.calibrator import registry
-from gyro_pipeline.calibrator.registry import Device, RegistryError, opened
+from gyro_pipeline.calibrator import Calibrator, registry
+from gyro_pipeline.calibrator.registry import Device, RegistryError
 from gyro_pipeline.conventions import InputError
+
+
+def opened(device, registry, **options):
+    return Calibrator.open(device, rate_hz=100.0, registry=registry, **options)
 
 
 def line(number, **more):
@@ -37,7 +41,7 @@ def test_what_is_stored_comes_back_in_order(device, tmp_path):
     assert not device.append(line(1))  # the same log
     given = opened("B17", tmp_path)
     assert [c.mean[2] for c in given.history] == [0.0, 0.001, 0.002]
-    assert given.kind.name == "dot"
+    assert given.device_type.name == "dot"
 
 
 def test_a_log_does_not_count_for_itself(device, tmp_path):
@@ -61,7 +65,7 @@ def test_a_line_that_was_cut_off_is_left_out_and_the_next_starts_anew(device):
     with device.lines_path.open("ab") as file:
         file.write(b'{"event": "calibration", "hash": "00')
     device.append(line(2))
-    assert [old["hash"] for old in device.calibrations()] == ["0001", "0002"]
+    assert list(device.calibrations()) == ["0001", "0002"]
 
 
 def test_a_full_disk_leaves_the_history_as_it_was(device, monkeypatch):
@@ -99,7 +103,7 @@ def test_two_processes_write_one_after_the_other(device, tmp_path):
     both = [writer(tmp_path, 0, 40), writer(tmp_path, 40, 80)]
     for process in both:
         process.communicate(timeout=60)
-    assert sorted(old["hash"] for old in device.calibrations()) == [f"{n:04d}" for n in range(80)]
+    assert sorted(device.calibrations()) == [f"{n:04d}" for n in range(80)]
 
 
 def test_a_kill_loses_nothing_that_was_acknowledged(device, tmp_path):
@@ -108,7 +112,7 @@ def test_a_kill_loses_nothing_that_was_acknowledged(device, tmp_path):
     time.sleep(0.05)
     process.send_signal(signal.SIGKILL)
     rest = [int(text) for text in process.communicate()[0].split()]
-    stored = {int(old["hash"]) for old in device.calibrations()}
+    stored = {int(key) for key in device.calibrations()}
     assert stored >= {*acknowledged, *rest}
     assert device.append(line(999_999))
 
@@ -119,7 +123,7 @@ def test_a_device_moves_in_one_file_and_is_not_doubled(device, tmp_path):
     content = json.loads(json.dumps(device.content()))
     other = Device(tmp_path / "elsewhere", "B18")
     for _ in range(2):
-        other.restore(content["lines"], content["device_toml"])
+        other.restore(content)
     assert other.lines() == device.lines()
     assert other.settings() == {"type": "dot"}
 
@@ -140,13 +144,14 @@ def test_settings_that_cannot_be_read_are_refused(device, text):
 def test_what_device_toml_says_and_what_options_overrule(device, tmp_path):
     device.settings_path.write_text('type = "memsense"\nmounted = true\nlatitude = 32.0\n')
     given = opened("B17", tmp_path)
-    assert (given.kind.name, given.now.same_heading, given.now.latitude_deg) == (
+    assert (given.device_type.name, given.now.same_heading, given.now.latitude_deg) == (
         "memsense",
         True,
         32,
     )
-    given = opened("B17", tmp_path, "dot", same_heading=False, latitude_deg=50.0)
-    assert (given.kind.name, given.now.same_heading, given.now.latitude_deg) == ("dot", False, 50)
+    given = opened("B17", tmp_path, device_type="dot", same_heading=False, latitude_deg=50.0)
+    assert given.device_type.name == "dot"
+    assert (given.now.same_heading, given.now.latitude_deg) == (False, 50)
 
 
 def test_the_registry_is_where_it_is_said_to_be(tmp_path, monkeypatch):

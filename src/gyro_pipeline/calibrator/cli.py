@@ -11,8 +11,9 @@ import re
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,121 +24,105 @@ import gyro_pipeline
 from gyro_pipeline.calibrator import output, registry
 from gyro_pipeline.calibrator.calibrator import BLOCK_S, Calibrator
 from gyro_pipeline.calibrator.device_types import names
+from gyro_pipeline.calibrator.reasons import UNUSABLE_CODES
 from gyro_pipeline.calibrator.registry import Device, RegistryError, registry_folder
 from gyro_pipeline.calibrator.state import STILL, USED, State
 from gyro_pipeline.conventions import MDPS, InputError
 
 DONE, USAGE, NOT_REACHED, NOT_AT_REST, NO_HISTORY, UNUSABLE, NOT_STORED = 0, 2, 3, 4, 5, 6, 7
 
-_SHORT = {"scale_dps": "scale"}  # the readers' options that have a shorter name here
-_TRIPLES = {"columns", "acceleration_columns"}
+
+def _posix(text: str) -> float:
+    """POSIX seconds of such, or of an ISO 8601 time."""
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    try:
+        return datetime.fromisoformat(text).timestamp()
+    except ValueError as error:
+        expected = "2026-01-31T12:00:00+00:00 or POSIX seconds"
+        raise click.BadParameter(f"expected {expected}, got {text!r}") from error
 
 
-def _option(default: Any, text: str, flag: str = "") -> Any:
-    return field(default=default, metadata={"help": text, "flag": flag})
+_option = partial(partial, click.option)
+_DEVICE = {  # arguments of Calibrator.open, and their options
+    "device": _option("--device", help="name in the registry; its history is used and added to"),
+    "device_type": _option("--type", help="of the device: noise, turn-on spread, ..."),
+    "registry": _option("--registry", help="folder of the devices"),
+    "target_mdps": _option("--target", type=float, help="standard deviation to reach, mdps"),
+    "same_heading": _option("--same-heading/--any-heading", default=None, help="it repeats"),
+    "latitude_deg": _option("--latitude", type=float, help="of the place, degrees"),
+    "started_at": _option(
+        "--started-at", type=_posix, help="time of the first sample, ISO 8601 or POSIX seconds"
+    ),
+    "since_power_on_s": _option("--since-power-on", type=float, help="of the first sample, s"),
+    "known_still": _option("--known-still", is_flag=True, help="it was at rest: cut nothing"),
+}
+_JSON = {"as_json": _option("--json", is_flag=True, help="one JSON object")}
+_SHARED = {
+    "require_history": _option("--require-history", is_flag=True, help="exit 5 without"),
+    "store": _option("--store/--no-store", default=True, help="add to the device's history"),
+    "plot": _option("--plot", type=Path, help="file to draw the running estimate to"),
+    "rate_hz": _option("--rate", type=float, help="samples a second, where times do not tell"),
+    **_JSON,
+}
+_FOLDER = {"folder": _DEVICE["registry"]}
 
 
-@dataclass
-class Options:
-    """What ``log`` and ``stream`` share; each field is an option of the command line."""
+def _with(options: dict[str, Any]) -> Callable[[Any], Any]:
+    """Add options to a command, by the names of its arguments."""
 
-    device: str | None = _option(None, "name in the registry; its history is used and added to")
-    device_type: str | None = _option(None, "of the device: noise, turn-on spread …", "--type")
-    registry: str | None = _option(None, "folder of the devices")
-    target: float | None = _option(None, "standard deviation that is wanted, mdps")
-    same_heading: bool | None = _option(None, "the heading repeats", "--same-heading/--any-heading")
-    latitude: float | None = _option(None, "of the place, degrees")
-    started_at: str | None = _option(None, "time of the first sample, ISO 8601 or POSIX seconds")
-    since_power_on: float | None = _option(None, "of the first sample, seconds")
-    known_still: bool = _option(False, "it was at rest: cut nothing")
-    require_history: bool = _option(False, "exit 5 where no history is used")
-    store: bool = _option(True, "add to the device's history", "--store/--no-store")
-    json: bool = _option(False, "one JSON object")
-    plot: str | None = _option(None, "file to draw the running estimate to")
-    rate: float | None = _option(None, "samples a second, where the times do not tell")
-    reader: dict[str, Any] = field(default_factory=dict)
+    def add(command: Any) -> Any:
+        for name, option in reversed(options.items()):
+            command = option(name)(command)
+        return command
 
-    @classmethod
-    def of(cls, values: dict[str, Any]) -> "Options":
-        """The shared options, and what else was given, which is for the readers."""
-        shared = {item.name: values.pop(item.name) for item in fields(cls) if item.metadata}
-        given = {name: _typed(name, text) for name, text in values.items() if text is not None}
-        return cls(**shared, reader=given)
-
-    def calibrator(self, rate_hz: float, without: str | None = None) -> Calibrator:
-        """A calibrator of the device; see :func:`.registry.opened`."""
-        given = registry.opened(
-            self.device, self.registry, self.device_type, self.same_heading, self.latitude,
-            _posix(self.started_at), without,
-        )  # fmt: skip
-        target = None if self.target is None else self.target * MDPS
-        more = target, self.since_power_on, self.known_still
-        return Calibrator(given.kind, rate_hz, given.history, given.now, *more)
-
-    def folder(self) -> Device | None:
-        """The device's folder; that it can be written is seen before anything is measured."""
-        if self.device is None:
-            return None
-        device = Device(registry_folder(self.registry), self.device)
-        if self.store:
-            device.create(self.device_type)
-        return device
+    return add
 
 
-def _with_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the shared options, and one for each of the readers'."""
+def _reader_options() -> dict[str, Any]:
     from gyro_pipeline.parameters import ReaderOptions  # noqa: PLC0415
 
-    for name, info in reversed(ReaderOptions.model_fields.items()):
-        text = info.description or "a name, or a number from 0"
-        command = click.option(_flag(name), name, help=text, metavar="VALUE")(command)
-    kinds = {float | None: float, bool: bool, bool | None: bool}
-    for item in reversed([item for item in fields(Options) if item.metadata]):
-        flag = item.metadata["flag"] or "--" + item.name.replace("_", "-")
-        kind = kinds.get(item.type, str)
-        more = {"is_flag": True} if kind is bool and "/" not in flag else {"type": kind}
-        given = {"default": item.default, "help": item.metadata["help"], **more}
-        command = click.option(flag, item.name, **given)(command)
-    return command
+    texts = {
+        name: info.description or "a name, or a number from 0"
+        for name, info in ReaderOptions.model_fields.items()
+    }
+    return {name: _option(_flag(name), help=text, metavar="VALUE") for name, text in texts.items()}
 
 
 def _flag(name: str) -> str:
-    return "--" + _SHORT.get(name, name).replace("_", "-")
+    return "--scale" if name == "scale_dps" else "--" + name.replace("_", "-")
 
 
-def _typed(name: str, text: str) -> Any:
-    """An option's text as the readers take it."""
-
-    def column(part: str) -> str | int:
-        return int(part) if part.strip().isdigit() else part.strip()
-
-    def number(part: str) -> str | float:
-        return float(part) if re.fullmatch(r"[-+.\deE]*\d[-+.\deE]*", part) else part
-
-    if name in _TRIPLES:
-        return tuple(map(column, text.split(",")))
-    if name == "rows":
-        pairs = (part.partition("=") for part in text.split(","))
-        return {column(key): number(value) for key, _, value in pairs}
-    if name == "time_units":
-        return number(text)
-    return column(text) if name.endswith("_column") else text
-
-
-def _reader_options(given: dict[str, Any]) -> Any:
-    """The readers' options, checked."""
+def _read_reader_options(texts: dict[str, str]) -> Any:
+    """The readers' options of what was typed: lists with commas, ``rows`` as COLUMN=VALUE."""
     from pydantic import ValidationError  # noqa: PLC0415
 
     from gyro_pipeline.parameters import ReaderOptions  # noqa: PLC0415
 
+    given: dict[str, Any] = {name: _value(text) for name, text in texts.items() if text is not None}
+    for name in {"columns", "acceleration_columns", "rows"} & given.keys():
+        given[name] = [_value(part.strip()) for part in texts[name].split(",")]
+    if "rows" in given:
+        pairs = (part.partition("=") for part in texts["rows"].split(","))
+        given["rows"] = {_value(column.strip()): _value(value) for column, _, value in pairs}
     try:
         return ReaderOptions(**given)
     except ValidationError as error:
         first = error.errors()[0]
         text = first["msg"].removeprefix("Value error, ")
-        name, _, what = text.partition(": ")
-        name, what = (str(first["loc"][0]), text) if first["loc"] else (name, what)
-        raise InputError(f"{_flag(name)}: {what}") from error
+        name, _, rest = text.partition(": ")
+        name, rest = (str(first["loc"][0]), text) if first["loc"] else (name, rest)
+        raise InputError(f"{_flag(name)}: {rest}") from error
+
+
+def _value(text: str) -> Any:
+    """A number or true or false, or else the text."""
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
 
 
 def _in_options(message: str) -> str:
@@ -147,10 +132,10 @@ def _in_options(message: str) -> str:
 
     if IN_READER not in message:
         return message
-    said, _, advice = message.replace(f" {IN_READER}", "").partition("; ")
+    text, _, advice = message.replace(f" {IN_READER}", "").partition("; ")
     for name in sorted(ReaderOptions.model_fields, key=len, reverse=True):
         advice = re.sub(rf"(?<![\w-])`?{name}\b(?!-):?`?", _flag(name), advice)
-    return f"{said}; {advice}"
+    return f"{text}; {advice}"
 
 
 def _say(text: str, colour: str = "yellow") -> None:
@@ -164,12 +149,9 @@ class Commands(click.Group):
         """Run a command, and end with its code."""
         try:
             code = super().invoke(ctx)
-        except InputError as error:
+        except (InputError, RegistryError) as error:
             _say(_in_options(str(error)), "red")
-            code = USAGE
-        except RegistryError as error:
-            _say(str(error), "red")
-            code = NOT_STORED
+            code = USAGE if isinstance(error, InputError) else NOT_STORED
         ctx.exit(code or DONE)
 
 
@@ -179,24 +161,56 @@ def main() -> None:
     """Calibrate a gyroscope at rest: its bias, a standard deviation, the seconds still needed."""
 
 
+@dataclass
+class Job:
+    """What ``log`` and ``stream`` were asked for.
+
+    Attributes:
+        known: Arguments of :meth:`.Calibrator.open`.
+        reader: Options of the readers.
+    """
+
+    known: dict[str, Any]
+    reader: Any
+    rate_hz: float | None
+    require_history: bool
+    store: bool
+    plot: Path | None
+    as_json: bool
+
+    @classmethod
+    def of(cls, values: dict[str, Any]) -> "Job":
+        """The job that options describe."""
+        known = {name: values.pop(name) for name in _DEVICE}
+        shared = {name: values.pop(name) for name in _SHARED}
+        return cls(known, _read_reader_options(values), **shared)
+
+    def device(self) -> Device | None:
+        """Where to store; that it can be written is seen before anything is measured."""
+        if self.known["device"] is None or not self.store:
+            return None
+        device = Device(registry_folder(self.known["registry"]), self.known["device"])
+        device.create(self.known["device_type"])
+        return device
+
+
 @main.command()
-@click.argument("files", nargs=-1, required=True, type=click.Path(exists=True, dir_okay=False))
-@_with_options
-def log(files: tuple[str, ...], **values: Any) -> int:
+@click.argument("files", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@_with({**_DEVICE, **_SHARED, **_reader_options()})
+def log(files: tuple[Path, ...], **values: Any) -> int:
     """Calibrate from each of some files."""
-    options = Options.of(values)
-    return max([_log(Path(name), options) for name in files])
+    job = Job.of(values)
+    return max(_log(path, job) for path in files)
 
 
-def _log(path: Path, options: Options) -> int:
+def _log(path: Path, job: Job) -> int:
     """One file; returns the exit code."""
     from gyro_pipeline.readers import read_log  # noqa: PLC0415
     from gyro_pipeline.readers.table import IN_READER  # noqa: PLC0415
 
-    device, source = options.folder(), hashlib.sha256(path.read_bytes()).hexdigest()
-    reader_options = _reader_options(options.reader)
+    device = job.device()
     try:
-        recording = read_log(path, reader_options, options.rate)
+        recording = read_log(path, job.reader, job.rate_hz)
     except InputError as error:
         _say(_in_options(str(error)), "red")
         return USAGE if IN_READER in str(error) else UNUSABLE
@@ -204,207 +218,198 @@ def _log(path: Path, options: Options) -> int:
         if finding.outcome == "rejected":
             _say(_in_options(f"{path}: {finding.check}: {finding.detail}"), "red")
             return UNUSABLE
-    rate_hz = recording.rate_hz or options.rate
+    rate_hz = recording.rate_hz or job.rate_hz
     if rate_hz is None:
         raise InputError(f"{path}: expected times that tell the rate, got none; give --rate")
-    calibrator = options.calibrator(rate_hz, source)
-    states = _fed(calibrator, recording, 1.0 if options.plot else np.inf)
-    return _report(calibrator, options, states, device, source, path.name)
+    source = hashlib.sha256(path.read_bytes()).hexdigest()
+    calibrator = Calibrator.open(rate_hz=rate_hz, **job.known, without=source)
+    states = _feed(calibrator, recording, 1.0 if job.plot else np.inf)
+    return _report(calibrator, job, states, device, source, path.name)
 
 
-def _fed(calibrator: Calibrator, recording: Any, chunk_s: float) -> list[State]:
+def _feed(calibrator: Calibrator, recording: Any, chunk_s: float) -> list[State]:
     """Feed a log in chunks; the states after each."""
-    rates, count = recording.samples, len(recording.samples)
+    count = len(recording.samples)
     times = np.arange(count) / calibrator.rate_hz
     for row in recording.gap_rows:  # how long a gap is, a log does not say
         times[row:] += 2 * BLOCK_S
-    columns = times, rates, recording.acceleration_g, recording.temperature_c
-    step = max(round(min(chunk_s * calibrator.rate_hz, count)), 1)
-    states = []
-    for first in range(0, count, step):
-        parts: list[Any] = [None if x is None else x[first : first + step] for x in columns]
-        states.append(calibrator.update(*parts))
+    columns: list[Any] = [
+        times,
+        recording.samples,
+        recording.acceleration_g,
+        recording.temperature_c,
+    ]
+    step, states = max(round(min(chunk_s * calibrator.rate_hz, count)), 1), []
+    for row in range(0, count, step):
+        chunk: list[Any] = [None if x is None else x[row : row + step] for x in columns]
+        states.append(calibrator.update(*chunk))
     return states
 
 
-def _posix(text: str | None) -> float | None:
-    """POSIX seconds of such, or of an ISO 8601 time."""
-    if text is None:
-        return None
-    try:
-        return (
-            float(text)
-            if re.fullmatch(r"[\d.]+", text)
-            else datetime.fromisoformat(text).timestamp()
-        )
-    except ValueError as error:
-        expected = "2026-01-31T12:00:00+00:00 or POSIX seconds"
-        raise InputError(f"--started-at: expected {expected}, got {text!r}") from error
-
-
 def _report(  # noqa: PLR0917 - what an answer is made of
-    calibrator: Calibrator, options: Options, states: Sequence[State], device: Device | None,
+    calibrator: Calibrator, job: Job, states: Sequence[State], device: Device | None,
     source: str, name: str,
 ) -> int:  # fmt: skip
     """Print, plot and store; returns the exit code."""
-    state = calibrator.finish()
-    code, evidence = _code(calibrator, state, options), calibrator.evidence()
-    if options.json:
-        click.echo(json.dumps(output.as_json(state, options.device, source=name), allow_nan=False))
+    state, target = calibrator.finish(), job.known["target_mdps"]
+    code = _code(state, job)
+    if job.as_json:
+        answer = output.as_json(state, job.known["device"], source=name)
+        click.echo(json.dumps(answer, allow_nan=False))
     else:
         if code != UNUSABLE:
-            past = output.describe(calibrator.prior.count, calibrator.now.same_heading)
-            click.echo(output.as_text(state, options.target, evidence.temperature_c, past))
+            past = _past(calibrator)
+            temperature_c = calibrator.evidence().temperature_c
+            click.echo(output.as_text(state, target, temperature_c, past))
         for sentence in output.notes(state):
             _say(sentence, "red" if code in {UNUSABLE, NOT_AT_REST} else "yellow")
-    if options.plot:
-        output.plot(Path(options.plot), [*states, state], options.target)
-    if device is not None and options.store and code != UNUSABLE:
-        _store(calibrator, state, options, device, source, name)
+    if job.plot:
+        output.plot(job.plot, [*states, state], target)
+    if device is not None and code != UNUSABLE:
+        _store(calibrator, state, job, device, {"hash": source, "source": name})
     return code
 
 
-def _store(  # noqa: PLR0917 - what a line is made of
-    calibrator: Calibrator, state: State, options: Options, device: Device, source: str, name: str
-) -> None:
-    """Add the calibration, or the attempt, to the device's history."""
-    said = {
-        "hash": source, "source": name, "time": _posix(options.started_at),
-        "since_power_on_s": options.since_power_on, "version": gyro_pipeline.__version__,
-        "same_heading": calibrator.now.same_heading, "known_still": options.known_still,
-    }  # fmt: skip
-    line = registry.line_of(calibrator.evidence(), state, said, calibrator.temperature_range)
-    if not device.append(line):
-        _say(f"{name} is stored already; it is not stored again")
-        return
-    try:
-        device.write_model(options.calibrator(calibrator.rate_hz))
-    except RegistryError as error:
-        _say(f"{name} is stored, but model.json is not made anew: {error}")
+def _past(calibrator: Calibrator) -> str:
+    """The history in a few words."""
+    count = max(calibrator.best.prior.count)
+    heading = f"heading {'' if calibrator.now.same_heading else 'not '}declared to repeat"
+    return f"{count} calibration{'s' * (count != 1)}, {heading}" if count else "none"
 
 
-def _code(calibrator: Calibrator, state: State, options: Options) -> int:
+def _code(state: State, job: Job) -> int:
     """The exit code of an answer."""
-    if calibrator.facts.unusable or any(reason.code == "unit" for reason in state.reasons):
+    if any(reason.code in UNUSABLE_CODES for reason in state.reasons):
         return UNUSABLE
-    if options.require_history and not all(outcome == USED for outcome in state.history):
+    if job.require_history and not all(outcome == USED for outcome in state.history):
         return NO_HISTORY
     if state.rest != STILL:
         return NOT_AT_REST
     return DONE if state.reached else NOT_REACHED
 
 
+def _store(
+    calibrator: Calibrator, state: State, job: Job, device: Device, source: dict[str, str]
+) -> None:
+    """Add the calibration, or the attempt, to the device's history."""
+    name, known = source["source"], job.known
+    declared = {
+        "time": known["started_at"], "since_power_on_s": known["since_power_on_s"],
+        "same_heading": calibrator.now.same_heading, "known_still": known["known_still"],
+        "version": gyro_pipeline.__version__,
+    }  # fmt: skip
+    if not device.append(registry.line_of(calibrator, state, {**source, **declared})):
+        _say(f"{name} is stored already; it is not stored again")
+        return
+    try:
+        device.write_model(Calibrator.open(rate_hz=calibrator.rate_hz, **known))
+    except RegistryError as error:
+        _say(f"{name} is stored, but model.json is not made anew: {error}")
+
+
 @main.command()
 @click.option("--port", help="serial port; else standard input")
 @click.option("--baud", type=int, default=115200, show_default=True)
 @click.option("--timeout", type=float, default=5.0, show_default=True, help="of silence, seconds")
-@_with_options
+@_with({**_DEVICE, **_SHARED, **_reader_options()})
 def stream(port: str | None, baud: int, timeout: float, **values: Any) -> int:
     """Calibrate from lines as they come, until the target is reached: a JSON line a second."""
     from gyro_pipeline.calibrator import stream as lines  # noqa: PLC0415
 
-    options = Options.of(values)
-    device, parser = options.folder(), lines.Parser(_reader_options(options.reader), options.rate)
-    options.started_at = options.started_at or str(time.time())
-    calibrator, states, ended = None, [], False
+    job = Job.of(values)
+    device, parser = job.device(), lines.Parser(job.reader, job.rate_hz)
+    job.known["started_at"] = job.known["started_at"] or time.time()
+    calibrator, states = None, list[State]()
 
     def show(state: State) -> None:
-        click.echo(json.dumps(output.as_json(state, options.device), allow_nan=False))
+        answer = output.as_json(state, job.known["device"])
+        click.echo(json.dumps(answer, allow_nan=False))
+        states.append(state)
 
     with lines.source(port, baud) as descriptor:
         for samples in parser.seconds(lines.lines_of(descriptor, timeout, _say)):
             if calibrator is None:  # the first answer is the history's
-                calibrator = options.calibrator(parser.rate_hz or 0.0)
-                states.append(calibrator.state())
-                show(states[-1])
-            states.append(calibrator.update(*samples))
-            if int(states[-1].time_s) > int(states[-2].time_s):
-                show(states[-1])
-            ended = options.target is not None and states[-1].done
-            if ended:
+                calibrator = Calibrator.open(rate_hz=parser.rate_hz or 0.0, **job.known)
+                show(calibrator.state())
+            state = calibrator.update(*samples)
+            if int(state.time_s) > int(states[-1].time_s):
+                show(state)
+            if state.done and job.known["target_mdps"] is not None:
                 break
     if calibrator is None:
         raise InputError("stream: expected lines of samples, got none; check what sends them")
     if parser.bad:
         _say(f"{parser.bad} lines were of another shape and were left out")
-    source = hashlib.sha256(f"{options.started_at} {states[-1].own_dps}".encode()).hexdigest()
-    return _report(calibrator, options, states, device, source, port or "standard input")
-
-
-_registry_option = click.option("--registry", "folder", help="folder of the devices")
-_json_option = click.option("--json", "as_json", is_flag=True, help="JSON")
+    source = hashlib.sha256(f"{job.known['started_at']} {state.own_dps}".encode()).hexdigest()
+    return _report(calibrator, job, states, device, source, port or "standard input")
 
 
 @main.command()
-@click.option("--target", type=float, help="standard deviation, mdps")
-@click.option("--heading", help="the same as the drift of a heading, such as 1deg/h")
-@click.option("--device", help="name in the registry")
-@click.option("--type", "device_type", help="of the device")
-@click.option("--same-heading/--any-heading", default=None, help="the heading repeats")
-@click.option("--latitude", type=float, help="degrees")
-@_json_option
-@_registry_option
-def plan(target: float | None, heading: str | None, as_json: bool, **values: Any) -> int:
+@click.option("--heading", help="a drift of the heading in place of --target, such as 1deg/h")
+@_with({**{name: _DEVICE[name] for name in [*_DEVICE][:6]}, **_JSON})
+def plan(heading: str | None, as_json: bool, **known: Any) -> int:
     """How many seconds at rest a standard deviation takes."""
-    target_mdps = _target(target, heading)
-    options = Options(registry=values.pop("folder"), target=target_mdps, **values)
-    calibrator = options.calibrator(100.0)
+    if (heading is None) == (known["target_mdps"] is None):
+        raise InputError("plan: expected either --target 0.3 (mdps) or --heading 1deg/h")
+    target_mdps = known["target_mdps"] = known["target_mdps"] or _heading_mdps(str(heading))
+    calibrator = Calibrator.open(rate_hz=100.0, **known)
     if not np.all(calibrator.freedom > 0):
-        known = ", ".join(names(registry_folder(options.registry)))
-        text = f"expected a device of known noise; give --type ({known}) or a --device with history"
-        raise InputError(f"plan: {text}")
+        listed = ", ".join(names(registry_folder(known["registry"])))
+        text = f"expected a device of known noise; give --type ({listed})"
+        raise InputError(f"plan: {text} or a --device with history")
     seconds = calibrator.state().seconds_left
     if as_json:
-        numbers = output.numbers(seconds)
-        click.echo(json.dumps({"target_mdps": target_mdps, "seconds": numbers}))
+        answer = {"target_mdps": target_mdps, "seconds": output.numbers(seconds)}
+        click.echo(json.dumps(answer))
     else:
-        floors = calibrator.kind.noise.floor_dps / MDPS
+        floors = calibrator.device_type.noise.floor_dps / MDPS
         click.echo("\n".join(output.planned(seconds, floors, target_mdps)))
     return DONE if np.isfinite(seconds).all() else NOT_REACHED
 
 
-def _target(target: float | None, heading: str | None) -> float:
-    """The target in mdps, of one of two options."""
-    if (target is None) == (heading is None):
-        raise InputError("plan: expected either --target 0.3 (mdps) or --heading 1deg/h")
-    if target is not None:
-        return target
-    match = re.fullmatch(r"([\d.]+) *(?:deg|°)/(?:h|hr|hour)", str(heading))
-    if match is None:
-        raise InputError(f"--heading: expected such as 1deg/h, got {heading!r}")
-    return float(match[1]) / output.HEADING_DEG
+def _heading_mdps(text: str) -> float:
+    """A rate such as 1deg/h in mdps."""
+    from gyro_pipeline.units import read_unit  # noqa: PLC0415
+
+    match = re.fullmatch(r"([\d.]+) *(.+)", text)
+    unit = read_unit(match[2]) if match else None
+    if match is None or unit is None or unit.quantity != "rate":
+        raise InputError(f"--heading: expected such as 1deg/h, got {text!r}")
+    return float(match[1]) * unit.factor / MDPS
 
 
-@main.group(cls=Commands)
+@main.group()
 def devices() -> None:
     """List and look after the devices of the registry."""
 
 
 def _existing(folder: str | None, name: str) -> Device:
-    device, known = Device(registry_folder(folder), name), registry.devices(registry_folder(folder))
+    device = Device(registry_folder(folder), name)
     if not device.folder.is_dir():
-        listed = ", ".join(d.name for d in known) or "none"
+        listed = ", ".join(d.name for d in registry.devices(registry_folder(folder))) or "none"
         raise InputError(f"device: expected one of {listed}, got {name!r}; see devices list")
     return device
 
 
 @devices.command("list")
-@_json_option
-@_registry_option
+@_with({**_FOLDER, **_JSON})
 def list_devices(folder: str | None, as_json: bool) -> None:
     """Devices, their types and how many calibrations count."""
     rows = [
         {"device": d.name, "type": d.settings().get("type"), "calibrations": len(d.calibrations())}
         for d in registry.devices(registry_folder(folder))
     ]
-    click.echo(json.dumps(rows) if as_json else "\n".join(map(output.device_row, rows)))
+    if as_json:
+        click.echo(json.dumps(rows))
+        return
+    for row in rows:
+        click.echo(f"{row['device']:<24} {row['type'] or '-':<12} {row['calibrations']:>4}")
     _say(f"types: {', '.join(names(registry_folder(folder)))}")
 
 
 @devices.command()
 @click.argument("name")
-@_json_option
-@_registry_option
+@_with({**_FOLDER, **_JSON})
 def show(name: str, folder: str | None, as_json: bool) -> None:
     """Level over time, turn-on spread, walk, temperature slope and noise of a device."""
     device = _existing(folder, name)
@@ -412,14 +417,13 @@ def show(name: str, folder: str | None, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps({"lines": lines, "model": model}))
     else:
-        counting = {line["hash"] for line in device.calibrations()}
-        click.echo("\n".join(output.device_table(lines, counting, model)))
+        click.echo("\n".join(output.device_table(lines, device.calibrations(), model)))
 
 
 @devices.command()
 @click.argument("name")
 @click.argument("text")
-@_registry_option
+@_with(_FOLDER)
 def note(name: str, text: str, folder: str | None) -> None:
     """Append a note to a device's history."""
     _existing(folder, name).append({"event": "note", "time": time.time(), "text": text})
@@ -429,7 +433,7 @@ def note(name: str, text: str, folder: str | None) -> None:
 @click.argument("name")
 @click.argument("source", required=False)
 @click.option("--all", "everything", is_flag=True, help="remove the device's folder")
-@_registry_option
+@_with(_FOLDER)
 def forget(name: str, source: str | None, everything: bool, folder: str | None) -> None:
     """Withdraw a calibration, by its file's name or hash: it stays stored, and counts no more."""
     device = _existing(folder, name)
@@ -437,39 +441,39 @@ def forget(name: str, source: str | None, everything: bool, folder: str | None) 
         device.remove()
         return
     lines = [line for line in device.lines() if line["event"] == "calibration"]
-    chosen = [
+    hashes = [
         line["hash"] for line in lines
         if source and (line["source"] == source or line["hash"].startswith(source))
     ]  # fmt: skip
-    if not chosen:
+    if not hashes:
         known = ", ".join(line["source"] for line in lines) or "none"
         raise InputError(f"forget: expected one of {known}, or a hash, got {source!r}; or --all")
-    for withdrawn in chosen:
+    for withdrawn in hashes:
         device.append({"event": "forget", "time": time.time(), "of": withdrawn})
 
 
 @devices.command()
 @click.argument("name")
-@click.argument("file", type=click.Path(dir_okay=False))
-@_registry_option
-def save(name: str, file: str, folder: str | None) -> None:
+@click.argument("file", type=click.Path(dir_okay=False, path_type=Path))
+@_with(_FOLDER)
+def save(name: str, file: Path, folder: str | None) -> None:
     """Write a device to one file."""
-    Path(file).write_text(json.dumps(_existing(folder, name).content(), indent=1) + "\n", "utf-8")
+    file.write_text(json.dumps(_existing(folder, name).content(), indent=1) + "\n", "utf-8")
 
 
 @devices.command()
-@click.argument("file", type=click.Path(exists=True, dir_okay=False))
+@click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @click.option("--as", "name", help="another name")
-@_registry_option
-def load(file: str, name: str | None, folder: str | None) -> None:
+@_with(_FOLDER)
+def load(file: Path, name: str | None, folder: str | None) -> None:
     """Read a device from such a file; what is there already is kept, and nothing is doubled."""
     try:
-        content = json.loads(Path(file).read_text("utf-8"))
-        device = Device(registry_folder(folder), name or content["device"])
-        lines, settings = content["lines"], content["device_toml"]
+        content = json.loads(file.read_text("utf-8"))
+        Device(registry_folder(folder), name or content["device"]).restore(content)
     except (ValueError, KeyError, TypeError) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{file}: expected what devices save writes, but: {error!r}") from error
-    device.restore(lines, settings)
 
 
 if __name__ == "__main__":

@@ -12,33 +12,32 @@ white: e_y of variance S, and e_X. Then (generalised least squares, the sequenti
 
     information = sum of e_X e_X' / S,    c = information^-1 (sum of e_X e_y / S)
 
-and a bias that nothing is known of needs no large variance anywhere. All but y is independent of
-the data, so the variance at any later time is known now.
+so an unknown bias needs no large variance anywhere. Everything but y is independent of the data:
+the variance at any later time is known now.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from gyro_pipeline.calibrator.state import Array
 
 FLICKER_S = 120.0
 """Flicker counts down to one cycle in two such times; what is slower is turn-on bias."""
 
 # Three AR(1) processes whose block means have, in the sums that estimates of 1 to 30 s make, the
-# covariance of B = 1 in recordings of FLICKER_S: variances to 0.02 %, RMSE to 0.001 %
-# (tests/calibrator/test_filter.py compares them with the exact ones).
+# covariance of B = 1 in recordings of FLICKER_S (tests/calibrator/test_filter.py).
 _TIME_CONSTANTS_S = np.array([0.19990, 1.57091, 13.58328])
 _VARIANCES = np.array([0.826513, 0.602418, 0.896548])
 _WITHIN_BLOCK = 0.009284  # faster flicker, as white noise of a block of 0.5 s
 
-_FREE_DPS = 1.0  # standard deviation of an amplitude that nothing is known of
+_FREE_DPS = 1.0  # standard deviation of a warm-up's amplitude where the time of power-on is unknown
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Noise:
     """Noise figures of three axes (IEEE Std 952), and the warm-up.
 
@@ -57,60 +56,62 @@ class Noise:
 
     @property
     def floor_dps(self) -> Array:
-        """(3,), below which no average comes: the flicker's floor of the Allan deviation."""
+        """The flicker floor of the Allan deviation, (3,): no average comes below it."""
         return np.sqrt(2 * np.log(2) / np.pi) * self.instability
 
 
-class Own(NamedTuple):
-    """What the data alone say after each of n filters; infinite variances before the first block.
+class Estimate(NamedTuple):
+    """Estimates by the data alone after each of n filters; infinite before the first block.
 
-    The bias now is ``follows`` times the bias at the start, and something independent of it.
+    The bias now is ``transfer`` times the bias at the start, plus something independent of it.
     """
 
     bias: Array  # (n, 3), now
     variance: Array  # (n, 3)
     start: Array  # (n, 3), the bias at the start
     start_variance: Array  # (n, 3)
-    follows: Array  # (n, 3)
+    transfer: Array  # (n, 3)
     squares: Array  # (n, 3), of the residuals over their variances
     freedom: Array  # (n, 1), degrees of freedom of those
 
-    def row(self, number: int) -> "Own":
-        """After one filter, (3,) each."""
-        return Own(*(column[number] for column in self))
+
+class _Step(NamedTuple):
+    """What some seconds do to the four processes, the walk first (exact integrals)."""
+
+    keep: Array  # (4,), F
+    read: Array  # (4,), H: the mean over the step, per value at its start
+    added: Array  # (3, 4, 4), Q
+    shared: Array  # (3, 4), covariance of what is added to the end and to the mean
+    white: Array  # (3,), R
 
 
-class _Steps:
-    """What a step of some seconds does to the four processes, the walk first (exact integrals)."""
-
-    def __init__(self, noise: Noise, step_s: float) -> None:
-        d = step_s / _TIME_CONSTANTS_S
-        decay = np.exp(-d)
-        mean = -np.expm1(-d) / d  # of the block, per value at its start
-        flicker = noise.instability[:, None] ** 2 * _VARIANCES
-        walk = noise.random_walk[:, None] ** 2 * step_s
-        self.keep = np.append(1.0, decay)  # F
-        self.read = np.append(1.0, mean)  # H
-        added = np.hstack([walk, flicker * (1 - decay**2)])
-        self.added = added[:, :, None] * np.eye(4)  # Q
-        self.shared = np.hstack([walk / 2, flicker * (1 - decay) ** 2 / d])  # of end and mean
-        within = flicker * (2 * (d - 1 + decay) / d**2 - mean**2)
-        white = noise.white**2 / step_s + _WITHIN_BLOCK * noise.instability**2
-        self.white = white + walk[:, 0] / 3 + within.sum(axis=1)  # R
-        self.fading = np.outer(self.keep, self.keep)
+@lru_cache(maxsize=64)
+def _step(noise: Noise, step_s: float) -> _Step:
+    d = step_s / _TIME_CONSTANTS_S
+    decay, mean = np.exp(-d), -np.expm1(-d) / d
+    flicker = noise.instability[:, None] ** 2 * _VARIANCES
+    walk = noise.random_walk[:, None] ** 2 * step_s
+    within = flicker * (2 * (d - 1 + decay) / d**2 - mean**2)
+    white = noise.white**2 / step_s + _WITHIN_BLOCK * noise.instability**2
+    return _Step(
+        keep=np.append(1.0, decay),
+        read=np.append(1.0, mean),
+        added=np.hstack([walk, flicker * (1 - decay**2)])[:, :, None] * np.eye(4),
+        shared=np.hstack([walk / 2, flicker * (1 - decay) ** 2 / d]),
+        white=white + walk[:, 0] / 3 + within.sum(axis=1),
+    )
 
 
-@dataclass(frozen=True)
-class Filter:
-    """State after some blocks; an update makes a new one, so that older ones can be gone back to.
+class Filter(NamedTuple):
+    """State after some blocks; an update makes a new one, so one can go back to an older one.
 
     Attributes:
         noise: Of the sensor.
         block_s: Length of a block, seconds.
-        age_s: Of the warm-up at the start, seconds since power-on; None: its amplitude is free.
-        reference: (3,), deg/s, taken off the data.
+        age_s: Seconds from power-on to the start; None: the amplitude of a warm-up is free.
+        reference: (3,), deg/s, the first block's mean, which is subtracted from the data.
         time_s: Seconds since the start, gaps included.
-        blocks: How many were taken.
+        blocks: Number of blocks taken.
         states: (3, 4, 1 + p), of the walk and flicker, in y and in each column of X.
         covariance: (3, 4, 4), of the states, (deg/s)^2.
         information: (3, p, p), on c.
@@ -131,68 +132,73 @@ class Filter:
     squares: Array
 
     @classmethod
-    def start(
-        cls, noise: Noise, block_s: float, reference: ArrayLike, age_s: float | None = None
-    ) -> Self:
-        """The filter before the first block, near a reference such as the first block's mean."""
-        p = 1 if noise.warm_up is None else 2
+    def start(cls, noise: Noise, block_s: float, age_s: float | None = None) -> Self:
+        """The filter before the first block."""
+        p, zero = 1 if noise.warm_up is None else 2, np.zeros(3)
         flicker = noise.instability[:, None] ** 2 * _VARIANCES
         covariance = np.hstack([np.zeros((3, 1)), flicker])[:, :, None] * np.eye(4)
         information, weighted = np.zeros((3, p, p)), np.zeros((3, p))
         if noise.warm_up is not None:
             mean, spread, _ = noise.warm_up
             if age_s is None:
-                mean, spread = np.zeros(3), np.full(3, _FREE_DPS)
+                mean, spread = zero, np.full(3, _FREE_DPS)
             information[:, 1, 1] = 1 / spread**2
             weighted[:, 1] = mean / spread**2
+        states = np.zeros((3, 4, 1 + p))
         return cls(
-            noise, block_s, age_s, np.asarray(reference, np.float64), 0.0, 0,
-            np.zeros((3, 4, 1 + p)), covariance, information, weighted, np.zeros(3),
-        )  # fmt: skip
+            noise, block_s, age_s, zero, 0.0, 0, states, covariance, information, weighted, zero
+        )
 
     def update(self, mean: Array | None) -> tuple[Self, Array]:
         """Take the mean of a block, (3,), deg/s; None looks ahead: all but the data moves on.
 
         Returns:
             The next filter, and the block's innovation (3,) in units of its standard deviation;
-            0 where nothing was known before.
+            0 at the first block.
         """
-        steps = _steps(self.noise, self.block_s)
-        to_mean = self.covariance @ steps.read
-        variance = to_mean @ steps.read + steps.white
-        left = self._columns(mean) - steps.read @ self.states
-        gain = (steps.keep * to_mean + steps.shared) / variance[:, None]
-        covariance = steps.fading * self.covariance + steps.added
-        covariance -= (variance[:, None] * gain)[:, :, None] * gain[:, None, :]
-        of_y, of_x = left[:, 0], left[:, 1:]
+        reference = self.reference if self.blocks or mean is None else mean
+        step = _step(self.noise, self.block_s)
+        to_mean = self.covariance @ step.read
+        variance = to_mean @ step.read + step.white
+        residuals = (
+            self._columns(0.0 if mean is None else mean - reference) - step.read @ self.states
+        )
+        of_y, of_x = residuals[:, 0], residuals[:, 1:]
+        gain = (step.keep * to_mean + step.shared) / variance[:, None]
         scaled = of_x / variance[:, None]
-        states = steps.keep[:, None] * self.states + gain[:, :, None] * left[:, None, :]
-        following = type(self)(
-            self.noise, self.block_s, self.age_s, self.reference, self.time_s + self.block_s,
-            self.blocks + 1, states, covariance,
-            self.information + scaled[:, :, None] * of_x[:, None, :],
-            self.weighted + scaled * of_y[:, None], self.squares + of_y**2 / variance,
-        )  # fmt: skip
+        explained = (variance[:, None] * gain)[:, :, None] * gain[:, None, :]
+        following = self.skip(self.block_s)
+        following = following._replace(
+            reference=reference,
+            blocks=self.blocks + 1,
+            states=following.states + gain[:, :, None] * residuals[:, None, :],
+            covariance=following.covariance - explained,
+            information=self.information + scaled[:, :, None] * of_x[:, None, :],
+            weighted=self.weighted + scaled * of_y[:, None],
+            squares=self.squares + of_y**2 / variance,
+        )
         return following, self._innovation(of_y, of_x, variance)
 
     def skip(self, seconds: float) -> Self:
         """Move on over a gap without data."""
-        steps = _steps(self.noise, seconds)
-        covariance = steps.fading * self.covariance + steps.added
-        states = steps.keep[:, None] * self.states
-        return replace(self, time_s=self.time_s + seconds, states=states, covariance=covariance)
+        step = _step(self.noise, seconds)
+        return self._replace(
+            time_s=self.time_s + seconds,
+            states=step.keep[:, None] * self.states,
+            covariance=step.keep[:, None] * step.keep * self.covariance + step.added,
+        )
 
-    def _columns(self, mean: Array | None) -> Array:
+    def _columns(self, y: Array | float) -> Array:
         """(3, 1 + p): y about the reference, 1, and the decay's mean in the block."""
         columns = np.ones((3, self.states.shape[-1]))
-        columns[:, 0] = 0.0 if mean is None else mean - self.reference
+        columns[:, 0] = y
         if self.noise.warm_up is not None:
             length = self.block_s / self.noise.warm_up[2]
-            columns[:, 2] = self.decay() * -np.expm1(-length) / length
+            columns[:, 2] = self._decay() * -np.expm1(-length) / length
         return columns
 
-    def decay(self) -> float:
-        """What is left now of a warm-up's amplitude: of that at power-on, or at the start."""
+    def _decay(self) -> float:
+        """What is left now of a warm-up's amplitude at power-on, or else at the start."""
         if self.noise.warm_up is None:
             return 0.0
         return float(np.exp(-(self.time_s + (self.age_s or 0.0)) / self.noise.warm_up[2]))
@@ -200,38 +206,39 @@ class Filter:
     def _innovation(self, of_y: Array, of_x: Array, variance: Array) -> Array:
         if not self.blocks:
             return np.zeros(3)
-        c, uncertainty = self.constants()
+        c, uncertainty = self._constants()
         spread = variance + np.sum(_times(uncertainty, of_x) * of_x, axis=1)
         return np.asarray((of_y - np.sum(of_x * c, axis=1)) / np.sqrt(spread))
 
-    def constants(self) -> tuple[Array, Array]:
+    def _constants(self) -> tuple[Array, Array]:
         """The constants c by the data alone, (3, p), and their covariance, (3, p, p)."""
         uncertainty = _inverse(self.information)
         return _times(uncertainty, self.weighted), uncertainty
 
     def warm_up(self) -> tuple[Array, Array]:
         """How far the warm-up still is from its end, and the standard deviation, (3,), deg/s."""
-        c, uncertainty = self.constants()
-        return self.decay() * c[:, -1], self.decay() * np.sqrt(uncertainty[:, -1, -1])
+        c, uncertainty = self._constants()
+        return self._decay() * c[:, -1], self._decay() * np.sqrt(uncertainty[:, -1, -1])
 
     def ahead(self, blocks: int) -> list[Self]:
-        """Filters of so many blocks to come: later variances, which are known now."""
-        following = [self]
+        """Filters after each of the blocks to come: their variances are known now."""
+        filters = [self]
         for _ in range(blocks):
-            following.append(following[-1].update(None)[0])
-        return following[1:]
+            filters.append(filters[-1].update(None)[0])
+        return filters[1:]
 
 
-def own(filters: Sequence[Filter]) -> Own:
+def estimates(filters: Sequence[Filter]) -> Estimate:
     """What filters of one stretch say by the data alone."""
     first, blocks = filters[0], np.array([[f.blocks] for f in filters], np.float64)
     if not first.blocks:
         unknown, infinite = np.full((1, 3), np.nan), np.full((1, 3), np.inf)
-        none, one = np.zeros((1, 3)), np.ones((1, 3))
-        return Own(unknown, infinite, unknown, infinite, one, none, none[:, :1])
+        one, zero = np.ones((1, 3)), np.zeros((1, 3))
+        return Estimate(unknown, infinite, unknown, infinite, one, zero, zero[:, :1])
     uncertainty = _inverse(np.array([f.information for f in filters]))
     weighted = np.array([f.weighted for f in filters])
     walk = np.array([f.states[:, 0] for f in filters])  # of y, and of each column
+    walk_variance = np.array([f.covariance[:, 0, 0] for f in filters])
     c, on_c = _times(uncertainty, weighted), -walk[..., 1:]
     on_c[..., 0] += 1
     shared = _times(uncertainty, on_c)
@@ -241,15 +248,14 @@ def own(filters: Sequence[Filter]) -> Own:
         mean, spread, _ = first.noise.warm_up
         free = first.age_s is None
         squares, freedom = squares + (0 if free else (mean / spread) ** 2), freedom - free
-    of_walk = np.array([f.covariance[:, 0, 0] for f in filters])
-    return Own(
-        first.reference + walk[..., 0] + np.sum(on_c * c, axis=-1),
-        of_walk + np.sum(shared * on_c, axis=-1),
-        first.reference + c[..., 0],
-        uncertainty[..., 0, 0],
-        shared[..., 0] / uncertainty[..., 0, 0],
-        squares,
-        np.maximum(freedom, 0),
+    return Estimate(
+        bias=first.reference + walk[..., 0] + np.sum(on_c * c, axis=-1),
+        variance=walk_variance + np.sum(shared * on_c, axis=-1),
+        start=first.reference + c[..., 0],
+        start_variance=uncertainty[..., 0, 0],
+        transfer=shared[..., 0] / uncertainty[..., 0, 0],
+        squares=squares,
+        freedom=np.maximum(freedom, 0),
     )
 
 
@@ -259,13 +265,3 @@ def _inverse(matrices: Array) -> Array:
 
 def _times(matrices: Array, vectors: Array) -> Array:
     return np.sum(matrices * vectors[..., None, :], axis=-1)
-
-
-def _steps(noise: Noise, step_s: float) -> _Steps:
-    """Those of the last few lengths are kept with the noise that they are of."""
-    kept: dict[float, _Steps] = noise.__dict__.setdefault("_kept", {})
-    if step_s not in kept:
-        if len(kept) > 8:  # noqa: PLR2004 - gaps are of many lengths
-            kept.clear()
-        kept[step_s] = _Steps(noise, step_s)
-    return kept[step_s]

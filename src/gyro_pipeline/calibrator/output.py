@@ -19,10 +19,6 @@ _IN_TEXT = {"conflict", "cut", "floor", "rotation_bound"}  # reasons that the te
 
 def as_json(state: State, device: str | None, **more: Any) -> dict[str, Any]:
     """One object for a program; null stands where there is no number."""
-    reasons = [
-        {"code": r.code, "axis": r.axis, "value": _number(r.value), "limit": _number(r.limit),
-         "sentence": r.sentence} for r in state.reasons
-    ]  # fmt: skip
     return {
         "device": device,
         "bias_dps": numbers(state.bias_dps),
@@ -31,52 +27,38 @@ def as_json(state: State, device: str | None, **more: Any) -> dict[str, Any]:
         "seconds_at_rest": state.seconds_at_rest,
         "seconds_left": numbers(state.seconds_left),
         "history": list(state.history),
-        "reasons": reasons,
+        "reasons": [vars(reason) for reason in state.reasons],
         **more,
     }
 
 
 def numbers(values: Array) -> list[float | None]:
     """Numbers of JSON."""
-    return [_number(value) for value in values.tolist()]
-
-
-def _number(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else float(value)
-
-
-def describe(count: Sequence[int], same_heading: bool) -> str:
-    """The history in a few words."""
-    most = max(count)
-    heading = f"heading {'' if same_heading else 'not '}declared to repeat"
-    return f"{most} calibration{'s' * (most != 1)}, {heading}" if most else "none"
+    return [value if math.isfinite(value) else None for value in values.tolist()]
 
 
 def as_text(state: State, target_mdps: float | None, temperature_c: float | None, past: str) -> str:
     """A table of the axes, with a line above and what is left to do below; coloured."""
-    warmth = "" if temperature_c is None else f"; {temperature_c:.1f} °C"
-    cut = [f"{r.value:.1f} s" for r in state.reasons if r.code == "cut"]
-    knocks = f" (a motion at {', '.join(cut)} was cut)" if cut else ""
-    moving = "" if state.rest == STILL else f"not at rest ({state.rest}): "
-    rest = f"{moving}at rest for {state.seconds_at_rest:.1f} of {state.time_s:.1f} s"
-    lines = [
-        f"{rest}{knocks}{warmth}; history: {past}",
-        f"{'bias, deg/s':>17}{'σ, mdps':>11}   from",
-    ]
+    still = state.rest == STILL
+    cut = ", ".join(f"{r.value:.1f} s" for r in state.reasons if r.code == "cut")
+    first = "" if still else f"not at rest ({state.rest}): "
+    first += f"at rest for {state.seconds_at_rest:.1f} of {state.time_s:.1f} s"
+    first += f" (a motion at {cut} was cut)" if cut else ""
+    first += "" if temperature_c is None else f"; {temperature_c:.1f} °C"
+    lines = [click.style(f"{first}; history: {past}", fg="green" if still else "red")]
+    lines.append(f"{'bias, deg/s':>17}{'σ, mdps':>11}   from")
+    sigmas = state.sigma_dps / MDPS
     for axis, name in enumerate(AXES):
-        sigma = state.sigma_dps[axis] / MDPS
-        lines.append(f"{name}{state.bias_dps[axis]:+16.6f}{sigma:11.2f}   {_from(state, axis)}")
+        row = f"{name}{state.bias_dps[axis]:+16.6f}{sigmas[axis]:11.2f}   {_from(state, axis)}"
+        dropped = state.history[axis] == DROPPED
+        lines.append(click.style(row, fg="yellow") if dropped else row)
     if target_mdps is not None:
         lines.append(_left(state, target_mdps))
-    if np.isfinite(state.sigma_dps).all():
-        drifts = zip(state.sigma_dps / MDPS * HEADING_DEG, AXES, strict=True)
+    if np.isfinite(sigmas).all():
+        drifts = zip(sigmas * HEADING_DEG, AXES, strict=True)
         listed = ", ".join(f"{drift:.2g}° about {name}" for drift, name in drifts)
         lines.append(f"In one hour the heading drifts by {listed} (1 σ of the bias alone).")
     bounds = [r.sentence for r in state.reasons if r.code == "rotation_bound"]
-    lines[0] = click.style(lines[0], fg="green" if state.rest == STILL else "red")
-    dropped = [axis for axis in range(3) if state.history[axis] == DROPPED]
-    for number in (2 + axis for axis in dropped):
-        lines[number] = click.style(lines[number], fg="yellow")
     return "\n".join([*lines, *bounds])
 
 
@@ -92,27 +74,22 @@ def _from(state: State, axis: int) -> str:
     if state.history[axis] == USED:
         own, past = state.own_sigma_dps[axis] / MDPS, state.history_sigma_dps[axis] / MDPS
         return f"this log {own:.2f}, history {past:.2f}"
-    if state.history[axis] == DROPPED:
-        of_axis = (r for r in state.reasons if r.code == "conflict" and r.axis == AXES[axis])
-        return f"this log alone: {next(of_axis).sentence}"
-    return "this log"
+    conflicts = [r for r in state.reasons if r.code == "conflict" and r.axis == AXES[axis]]
+    return f"this log alone: {conflicts[0].sentence}" if conflicts else "this log"
 
 
 def _left(state: State, target_mdps: float) -> str:
     """How long it still takes."""
-    floors = {r.axis: r.value for r in state.reasons if r.code == "floor"}
+    floors = {r.axis: f", below its floor of {r.value:.2g}" for r in state.reasons
+              if r.code == "floor"}  # fmt: skip
     parts = []
     for name, seconds in zip(AXES, state.seconds_left, strict=True):
-        if np.isinf(seconds) and floors.get(name):
-            parts.append(
-                f"{name} does not reach {target_mdps:g} mdps, below its floor of {floors[name]:.2g}"
-            )
-        elif np.isinf(seconds):
-            parts.append(f"{name} does not reach {target_mdps:g} mdps within an hour")
+        if np.isinf(seconds):
+            why = floors.get(name, " within an hour")
+            parts.append(f"{name} does not reach {target_mdps:g} mdps{why}")
         elif seconds:
-            parts.append(
-                f"{name} needs {math.ceil(seconds):d} s more at rest for {target_mdps:g} mdps"
-            )
+            needed = f"{math.ceil(seconds)} s more at rest for {target_mdps:g} mdps"
+            parts.append(f"{name} needs {needed}")
     return f"{'; '.join(parts)}." if parts else f"The target of {target_mdps:g} mdps is reached."
 
 
@@ -128,13 +105,8 @@ def planned(seconds: Array, floors_mdps: Array, target_mdps: float) -> Iterator[
             yield f"{name}: not within an hour"
 
 
-def device_row(row: Mapping[str, Any]) -> str:
-    """A line of the list of devices."""
-    return f"{row['device']:<24} {row['type'] or '-':<12} {row['calibrations']:>4}"
-
-
 def device_table(
-    lines: Sequence[Mapping[str, Any]], counting: Collection[str], model: Mapping[str, Any] | None
+    lines: Sequence[Mapping[str, Any]], counting: Collection[str], model: Mapping[str, Any]
 ) -> Iterator[str]:
     """The history of a device, and what is derived from it."""
     yield f"{'source':<24}{'rest':>8}{'s':>8}  {'bias, deg/s':^36}{'σ, mdps':^20}  history"
@@ -147,12 +119,11 @@ def device_table(
             sigma = "".join(f"{v**0.5 / MDPS:7.2f}" for v in line["variance_dps2"] or [])
             out = "" if line["hash"] in counting else "  (does not count)"
             yield f"{head}{mean}{sigma}  {'/'.join(line['outcome'])}{out}"
-    for name, fitted, noise in zip(AXES, *(model or {"a": [], "n": []}).values(), strict=False):
-        figures = ", ".join(
-            f"{key} {value:.3g} ± {sigma:.2g}" for key, (value, sigma) in fitted.items()
-        )
-        known = "not known" if noise is None else f"{noise:.3g} mdps·√s"
-        yield f"{name}: noise {known}; {figures} (mdps, √day, °C)"
+    if model:
+        for name, fit, noise in zip(AXES, model["axes"], model["noise_mdps_rts"], strict=False):
+            figures = ", ".join(f"{key} {value:.3g} ± {sd:.2g}" for key, (value, sd) in fit.items())
+            known = "not known" if noise is None else f"{noise:.3g} mdps·√s"
+            yield f"{name}: noise {known}; {figures} (mdps, √day, °C)"
 
 
 def plot(path: Path, states: Sequence[State], target_mdps: float | None) -> None:
@@ -173,12 +144,11 @@ def plot(path: Path, states: Sequence[State], target_mdps: float | None) -> None
         raise InputError(text) from error
     figure = Figure(figsize=(8, 7), layout="constrained")
     panels = figure.subplots(3, 1, sharex=True)
+    stop = next((state.time_s for state in states if state.done), None)
     for axis, panel in enumerate(panels):
         _draw(panel, states, axis)
-        stop = next((state.time_s for state in states if state.done), None)
         if target_mdps is not None and stop is not None:
-            label = f"{target_mdps:g} mdps reached"
-            panel.axvline(stop, color="C2", linestyle="--", label=label)
+            panel.axvline(stop, color="C2", linestyle="--", label=f"{target_mdps:g} mdps reached")
     panels[0].legend(loc="upper right", fontsize="small")
     panels[-1].set_xlabel("time, s")
     figure.savefig(path)

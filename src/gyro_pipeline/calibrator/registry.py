@@ -1,12 +1,12 @@
 """The registry of devices: a folder each, whose history is only ever appended to.
 
-    <registry>/<device>/device.toml         written by people: type, mounted, latitude, notes
+    <registry>/<device>/device.toml         written by people: type, mounted, latitude, frame, notes
                         calibrations.jsonl  one line a calibration, note or withdrawal
                         model.json          derived: noise, level, tau, walk, slope
     <registry>/types/<type>.json
 
 A line is written at once, under a lock, and synced before the call returns. A line that a crash cut
-off is no line: it is left out, and the next one starts anew.
+off is ignored, and the next one starts on a new line.
 """
 
 import json
@@ -14,9 +14,8 @@ import os
 import re
 import shutil
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,43 +23,29 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from gyro_pipeline.calibrator.calibrator import Calibrator
-from gyro_pipeline.calibrator.device_types import DeviceType, read_type
-from gyro_pipeline.calibrator.history import Calibration, Circumstances
+from gyro_pipeline.calibrator.history import Calibration
 from gyro_pipeline.calibrator.state import STILL, State
 from gyro_pipeline.conventions import MDPS, InputError
 
 VARIABLE = "GYRO_CALIBRATE_REGISTRY"
 """The environment variable that names the folder."""
 
-SCHEMA = 1
 DAY_S = 86400.0
 
 _NAME = re.compile(r"[\w][\w.-]{0,63}")
 _LOCK_S = 10.0
-_TEMPLATE = """# mounted = true     # the heading repeats at each calibration
+_TEMPLATE = """{type}
+# mounted = true     # the heading repeats at each calibration
 # latitude = 32.1    # degrees
 # notes = ""
 """
 _KEYS = {"type", "mounted", "latitude", "frame", "notes"}
 
+Line = dict[str, Any]
+
 
 class RegistryError(Exception):
     """The registry cannot be written."""
-
-
-@dataclass(frozen=True)
-class Opened:
-    """What is known of a device before its samples.
-
-    Attributes:
-        kind: Its type.
-        history: Its calibrations.
-        now: What is known of this one.
-    """
-
-    kind: DeviceType
-    history: tuple[Calibration, ...] = ()
-    now: Circumstances = Circumstances()
 
 
 def registry_folder(path: str | Path | None = None) -> Path:
@@ -72,42 +57,16 @@ def registry_folder(path: str | Path | None = None) -> Path:
     return Path(platformdirs.user_data_dir("gyro-calibrate"))
 
 
-def opened(
-    device: str | None, registry: str | Path | None = None, device_type: str | None = None,
-    same_heading: bool | None = None, latitude_deg: float | None = None,
-    started_at: float | None = None, without: str | None = None,
-) -> Opened:  # fmt: skip
-    """What the registry knows of a device; options that are given overrule its ``device.toml``.
-
-    Args:
-        device: Its name; None: a device without history.
-        registry: Folder; see :func:`registry_folder`.
-        device_type: Name of the type.
-        same_heading: Whether the heading repeats.
-        latitude_deg: Of the place.
-        started_at: Of the calibration, POSIX seconds.
-        without: Hash of the source whose own stored line is not to count.
-    """
-    folder = registry_folder(registry)
-    said: Mapping[str, Any] = {}
-    history: tuple[Calibration, ...] = ()
-    if device is not None:
-        here = Device(folder, device)
-        said = here.settings()
-        lines = [line for line in here.calibrations() if not without or line["hash"] != without]
-        history = tuple(_evidence(line) for line in lines)
-    heading = bool(said.get("mounted", False)) if same_heading is None else same_heading
-    latitude = said.get("latitude") if latitude_deg is None else latitude_deg
-    day = None if started_at is None else started_at / DAY_S
-    now = Circumstances(day, same_heading=heading, latitude_deg=latitude)
-    return Opened(read_type(device_type or said.get("type"), folder), history, now)
+def devices(registry: Path) -> list["Device"]:
+    """All devices of a registry, by name."""
+    return [Device(registry, path.parent.name) for path in sorted(registry.glob("*/device.toml"))]
 
 
 class Device:
     """A device's folder.
 
     Args:
-        registry: The folder of all.
+        registry: The folder of all devices.
         name: Letters, digits, ``.``, ``-`` and ``_``.
     """
 
@@ -123,40 +82,38 @@ class Device:
     def settings(self) -> dict[str, Any]:
         """What ``device.toml`` says; nothing where there is none."""
         try:
-            said = tomllib.loads(self.settings_path.read_text("utf-8"))
-        except (FileNotFoundError, NotADirectoryError):
-            return {}
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            content = tomllib.loads(_read(self.settings_path).decode())
+        except ValueError as error:
             text = f"{self.settings_path}: expected TOML, but: {error}; correct it"
             raise InputError(text) from error
-        if extra := set(said) - _KEYS:
+        if extra := set(content) - _KEYS:
             expected = ", ".join(sorted(_KEYS))
             text = f"{self.settings_path}: expected {expected}, got {sorted(extra)}; correct it"
             raise InputError(text)
-        return said
+        return content
 
-    def lines(self) -> list[dict[str, Any]]:
+    def lines(self) -> list[Line]:
         """All whole lines of its history, the oldest first."""
-        try:
-            content = self.lines_path.read_bytes()
-        except (FileNotFoundError, NotADirectoryError):
-            return []
-        parsed = (_parsed(line) for line in content.split(b"\n"))
+        parsed = map(_parsed, _read(self.lines_path).split(b"\n"))
         return [line for line in parsed if line is not None]
 
-    def calibrations(self) -> list[dict[str, Any]]:
-        """Those that count: at rest, and not withdrawn since."""
-        return [line for line in self._kept().values() if line["rest"] == STILL]
+    def calibrations(self) -> dict[str, Line]:
+        """The calibrations that count, by hash: at rest, and not withdrawn since."""
+        return {key: line for key, line in self._kept().items() if line["rest"] == STILL}
 
-    def _kept(self) -> dict[str, dict[str, Any]]:
-        """All that are not withdrawn, by their hashes."""
-        kept: dict[str, dict[str, Any]] = {}
+    def _kept(self) -> dict[str, Line]:
+        """All that were not withdrawn since, attempts as well."""
+        kept: dict[str, Line] = {}
         for line in self.lines():
             if line["event"] == "calibration":
                 kept.setdefault(line["hash"], line)
             elif line["event"] == "forget":
                 kept.pop(line["of"], None)
         return kept
+
+    def history(self, without: str | None = None) -> list[Calibration]:
+        """The evidence of the calibrations that count, but for that of one hash."""
+        return [_evidence(line) for key, line in self.calibrations().items() if key != without]
 
     def append(self, line: Mapping[str, Any]) -> bool:
         """Write a line, synced; not if there is a calibration of the same hash.
@@ -167,7 +124,7 @@ class Device:
         Raises:
             RegistryError: The disk is full, or the folder cannot be written.
         """
-        data = json.dumps({"schema": SCHEMA, **line}, allow_nan=False).encode() + b"\n"
+        data = json.dumps({"schema": 1, **line}, allow_nan=False).encode() + b"\n"
         with self._locked():
             if line["event"] == "calibration" and line["hash"] in self._kept():
                 return False
@@ -176,53 +133,42 @@ class Device:
 
     def write_model(self, calibrator: Calibrator) -> None:
         """Replace ``model.json``, for people and other programs, by what is known now."""
-        noise = np.sqrt(calibrator.scale) * calibrator.kind.noise.white / MDPS
+        noise = np.sqrt(calibrator.scale) * calibrator.device_type.noise.white / MDPS
+        known = zip(noise.tolist(), calibrator.freedom > 0, strict=True)
         axes = [
             {key: [value / MDPS, sigma / MDPS] for key, (value, sigma) in axis.items()}
-            for axis in calibrator.prior.fitted
+            for axis in calibrator.best.prior.fitted
         ]
-        known = np.where(calibrator.freedom > 0, noise, np.nan)
-        model = {
-            "axes": axes,
-            "noise_mdps_rts": [None if np.isnan(n) else n for n in known.tolist()],
-        }
+        model = {"axes": axes, "noise_mdps_rts": [n if is_known else None for n, is_known in known]}
+        temporary = self.model_path.with_suffix(".new")
         with self._locked():
-            temporary = self.model_path.with_suffix(".new")
-            try:
-                temporary.write_text(json.dumps(model, indent=1) + "\n", "utf-8")
-                os.replace(temporary, self.model_path)
-            finally:
-                temporary.unlink(missing_ok=True)
+            temporary.write_text(json.dumps(model, indent=1) + "\n", "utf-8")
+            os.replace(temporary, self.model_path)
 
-    def model(self) -> dict[str, Any] | None:
-        """What ``model.json`` holds, if it is there."""
-        return json.loads(self.model_path.read_text("utf-8")) if self.model_path.exists() else None
+    def model(self) -> dict[str, Any]:
+        """What ``model.json`` holds; nothing where there is none."""
+        return dict(json.loads(_read(self.model_path) or "{}"))
 
     def create(self, device_type: str | None = None, settings: str = "") -> None:
-        """Make the folder and the file for people, where they are not there.
+        """Make the folder and ``device.toml``, where they are not there.
 
         Raises:
             RegistryError: Nothing can be written; this is said before anything is measured.
         """
-        kind = f'type = "{device_type}"' if device_type else '# type = "consumer"'
+        of_type = f'type = "{device_type}"' if device_type else '# type = "consumer"'
         with self._locked(), open(self.lines_path, "ab"):
             if not self.settings_path.exists():
-                self.settings_path.write_text(settings or f"{kind}\n{_TEMPLATE}", "utf-8")
+                self.settings_path.write_text(settings or _TEMPLATE.format(type=of_type), "utf-8")
 
     def content(self) -> dict[str, Any]:
         """All of it, for one file."""
-        settings = self.settings_path.read_text("utf-8") if self.settings_path.exists() else ""
-        return {
-            "schema": SCHEMA,
-            "device": self.name,
-            "device_toml": settings,
-            "lines": self.lines(),
-        }
+        settings = _read(self.settings_path).decode()
+        return {"device": self.name, "device_toml": settings, "lines": self.lines()}
 
-    def restore(self, lines: Sequence[Mapping[str, Any]], settings: str) -> None:
+    def restore(self, content: Mapping[str, Any]) -> None:
         """Add what such a file holds and is not there yet."""
-        self.create(settings=settings)
-        there = self.lines()
+        lines, there = list(content["lines"]), self.lines()
+        self.create(settings=content["device_toml"])
         for line in lines:
             if line not in there:
                 self.append(line)
@@ -245,26 +191,30 @@ class Device:
             raise RegistryError(f"{text}; give another --registry, or --no-store") from error
 
 
+def _read(path: Path) -> bytes:
+    """A file's content, empty where it is not there."""
+    try:
+        return path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError):
+        return b""
+
+
 def _append(path: Path, data: bytes) -> None:
     """All of the data at the end of a file, or none, on the disk."""
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
-    try:
-        size = os.fstat(descriptor).st_size
-        if size and os.pread(descriptor, 1, size - 1) != b"\n":
+    with open(path, "a+b", buffering=0) as file:
+        size = file.seek(0, os.SEEK_END)
+        if size and os.pread(file.fileno(), 1, size - 1) != b"\n":
             data = b"\n" + data  # a crash cut the last line off
         try:
-            written = os.write(descriptor, data)
-            if written < len(data):
+            if os.write(file.fileno(), data) < len(data):
                 raise OSError(28, "No space left on device")
-            os.fsync(descriptor)
+            os.fsync(file.fileno())
         except OSError:
-            os.ftruncate(descriptor, size)
+            file.truncate(size)
             raise
-    finally:
-        os.close(descriptor)
 
 
-def _parsed(line: bytes) -> dict[str, Any] | None:
+def _parsed(line: bytes) -> Line | None:
     try:
         content = json.loads(line)
     except ValueError:
@@ -272,50 +222,43 @@ def _parsed(line: bytes) -> dict[str, Any] | None:
     return content if isinstance(content, dict) and "event" in content else None
 
 
-def _evidence(line: Mapping[str, Any]) -> Calibration:
+def _evidence(line: Line) -> Calibration:
     """What a stored line says."""
-    warmth, up, noise = line["temperature_c"], line["gravity"], line["noise_mdps_rts"]
+    temperature, up, noise = line["temperature_c"], line["gravity"], line["noise_mdps_rts"]
     return Calibration(
-        np.array(line["mean_dps"]), np.array(line["variance_dps2"]),
-        None if line["time"] is None else line["time"] / DAY_S,
-        None if warmth is None else warmth[0], None if up is None else np.array(up),
-        tuple(line["outcome"]), None if noise is None else np.array(noise) * MDPS,
-        line["noise_freedom"],
-    )  # fmt: skip
+        mean=np.array(line["mean_dps"]),
+        variance=np.array(line["variance_dps2"]),
+        day=None if line["time"] is None else line["time"] / DAY_S,
+        temperature_c=None if temperature is None else temperature[0],
+        up=None if up is None else np.array(up),
+        outcome=tuple(line["outcome"]),
+        noise=None if noise is None else np.array(noise) * MDPS,
+        freedom=line["noise_freedom"],
+    )
 
 
-def line_of(
-    evidence: Calibration, state: State, source: Mapping[str, Any], range_c: tuple[float, float]
-) -> dict[str, Any]:
+def line_of(calibrator: Calibrator, state: State, source: Mapping[str, Any]) -> Line:
     """The line of a calibration, or of an attempt.
 
     Args:
-        evidence: Its own data's word.
+        calibrator: After its last sample.
         state: Its answer.
         source: ``hash``, ``time`` (POSIX), ``source`` and what else is to be kept of it.
-        range_c: The least and the most temperature.
     """
+    evidence, seen = calibrator.evidence(), calibrator.best.current.temperature
     usable = state.rest == STILL and bool(np.isfinite(evidence.variance).all())
-    warmth, up, noise = evidence.temperature_c, evidence.up, evidence.noise
+    noise = None if evidence.noise is None else (evidence.noise / MDPS).tolist()
     return {
         "event": "calibration",
         **source,
         "seconds": state.seconds_at_rest,
         "mean_dps": evidence.mean.tolist() if usable else None,
         "variance_dps2": evidence.variance.tolist() if usable else None,
-        "temperature_c": None if warmth is None else [warmth, *range_c],
-        "gravity": None if up is None else up.tolist(),
+        "temperature_c": [seen.mean, seen.least, seen.most] if seen.blocks else None,
+        "gravity": None if evidence.up is None else evidence.up.tolist(),
         "rest": state.rest,
         "outcome": list(evidence.outcome),
-        "noise_mdps_rts": (noise / MDPS).tolist()
-        if noise is not None and evidence.freedom
-        else None,
+        "noise_mdps_rts": noise,
         "noise_freedom": evidence.freedom,
         "reasons": [reason.sentence for reason in state.reasons],
     }
-
-
-def devices(registry: Path) -> list[Device]:
-    """All devices of a registry, by name."""
-    folders = sorted(registry.iterdir()) if registry.is_dir() else []
-    return [Device(registry, path.name) for path in folders if (path / "device.toml").exists()]

@@ -1,4 +1,4 @@
-"""What the calibrator says after each call."""
+"""What the calibrator answers after each call."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -6,6 +6,8 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+
+from gyro_pipeline.calibrator.reasons import Reason
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -18,42 +20,23 @@ USED, DROPPED, NONE = "used", "dropped", "none"
 
 
 @dataclass(frozen=True)
-class Reason:
-    """Something that a user or a program should know.
-
-    Attributes:
-        code: One word for programs, such as ``conflict``, ``motion`` or ``floor``.
-        sentence: The same for people.
-        axis: x, y or z; None where it is of all.
-        value: What was found, in the unit of the sentence.
-        limit: What it was compared with.
-    """
-
-    code: str
-    sentence: str
-    axis: str | None = None
-    value: float | None = None
-    limit: float | None = None
-
-
-@dataclass(frozen=True)
 class State:
-    """The answer so far; NaN and infinity stand where there is no number.
+    """The answer so far; NaN and infinity stand where there is no number. Arrays are (3,).
 
     Attributes:
-        bias_dps: (3,), the bias now: what it settles to, where the device warms up.
-        sigma_dps: (3,), its standard deviation; 1.96 of it to both sides hold the bias in 95 %.
-        own_dps: (3,), by this log alone.
-        own_sigma_dps: (3,), of that.
-        history_dps: (3,), by the history alone.
-        history_sigma_dps: (3,), of that.
+        bias_dps: The bias now; what it settles to, where the device warms up.
+        sigma_dps: Its standard deviation; the bias is within 1.96 of it in 95 % of cases.
+        own_dps: The bias by this log alone.
+        own_sigma_dps: Its standard deviation.
+        history_dps: The bias by the history alone.
+        history_sigma_dps: Its standard deviation.
         rest: STILL, MOVING or UNSURE.
         time_s: Seconds since the first sample.
-        seconds_at_rest: Of the stretch that the answer is from.
-        history: Three of USED, DROPPED and NONE.
-        reasons: What should be known.
-        reached: Whether the target is, on all axes; true where none is given.
-        look_ahead: Makes ``seconds_left``, which takes some time.
+        seconds_at_rest: Length of the stretch that the answer is from.
+        history: USED, DROPPED or NONE for each axis.
+        reasons: What a user should know, the most important first.
+        reached: Whether all axes reach the target; true where none is given.
+        look_ahead: Computes ``seconds_left``, which takes some time.
     """
 
     bias_dps: Array

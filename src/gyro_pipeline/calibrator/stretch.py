@@ -1,29 +1,28 @@
 """A stretch in one attitude: the filter, the test of rest, and the history with its conflict."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from statistics import NormalDist
+from typing import Any, NamedTuple, SupportsIndex
 
 import numpy as np
 
 from gyro_pipeline.calibrator.device_types import DeviceType
-from gyro_pipeline.calibrator.filter import Filter, Own, own
+from gyro_pipeline.calibrator.filter import Estimate, Filter, estimates
 from gyro_pipeline.calibrator.history import Prior, angle_deg
-from gyro_pipeline.calibrator.rest import BRIEF, WHOLE, Alarm, RestMonitor
-from gyro_pipeline.calibrator.state import Array, Mask
+from gyro_pipeline.calibrator.reasons import VERTICAL, Reason, reason
+from gyro_pipeline.calibrator.rest import ATTITUDE, MOTION, Alarm, Block, RestMonitor
+from gyro_pipeline.calibrator.state import DROPPED, NONE, USED, Array, Mask
+from gyro_pipeline.conventions import MDPS
 from gyro_pipeline.physics.mixture import Posterior, mixture_posterior
 from gyro_pipeline.quality.rest import student_limits
 
 CONFLICT = 120.0
-"""The e-value at which the history is dropped. Where it holds, that happens in at most one of so
-many calibrations (Ville), and in half as many as measured."""
+"""The e-value at which the history is dropped. Where it holds, that happens in at most one of as
+many calibrations (Ville), and in half of that as measured."""
 
 PriorOf = Callable[[Array | None, float | None, bool], Prior]
-"""The prior, by the up direction and the temperature, None where they are not measured, and whether
-a declared heading is believed."""
-
-VERTICAL = 0.9
-"""Cosine of the angle between an axis that counts as vertical and the vertical."""
+"""The prior by the up direction and the temperature, None where they are not measured, and by
+whether a declared heading is believed."""
 
 _TURN_DEG = 1.0  # the attitude is the same after a motion that turned the device by less
 _WARMER_C = 0.5  # by which the temperature moves until the prior is looked up again
@@ -33,108 +32,73 @@ _AHEAD = 64  # blocks that are looked ahead at a time
 _TWO_SIDED = 1.959964
 
 
-class Blocks(NamedTuple):
-    """Means and variances of the samples of blocks, in deg/s, g and degrees Celsius."""
+class Temperature(NamedTuple):
+    """Of the blocks of a stretch, degrees Celsius; NaN where it is unknown."""
 
-    means: Array  # (block, 3)
-    variances: Array  # (block, 3)
-    gravity: Array  # (block, 3), NaN where it is not measured
-    gravity_variances: Array  # (block,), the mean over axes
-    temperature: Array  # (block,), NaN where it is not measured
+    blocks: int = 0
+    mean: float = np.nan
+    least: float = np.inf
+    most: float = -np.inf
+    last: float = np.nan
 
-    def rows(self, first: int, last: int) -> "Blocks":
-        """Some of them."""
-        return Blocks(*(column[first:last] for column in self))
-
-
-class Conflict(NamedTuple):
-    """Where data and history contradict each other so much that the history is dropped."""
-
-    axes: Mask  # (3,)
-    away: Array  # (3,), data less history, deg/s
-    sigma: Array  # (3,), of that, if the history were right
+    def add(self, value: float) -> "Temperature":
+        """One more block."""
+        if np.isnan(value):
+            return self._replace(last=value)
+        mean = value if not self.blocks else self.mean + (value - self.mean) / (self.blocks + 1)
+        least, most = min(self.least, value), max(self.most, value)
+        return Temperature(self.blocks + 1, mean, least, most, value)
 
 
-class Taken(NamedTuple):
-    """What the blocks taken so far come to; a motion goes back to an earlier one."""
+class Snapshot(NamedTuple):
+    """What the blocks so far come to; a motion goes back to the snapshot before the last block."""
 
     filter: Filter
     prior: Prior
-    warmth: float  # degrees Celsius that the prior is of, NaN where it is of none
-    believed: bool  # that a declared heading repeats
-    dropped: Mask  # (3,), axes whose history was dropped
-    conflicts: tuple[Conflict, ...]
-    sums: Array  # (9,), of variances within blocks, gravity and its count, temperature and its
-    range_c: tuple[float, float]  # of the temperature
-    last_c: float  # temperature of the last block, NaN where it is not known
-
-
-@dataclass(frozen=True)
-class Setting:
-    """What all stretches of a calibration share.
-
-    Attributes:
-        kind: Type of the device.
-        prior_of: The history's word.
-        scale: (3,), N^2 over that of the type, as it is known beforehand.
-        freedom: (3,), degrees of freedom of that; infinite where N is known, 0 where it is not.
-        size: Samples of a block.
-        block_s: Its length, seconds.
-        known_still: The device is declared to be at rest: nothing is tested.
-    """
-
-    kind: DeviceType
-    prior_of: PriorOf
-    scale: Array
-    freedom: Array
-    size: int
-    block_s: float
-    known_still: bool = False
-
-
-class Known(NamedTuple):
-    """What follows from the blocks taken so far, (3,) each."""
-
-    alone: Own  # with N as of the type
-    own: Own  # with N as known
-    scale: Array  # N^2 over that of the type
-    freedom: Array  # degrees of freedom of that
-    bias: Array
-    variance: Array
+    prior_c: float = np.nan  # temperature that the prior is of
+    believed: bool = True  # that a declared heading repeats
+    dropped: Mask = np.zeros(3, bool)  # axes whose history was dropped
+    conflicts: tuple[Reason, ...] = ()
+    variances: Array = np.zeros(3)  # summed over blocks, within them
+    gravity: Array = np.zeros(3)  # summed over blocks
+    temperature: Temperature = Temperature()
 
 
 class Stretch:
     """What is known from blocks at rest in one attitude.
 
     Args:
-        setting: What all stretches share.
+        device_type: Its noise, and more.
+        prior_of: What the history says.
+        scale: (3,), N^2 over that of the type, as known beforehand.
+        freedom: (3,), its degrees of freedom; infinite where N is known, 0 where it is not.
+        size: Samples in a block.
+        block_s: Its length, seconds.
+        known_still: The device is declared to be at rest: nothing is tested.
         start_s: When it starts, seconds since the first sample.
-        age_s: Of the device then, seconds since power-on; None where it is not known.
+        age_s: Seconds from power-on to that; None where that is unknown.
     """
 
-    def __init__(self, setting: Setting, start_s: float = 0.0, age_s: float | None = None) -> None:
-        self.setting, self.kind, self.start_s = setting, setting.kind, start_s
-        self.scale, self.freedom, self.block_s = setting.scale, setting.freedom, setting.block_s
-        empty = Filter.start(self.kind.noise, self.block_s, np.zeros(3), age_s)
-        prior, none = setting.prior_of(None, None, True), np.zeros(3, bool)
-        no_range = np.inf, -np.inf
-        self.taken = Taken(empty, prior, np.nan, True, none, (), np.zeros(9), no_range, np.nan)
-        self._before: Taken | None = None  # the last block
-        self._last_mean = np.zeros(3)  # of that block
-        self._worked_out: tuple[Taken, Known] | None = None
+    def __init__(  # noqa: PLR0913, PLR0917 - what stretches share, and two that differ
+        self, device_type: DeviceType, prior_of: PriorOf, scale: Array, freedom: Array, size: int,
+        block_s: float, known_still: bool, start_s: float, age_s: float | None,
+    ) -> None:  # fmt: skip
+        self.device_type, self.noise, self.prior_of = device_type, device_type.noise, prior_of
+        self.scale, self.freedom, self.size, self.block_s = scale, freedom, size, block_s
+        self.known_still, self.start_s = known_still, start_s
+        start = Filter.start(self.noise, block_s, age_s)
+        self.current = Snapshot(start, prior_of(None, None, True))
+        self.previous: tuple[Snapshot, Array] | None = None  # before the last block, and its mean
         self.moving = 0  # blocks of motion that just came
-        self._turned = np.zeros(3)  # deg, over them
+        self._turned = np.zeros(3)  # degrees, over them
         self.motions: list[float] = []  # when each started, seconds since the first sample
-        self.monitor = self._monitor(None)
-
-    def _monitor(self, noise_dps: Array | None) -> RestMonitor:
-        least = self.kind.least_change
-        return RestMonitor(self.setting.size, self.block_s, least, self.freedom, noise_dps)
+        self._renew_monitor()
+        self._conclude()
 
     @property
     def blocks(self) -> int:
         """Blocks at rest that the estimate is from."""
-        return self.taken.filter.blocks
+        return self.current.filter.blocks
 
     @property
     def seconds(self) -> float:
@@ -142,304 +106,223 @@ class Stretch:
         return self.blocks * self.block_s
 
     @property
+    def prior(self) -> Prior:
+        """What the history says at the attitude and temperature of the stretch."""
+        return self.current.prior
+
+    @property
     def up(self) -> Array | None:
-        """(3,), direction of the mean acceleration."""
-        gravity = self.taken.sums[3:6]
-        length = np.linalg.norm(gravity)
-        return np.asarray(gravity / length) if length > 0 else None
-
-    @property
-    def temperature_c(self) -> float | None:
-        """Mean over the blocks."""
-        total, count = self.taken.sums[7:]
-        return float(total / count) if count else None
-
-    def take(self, blocks: Blocks) -> tuple[int, Alarm | None]:
-        """Take blocks until an alarm ends the stretch.
-
-        Returns:
-            How many blocks are done with, and that alarm, if there is one.
-        """
-        first, count = 0, len(blocks.means)
-        while first < count:
-            part = blocks.rows(first, first + 1 if self.moving else count)
-            filters, innovations = self._filtered(part.means)
-            alarm = self._alarm(part, innovations)
-            if alarm is None and self.moving and self._attitude_changed(part):
-                return first, Alarm(0, BRIEF, "attitude")
-            if alarm is None:
-                self._accept(part, filters)
-                first += len(part.means)
-            elif alarm.kind == WHOLE:
-                return first + alarm.row + 1, alarm
-            else:
-                self._leave_out(part, filters, alarm.row)
-                first += alarm.row + 1
-                if self.moving >= _PATIENCE:
-                    return first, alarm
-        return count, None
-
-    def _filtered(self, means: Array) -> tuple[list[Filter], Array]:
-        """The filter before the first block and after each, and the innovations (block, 3)."""
-        current = self.taken.filter
-        if not current.blocks:
-            current = Filter.start(current.noise, self.block_s, means[0], current.age_s)
-        filters, innovations = [current], np.empty(means.shape)
-        for row, mean in enumerate(means):
-            current, innovations[row] = current.update(mean)
-            filters.append(current)
-        return filters, innovations
-
-    def _alarm(self, part: Blocks, innovations: Array) -> Alarm | None:
-        """The first alarm; after a motion also a block that is far from the level before it."""
-        if self.setting.known_still:
-            return None
-        white = self.kind.noise.white / np.sqrt(self.block_s)
-        alarm = self.monitor.update(
-            innovations / np.sqrt(self.scale), white * np.sqrt(self.scale), part
-        )
-        if alarm is None and self.moving and self.blocks >= _REFERENCE:
-            limit = self.kind.least_change + 6 * np.sqrt(self.noise_scale()) * white
-            if np.any(np.abs(innovations[0]) * white > limit):
-                return Alarm(0, BRIEF, "motion")
-        return alarm
-
-    def _accept(self, part: Blocks, filters: list[Filter]) -> None:
-        """Take blocks at rest, with the filters before the first and after each."""
-        first, count = 0, len(part.means)
-        while first < count:
-            self._look_up(part, first)
-            moved = np.abs(part.temperature[first:] - self.taken.warmth) > _WARMER_C
-            moved |= np.isnan(self.taken.warmth) & np.isfinite(part.temperature[first:])
-            last = first + int(moved.argmax()) if moved.any() else count
-            first += self._add(part.rows(first, last), filters[first + 1 : last + 1])
-        self.moving, self._turned = 0, np.zeros(3)
-
-    def _look_up(self, part: Blocks, row: int) -> None:
-        """The prior at the attitude and the temperature of a block."""
-        warmth, up = float(part.temperature[row]), self.up
-        if up is None and np.isfinite(part.gravity[row]).all():
-            up = part.gravity[row] / np.linalg.norm(part.gravity[row])
-        if not self.blocks or np.isfinite(warmth):
-            self._set_prior(up, warmth)
-
-    def _set_prior(self, up: Array | None, warmth: float) -> None:
-        known = warmth if np.isfinite(warmth) else None
-        prior = self.setting.prior_of(up, known, self.taken.believed)
-        self.taken = self.taken._replace(prior=prior, warmth=warmth)
-
-    def _add(self, part: Blocks, filters: list[Filter]) -> int:
-        """Take blocks of one prior, up to the first at which the history is dropped.
-
-        Returns:
-            How many; what was known one block before the last is kept as well.
-        """
-        known = np.isfinite(part.temperature)[:, None]
-        felt = np.isfinite(part.gravity).all(axis=1, keepdims=True)
-        warmth = np.where(known, part.temperature[:, None], 0)
-        rows = np.hstack([part.variances, np.where(felt, part.gravity, 0), felt, warmth, known])
-        sums = np.add.accumulate(np.vstack([self.taken.sums, rows]))
-        least, most = np.where(known, warmth, np.inf), np.where(known, warmth, -np.inf)
-        lows = np.minimum.accumulate(np.append(self.taken.range_c[0], least))
-        highs = np.maximum.accumulate(np.append(self.taken.range_c[1], most))
-        count, conflict = self._conflict(filters, sums[1:])
-        part = part.rows(0, count)
-        for row in range(max(count - 2, 0), count):
-            self._before = self.taken
-            self.taken = self.taken._replace(
-                filter=filters[row], sums=sums[row + 1],
-                range_c=(lows[row + 1], highs[row + 1]), last_c=float(part.temperature[row]),
-            )  # fmt: skip
-        self._last_mean = part.means[-1]
-        if conflict is not None:
-            self._drop(conflict)
-        return count
-
-    def _drop(self, conflict: Conflict) -> None:
-        """Drop the history on axes; a heading that one of them contradicts is not believed."""
-        dropped, conflicts = self.taken.dropped | conflict.axes, (*self.taken.conflicts, conflict)
-        self.taken, up = self.taken._replace(dropped=dropped, conflicts=conflicts), self.up
-        horizontal = conflict.axes if up is None else conflict.axes & (np.abs(up) < VERTICAL)
-        if self.taken.believed and horizontal.any():
-            self.taken = self.taken._replace(believed=False)
-            self._set_prior(up, self.taken.warmth)
-
-    def _conflict(self, filters: list[Filter], sums: Array) -> tuple[int, Conflict | None]:
-        """How many blocks until the history is dropped, or all of them; and that conflict.
-
-        The e-value says of all axes together that the history is wrong. It is then dropped on the
-        axes that speak against it, for the rest of the stretch.
-        """
-        usable = self.usable
-        if not usable.any():
-            return len(filters), None
-        alone, prior = own(filters), self._prior_at(sums)
-        variance = alone.start_variance * _factor(*self._noise_of(alone))
-        seen = _with_history(alone.start, variance, prior, usable)
-        wrong = np.flatnonzero(seen.log_e > np.log(CONFLICT))
-        if not wrong.size:
-            return len(filters), None
-        row = int(wrong[0])
-        against = usable & np.greater(seen.log_ratio[row], 0)
-        away = alone.start[row] - prior.mean[row]
-        return row + 1, Conflict(against, away, np.sqrt(prior.narrow + variance[row]))
-
-    def _leave_out(self, part: Blocks, filters: list[Filter], row: int) -> None:
-        """Leave out a block of motion and the one before it."""
-        moving, motion = self.moving, part.means[max(row - 1, 0) : row + 1]
-        if row > 1:
-            self._accept(part.rows(0, row - 1), filters[:row])
-        elif row == 0 and not moving and self._before is not None:
-            self.taken = self._before  # the block before came with an earlier call
-            motion = np.vstack([self._last_mean, motion])
-        if self.blocks:
-            current = self.taken.filter
-            turned = np.sum(motion - own([current]).bias, axis=0) * self.block_s
-            for _ in motion:
-                current = current.skip(self.block_s)
-            self._turned, self.taken = self._turned + turned, self.taken._replace(filter=current)
-        if not moving:
-            self.motions.append(self.start_s + self.taken.filter.time_s)
-        self.moving, self._before = moving + len(motion), None
-        enough = self.blocks >= _REFERENCE
-        self.monitor = self._monitor(np.sqrt(self.taken.sums[:3] / self.blocks) if enough else None)
-
-    def _attitude_changed(self, part: Blocks) -> bool:
-        """Whether the device was turned over a motion: by its rates, or by gravity."""
-        up = self.up
-        tilted = up is not None and np.isfinite(part.gravity[0]).all()
-        tilt = angle_deg(part.gravity[0], up) if tilted else 0.0  # type: ignore[arg-type]
-        return self.blocks > 0 and max(float(np.linalg.norm(self._turned)), tilt) > _TURN_DEG
-
-    def skip(self, seconds: float) -> None:
-        """Move on over a gap in the data."""
-        if self.blocks:
-            self.taken = self.taken._replace(filter=self.taken.filter.skip(seconds))
-            self._before = None
-
-    def _noise_of(self, alone: Own) -> tuple[Array, Array]:
-        """N^2 over that of the type with these blocks, (n, 3), and its degrees of freedom."""
-        if np.isinf(self.freedom).all():
-            return self.scale, self.freedom
-        freedom = self.freedom + alone.freedom
-        return (self.freedom * self.scale + alone.squares) / np.maximum(freedom, 1e-9), freedom
-
-    @property
-    def _known(self) -> Known:
-        """What follows from the blocks taken so far, worked out once."""
-        if self._worked_out is None or self._worked_out[0] is not self.taken:
-            alone = own([self.taken.filter])
-            scale, freedom = (np.reshape(x, (-1, 3))[0] for x in self._noise_of(alone))
-            alone = alone.row(0)
-            scaled = _scaled(alone, scale, freedom)
-            answer = self._warmed(*self._posterior(scaled, self.usable))
-            self._worked_out = self.taken, Known(alone, scaled, scale, freedom, *answer)
-        return self._worked_out[1]
-
-    def _prior_at(self, sums: Array) -> Prior:
-        """The prior at the mean temperature of blocks, by their sums (..., 9)."""
-        total, count = sums[..., 7:8], sums[..., 8:]
-        known = (count > 0) & np.isfinite(self.taken.warmth)
-        warmer = np.where(known, total / np.maximum(count, 1) - self.taken.warmth, 0.0)
-        prior = self.taken.prior
-        return replace(prior, mean=prior.mean + prior.slope * warmer)
-
-    def _warmed(self, bias: Array, variance: Array) -> tuple[Array, Array]:
-        """A bias at the temperature of the last block, from one at the mean of the blocks'."""
-        mean, prior = self.temperature_c, self.taken.prior
-        if mean is None or np.isnan(self.taken.last_c):
-            return bias, variance
-        warmer = self.taken.last_c - mean
-        return bias + prior.slope * warmer, variance + (prior.slope_sigma * warmer) ** 2
-
-    def log_noise(self) -> tuple[Array, float]:
-        """N of this stretch alone, (3,), deg/s * sqrt(s), and its degrees of freedom."""
-        squares, freedom = self._known.alone.squares, float(self._known.alone.freedom[0])
-        if freedom < 1:
-            return np.full(3, np.nan), 0.0
-        return self.kind.noise.white * np.sqrt(squares / freedom), freedom
-
-    def noise_scale(self) -> Array:
-        """N^2 over that of the type, (3,), as known beforehand and by these blocks."""
-        return self._known.scale
-
-    def own(self) -> Own:
-        """The estimate by this stretch alone, with the noise as known, and Student's interval."""
-        return self._known.own
-
-    def answer(self) -> tuple[Array, Array]:
-        """The bias and its variance, by the stretch and the history."""
-        return self._known.bias, self._known.variance
-
-    def _posterior(self, alone: Own, usable: Mask) -> tuple[Array, Array]:
-        """Bias and variance with the history where it is usable."""
-        if not usable.any():
-            return alone.bias, alone.variance
-        prior = self._prior_at(self.taken.sums)
-        at_start = _with_history(alone.start, alone.start_variance, prior, usable)
-        unknown = np.isinf(alone.variance)
-        with np.errstate(invalid="ignore"):
-            moved = alone.bias + alone.follows * (at_start.mean - alone.start)
-            rest = alone.variance - alone.follows**2 * alone.start_variance
-        bias = np.where(usable, np.where(unknown, at_start.mean, moved), alone.bias)
-        later = np.where(unknown, 0.0, rest) + alone.follows**2 * at_start.charged
-        return bias, np.where(usable, later, alone.variance)
+        """(3,), direction of the mean acceleration; None where it is not measured."""
+        length = np.linalg.norm(self.current.gravity)
+        return np.asarray(self.current.gravity / length) if length > 0 else None
 
     @property
     def usable(self) -> Mask:
         """(3,), axes with a history that was not dropped."""
-        return np.isfinite(self.taken.prior.narrow) & ~self.taken.dropped
+        return np.isfinite(self.prior.narrow) & ~self.current.dropped
 
-    def hopeless(self, target_dps: float) -> Mask:
-        """(3,), axes whose target is below the floor of the sensor, and that have no history."""
-        floor = self.kind.noise.floor_dps * np.sqrt(self.noise_scale())
-        return np.asarray((floor > target_dps) & ~self.usable)
+    @property
+    def outcome(self) -> tuple[str, ...]:
+        """What became of the history on each axis."""
+        known, dropped = np.isfinite(self.prior.narrow), self.current.dropped
+        return tuple(np.where(known, np.where(dropped, DROPPED, USED), NONE).tolist())
+
+    @property
+    def floor_dps(self) -> Array:
+        """(3,), below which no average of the sensor comes."""
+        return np.asarray(self.noise.floor_dps * np.sqrt(self.noise_scale))
+
+    def take(self, block: Block) -> Alarm | None:
+        """Take a block; an alarm that is returned ends the stretch.
+
+        After ATTITUDE the block is the first one of the next stretch, else it is left out.
+        """
+        following, innovation = self.current.filter.update(block.mean)
+        alarm = None if self.known_still else self._alarm(block, innovation)
+        if alarm is None and self.moving and self._attitude_changed(block):
+            return Alarm(ATTITUDE)
+        if alarm is None:
+            self._accept(block, following)
+        elif alarm.code == MOTION:
+            self._leave_out(block)
+            return alarm if self.moving >= _PATIENCE else None
+        return alarm
+
+    def skip(self, seconds: float) -> None:
+        """Move on over a gap in the data."""
+        if self.blocks:
+            self.current = self.current._replace(filter=self.current.filter.skip(seconds))
+            self.previous = None
+            self._conclude()
+
+    def _renew_monitor(self) -> None:
+        enough, sums = self.blocks >= _REFERENCE, self.current.variances
+        noise_dps = np.sqrt(sums / self.blocks) if enough else None
+        least = self.device_type.least_change
+        self._monitor = RestMonitor(self.size, self.block_s, least, self.freedom, noise_dps)
+
+    def _alarm(self, block: Block, innovation: Array) -> Alarm | None:
+        """An alarm; after a motion also where a block is far from the level before it."""
+        white, known = self.noise.white / np.sqrt(self.block_s), np.sqrt(self.scale)
+        alarm = self._monitor.update(innovation / known, white * known, block)
+        if alarm is None and self.moving and self.blocks >= _REFERENCE:
+            limit = self.device_type.least_change + 6 * np.sqrt(self.noise_scale) * white
+            if np.any(np.abs(innovation) * white > limit):
+                return Alarm(MOTION)
+        return alarm
+
+    def _accept(self, block: Block, following: Filter) -> None:
+        """Take a block at rest."""
+        before, gravity = self.current, block.gravity
+        known, first = np.isfinite(gravity).all(), not self.blocks
+        if first or not abs(block.temperature - before.prior_c) <= _WARMER_C:
+            up = gravity / np.linalg.norm(gravity) if known and self.up is None else self.up
+            if first or np.isfinite(block.temperature):
+                self._set_prior(up, block.temperature)
+        self.previous = before, block.mean
+        self.current = self.current._replace(
+            filter=following,
+            variances=before.variances + block.variance,
+            gravity=before.gravity + gravity if known else before.gravity,
+            temperature=before.temperature.add(block.temperature),
+        )
+        self.moving, self._turned = 0, np.zeros(3)
+        self._conclude()
+
+    def _set_prior(self, up: Array | None, temperature_c: float) -> None:
+        known = temperature_c if np.isfinite(temperature_c) else None
+        prior = self.prior_of(up, known, self.current.believed)
+        self.current = self.current._replace(prior=prior, prior_c=temperature_c)
+
+    def _leave_out(self, block: Block) -> None:
+        """Leave out a block of motion and the one before it."""
+        motion, first = [block.mean], not self.moving
+        if first and self.previous is not None:
+            self.current, last_mean = self.previous
+            motion.append(last_mean)
+        if self.blocks:
+            bias = estimates([self.current.filter]).bias[0]
+            self._turned = self._turned + np.sum(motion - bias, axis=0) * self.block_s
+            skipped = self.current.filter.skip(len(motion) * self.block_s)
+            self.current = self.current._replace(filter=skipped)
+        if first:
+            self.motions.append(self.start_s + self.current.filter.time_s)
+        self.moving, self.previous = self.moving + len(motion), None
+        self._renew_monitor()
+        self._conclude()
+
+    def _attitude_changed(self, block: Block) -> bool:
+        """Whether the device was turned over a motion: by its rates, or by gravity."""
+        up, known = self.up, np.isfinite(block.gravity).all()
+        tilt = angle_deg(block.gravity, up) if up is not None and known else 0.0
+        return self.blocks > 0 and max(float(np.linalg.norm(self._turned)), tilt) > _TURN_DEG
+
+    def _conclude(self) -> None:
+        """Work out the answer, and drop a history that the blocks so far contradict.
+
+        The e-value says of all axes together that the history is wrong. It is then dropped on the
+        axes that speak against it, for the rest of the stretch.
+        """
+        self.unscaled = Estimate(*(x[0] for x in estimates([self.current.filter])))
+        self.noise_scale, self.noise_freedom = self.scale, self.freedom
+        if not np.isinf(self.freedom).all():
+            self.noise_freedom = self.freedom + self.unscaled.freedom
+            total = self.freedom * self.scale + self.unscaled.squares
+            self.noise_scale = total / np.maximum(self.noise_freedom, 1e-9)
+        self.estimate = _scaled(self.unscaled, self.noise_scale, self.noise_freedom)
+        seen, bias, variance = self._posterior(self.estimate)
+        if seen is not None and seen.log_e > np.log(CONFLICT):
+            self._drop(seen)
+            _, bias, variance = self._posterior(self.estimate)
+        temperature = self.current.temperature  # the answer is of the last block's
+        warmer = np.nan_to_num(temperature.last - temperature.mean)
+        self.bias = bias + self.prior.slope * warmer
+        self.variance = variance + np.square(self.prior.slope_sigma * warmer)
+
+    def _drop(self, seen: Posterior) -> None:
+        """Drop the history on axes; a heading that one of them contradicts is not believed."""
+        current, up = self.current, self.up
+        axes = self.usable & np.greater(seen.log_ratio, 0)
+        away = (self.estimate.start - self._prior_mean()) / MDPS
+        sigma = np.sqrt(self.prior.narrow + self.estimate.start_variance) / MDPS
+        reasons = [
+            _conflict(axis, float(away[axis]), float(sigma[axis])) for axis in np.flatnonzero(axes)
+        ]
+        conflicts = (*current.conflicts, *reasons)
+        self.current = current._replace(dropped=current.dropped | axes, conflicts=conflicts)
+        horizontal = axes if up is None else axes & (np.abs(up) < VERTICAL)
+        if current.believed and horizontal.any():
+            self.current = self.current._replace(believed=False)
+            self._set_prior(up, current.prior_c)
+
+    def _prior_mean(self) -> Array:
+        """Mean of the prior at the mean temperature of the blocks, by its slope."""
+        warmer = np.nan_to_num(self.current.temperature.mean - self.current.prior_c)
+        return np.asarray(self.prior.mean + self.prior.slope * warmer)
+
+    def _posterior(self, estimate: Estimate) -> tuple[Posterior | None, Array, Array]:
+        """With the history where it is usable: of the bias at the start, and bias and variance."""
+        usable, transfer = self.usable, estimate.transfer
+        if not usable.any():
+            return None, estimate.bias, estimate.variance
+        prior = self._prior_mean(), self.prior.narrow, self.prior.wide
+        mean, narrow, wide = (np.where(usable, x, 1.0) for x in prior)
+        own = np.where(usable, estimate.start_variance, np.inf)
+        seen = mixture_posterior(estimate.start, own, mean, narrow, wide)
+        unknown = np.isinf(estimate.variance)
+        with np.errstate(invalid="ignore"):
+            moved = estimate.bias + transfer * (seen.mean - estimate.start)
+            added = estimate.variance - transfer**2 * estimate.start_variance
+        bias = np.where(usable, np.where(unknown, seen.mean, moved), estimate.bias)
+        variance = np.where(unknown, 0.0, added) + transfer**2 * seen.charged
+        return seen, bias, np.where(usable, variance, estimate.variance)
+
+    def log_noise(self) -> tuple[Array | None, float]:
+        """N of this stretch alone, (3,), deg/s * sqrt(s), and its degrees of freedom."""
+        freedom = float(self.unscaled.freedom[0])
+        if freedom < 1:
+            return None, 0.0
+        return self.noise.white * np.sqrt(self.unscaled.squares / freedom), freedom
 
     def reached(self, target_dps: float) -> Mask:
-        """(3,), axes whose standard deviation is at the target or below."""
-        return np.asarray(self.answer()[1] <= target_dps**2) & ~self.hopeless(target_dps)
+        """(3,), axes at the target, which is not below the sensor's floor without a history."""
+        below = (self.floor_dps > target_dps) & ~self.usable
+        return np.asarray((self.variance <= target_dps**2) & ~below)
 
     def seconds_left(self, target_dps: float, most_s: float) -> Array:
         """(3,), seconds at rest until the target; infinite where it is not within ``most_s``.
 
         The variances of blocks to come do not depend on the data. What does, the distance from the
-        history and the noise where it is not known, is taken as it is now.
+        history and the noise where it is unknown, is taken as it is now.
         """
-        known, usable = self._known, self.usable
-        seen, hopeless = self.blocks > 0, self.hopeless(target_dps)
+        below = (self.floor_dps > target_dps) & ~self.usable
         left = np.where(self.reached(target_dps), 0.0, np.inf)
-        following, done = self.taken.filter, 0
-        while np.any(np.isinf(left) & ~hopeless) and done * self.block_s < most_s:
+        start = self.estimate.start if self.blocks else np.where(self.usable, self.prior.mean, 0.0)
+        following, done = self.current.filter, 0
+        while np.any(np.isinf(left) & ~below) and done * self.block_s < most_s:
             filters = following.ahead(_AHEAD)
             following, number = filters[-1], done + 1 + np.arange(_AHEAD)[:, None]
-            later = _scaled(own(filters), known.scale, known.freedom + number)
-            start = known.own.start if seen else np.where(usable, self.taken.prior.mean, 0.0)
+            later = _scaled(estimates(filters), self.noise_scale, self.noise_freedom + number)
             later = later._replace(start=np.broadcast_to(start, (_AHEAD, 3)))
-            reached = self._posterior(later, usable)[1] <= target_dps**2
+            reached = self._posterior(later)[2] <= target_dps**2
             first = np.where(reached.any(axis=0), done + 1 + reached.argmax(axis=0), np.inf)
             left = np.minimum(left, first * self.block_s)
             done += _AHEAD
-        return left
+        return np.where(below, np.inf, left)
 
 
-def _with_history(start: Array, variance: Array, prior: Prior, usable: Mask) -> Posterior:
-    """The posterior of the bias at the start; meaningless on axes whose history is not usable."""
-    mean, narrow, wide = (np.where(usable, x, 1.0) for x in (prior.mean, prior.narrow, prior.wide))
-    return mixture_posterior(start, np.where(usable, variance, np.inf), mean, narrow, wide)
+def _conflict(axis: SupportsIndex, away: float, sigma: float) -> Reason:
+    chance = max(2 * NormalDist().cdf(-abs(away / sigma)), 1e-12)
+    words: dict[str, Any] = {"away": abs(away), "chance": 1 / chance}
+    return reason("conflict", away, abs(away / sigma), axis, **words)
 
 
-def _factor(scale: Array, freedom: Array) -> Array:
-    """On variances of N as of the type: the noise as known, and 1.96 sigma as Student's limits."""
-    if np.isinf(freedom).all():
-        return scale
-    known = np.where(freedom > 0, freedom, 1.0)
-    with np.errstate(invalid="ignore"):
-        student = np.where(np.isinf(known), _TWO_SIDED, student_limits(_TWO_SIDED, known))
-    return np.where(freedom > 0, scale * (student / _TWO_SIDED) ** 2, np.inf)
-
-
-def _scaled(alone: Own, scale: Array, freedom: Array) -> Own:
-    factor = _factor(scale, freedom)
-    return alone._replace(
-        variance=alone.variance * factor, start_variance=alone.start_variance * factor
+def _scaled(estimate: Estimate, scale: Array, freedom: Array) -> Estimate:
+    """With the noise as known, and 1.96 sigma as Student's limits; infinite where it is unknown."""
+    factor = scale
+    if not np.isinf(freedom).all():
+        student = student_limits(_TWO_SIDED, np.clip(freedom, 1e-3, 1e9))
+        factor = np.where(freedom > 0, scale * (student / _TWO_SIDED) ** 2, np.inf)
+    return estimate._replace(
+        variance=estimate.variance * factor, start_variance=estimate.start_variance * factor
     )
