@@ -233,7 +233,8 @@ class Calibrator:
         self.counts.zero += int(np.sum(zero))
         if len(rows) and np.isfinite(rows[-1, 0]):
             self._last_time = float(rows[-1, 0])
-        return rows[finite & ~zero]
+        good = finite & ~zero
+        return rows if good.all() else rows[good]
 
     def _take_whole_blocks(self, rows: Array) -> Array:
         """Take the blocks of rows without a gap; returns the rows that are left."""
@@ -316,8 +317,9 @@ class Calibrator:
 
 def _blocks(samples: Array) -> list[Block]:
     """Means and variances of whole blocks, (block, sample, 8)."""
-    means, variances = samples.mean(axis=1), samples[..., 1:7].var(axis=1, ddof=1)
-    columns = (
-        means[:, 1:4], variances[:, :3], means[:, 4:7], variances[:, 3:].mean(axis=1), means[:, 7],
-    )  # fmt: skip
+    means, variances = samples.mean(axis=1), samples[..., 1:4].var(axis=1, ddof=1)
+    gravity_variances = np.full(len(samples), np.nan)
+    if np.isfinite(means[:, 4:7]).any():
+        gravity_variances = samples[..., 4:7].var(axis=1, ddof=1).mean(axis=1)
+    columns = means[:, 1:4], variances, means[:, 4:7], gravity_variances, means[:, 7].tolist()
     return [Block(*row) for row in zip(*columns, strict=True)]

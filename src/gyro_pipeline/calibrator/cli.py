@@ -11,10 +11,10 @@ import re
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import click
@@ -161,37 +161,20 @@ def main() -> None:
     """Calibrate a gyroscope at rest: its bias, a standard deviation, the seconds still needed."""
 
 
-@dataclass
-class Job:
-    """What ``log`` and ``stream`` were asked for.
+def _job(values: dict[str, Any]) -> SimpleNamespace:
+    """What ``log`` and ``stream`` were asked for: ``known`` is for :meth:`.Calibrator.open`."""
+    known = {name: values.pop(name) for name in _DEVICE}
+    shared = {name: values.pop(name) for name in _SHARED}
+    return SimpleNamespace(known=known, reader=_read_reader_options(values), **shared)
 
-    Attributes:
-        known: Arguments of :meth:`.Calibrator.open`.
-        reader: Options of the readers.
-    """
 
-    known: dict[str, Any]
-    reader: Any
-    rate_hz: float | None
-    require_history: bool
-    store: bool
-    plot: Path | None
-    as_json: bool
-
-    @classmethod
-    def of(cls, values: dict[str, Any]) -> "Job":
-        """The job that options describe."""
-        known = {name: values.pop(name) for name in _DEVICE}
-        shared = {name: values.pop(name) for name in _SHARED}
-        return cls(known, _read_reader_options(values), **shared)
-
-    def device(self) -> Device | None:
-        """Where to store; that it can be written is seen before anything is measured."""
-        if self.known["device"] is None or not self.store:
-            return None
-        device = Device(registry_folder(self.known["registry"]), self.known["device"])
-        device.create(self.known["device_type"])
-        return device
+def _device(job: SimpleNamespace) -> Device | None:
+    """Where to store; that it can be written is seen before anything is measured."""
+    if job.known["device"] is None or not job.store:
+        return None
+    device = Device(registry_folder(job.known["registry"]), job.known["device"])
+    device.create(job.known["device_type"])
+    return device
 
 
 @main.command()
@@ -199,16 +182,16 @@ class Job:
 @_with({**_DEVICE, **_SHARED, **_reader_options()})
 def log(files: tuple[Path, ...], **values: Any) -> int:
     """Calibrate from each of some files."""
-    job = Job.of(values)
+    job = _job(values)
     return max(_log(path, job) for path in files)
 
 
-def _log(path: Path, job: Job) -> int:
+def _log(path: Path, job: SimpleNamespace) -> int:
     """One file; returns the exit code."""
     from gyro_pipeline.readers import read_log  # noqa: PLC0415
     from gyro_pipeline.readers.table import IN_READER  # noqa: PLC0415
 
-    device = job.device()
+    device = _device(job)
     try:
         recording = read_log(path, job.reader, job.rate_hz)
     except InputError as error:
@@ -247,7 +230,7 @@ def _feed(calibrator: Calibrator, recording: Any, chunk_s: float) -> list[State]
 
 
 def _report(  # noqa: PLR0917 - what an answer is made of
-    calibrator: Calibrator, job: Job, states: Sequence[State], device: Device | None,
+    calibrator: Calibrator, job: SimpleNamespace, states: Sequence[State], device: Device | None,
     source: str, name: str,
 ) -> int:  # fmt: skip
     """Print, plot and store; returns the exit code."""
@@ -258,9 +241,7 @@ def _report(  # noqa: PLR0917 - what an answer is made of
         click.echo(json.dumps(answer, allow_nan=False))
     else:
         if code != UNUSABLE:
-            past = _past(calibrator)
-            temperature_c = calibrator.evidence().temperature_c
-            click.echo(output.as_text(state, target, temperature_c, past))
+            click.echo(output.as_text(state, target, calibrator))
         for sentence in output.notes(state):
             _say(sentence, "red" if code in {UNUSABLE, NOT_AT_REST} else "yellow")
     if job.plot:
@@ -270,14 +251,7 @@ def _report(  # noqa: PLR0917 - what an answer is made of
     return code
 
 
-def _past(calibrator: Calibrator) -> str:
-    """The history in a few words."""
-    count = max(calibrator.best.prior.count)
-    heading = f"heading {'' if calibrator.now.same_heading else 'not '}declared to repeat"
-    return f"{count} calibration{'s' * (count != 1)}, {heading}" if count else "none"
-
-
-def _code(state: State, job: Job) -> int:
+def _code(state: State, job: SimpleNamespace) -> int:
     """The exit code of an answer."""
     if any(reason.code in UNUSABLE_CODES for reason in state.reasons):
         return UNUSABLE
@@ -289,7 +263,11 @@ def _code(state: State, job: Job) -> int:
 
 
 def _store(
-    calibrator: Calibrator, state: State, job: Job, device: Device, source: dict[str, str]
+    calibrator: Calibrator,
+    state: State,
+    job: SimpleNamespace,
+    device: Device,
+    source: dict[str, str],
 ) -> None:
     """Add the calibration, or the attempt, to the device's history."""
     name, known = source["source"], job.known
@@ -316,8 +294,8 @@ def stream(port: str | None, baud: int, timeout: float, **values: Any) -> int:
     """Calibrate from lines as they come, until the target is reached: a JSON line a second."""
     from gyro_pipeline.calibrator import stream as lines  # noqa: PLC0415
 
-    job = Job.of(values)
-    device, parser = job.device(), lines.Parser(job.reader, job.rate_hz)
+    job = _job(values)
+    device, parser = _device(job), lines.Parser(job.reader, job.rate_hz)
     job.known["started_at"] = job.known["started_at"] or time.time()
     calibrator, states = None, list[State]()
 

@@ -43,33 +43,19 @@ _TEXTS = {"schema", "type", "about", "sources", "warm_up"}
 
 @dataclass(frozen=True)
 class DeviceType:
-    """A type in deg/s; arrays are (3,).
-
-    Attributes:
-        name: Of the type.
-        noise: N, B, K and warm-up; N is 1 where it is not known, and ``noise_freedom`` 0.
-        noise_freedom: Degrees of freedom that N is worth before a log is seen; infinite: known.
-        turn_on: Median of tau.
-        turn_on_factor: One standard deviation of tau, as a factor.
-        walk: Median of the level's walk, deg/s a square root of a day.
-        walk_factor: One standard deviation of the walk, as a factor.
-        wide: Standard deviation of the wide prior.
-        slope: Of the bias, deg/s a degree Celsius.
-        slope_spread: Its standard deviation; 0: temperature is not used.
-        least_change: Smaller changes of the rate within half a minute are no motion.
-    """
+    """A type in deg/s; arrays are (3,)."""
 
     name: str
-    noise: Noise
-    noise_freedom: float
-    turn_on: Array
-    turn_on_factor: float
-    walk: Array
+    noise: Noise  # N is 1 where it is not known, and noise_freedom 0
+    noise_freedom: float  # that N is worth before a log is seen; infinite: known
+    turn_on: Array  # median of tau
+    turn_on_factor: float  # one standard deviation of tau, as a factor
+    walk: Array  # median of the level's walk, deg/s a square root of a day
     walk_factor: float
-    wide: Array
-    slope: Array
-    slope_spread: Array
-    least_change: float
+    wide: Array  # standard deviation of the wide prior
+    slope: Array  # of the bias, deg/s a degree Celsius
+    slope_spread: Array  # its standard deviation; 0: temperature is not used
+    least_change: float  # smaller changes of the rate within half a minute are no motion
 
 
 def read_type(name: str | None, registry: Path | None = None) -> DeviceType:

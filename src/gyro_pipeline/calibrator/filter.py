@@ -39,19 +39,12 @@ _FREE_DPS = 1.0  # standard deviation of a warm-up's amplitude where the time of
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Noise figures of three axes (IEEE Std 952), and the warm-up.
+    """Noise figures of three axes (IEEE Std 952), (3,) each, and the warm-up."""
 
-    Attributes:
-        white: N, (3,), deg/s * sqrt(s).
-        instability: B, (3,), deg/s.
-        random_walk: K, (3,), deg/s / sqrt(s).
-        warm_up: Mean and standard deviation of the amplitude at power-on, each (3,), deg/s, and the
-            time constant in seconds; None where the device has no warm-up.
-    """
-
-    white: Array
-    instability: Array
-    random_walk: Array
+    white: Array  # N, deg/s * sqrt(s)
+    instability: Array  # B, deg/s
+    random_walk: Array  # K, deg/s / sqrt(s)
+    # Mean and standard deviation of the amplitude at power-on, deg/s; time constant, s.
     warm_up: tuple[Array, Array, float] | None = None
 
     @property
@@ -103,33 +96,19 @@ def _step(noise: Noise, step_s: float) -> _Step:
 
 
 class Filter(NamedTuple):
-    """State after some blocks; an update makes a new one, so one can go back to an older one.
-
-    Attributes:
-        noise: Of the sensor.
-        block_s: Length of a block, seconds.
-        age_s: Seconds from power-on to the start; None: the amplitude of a warm-up is free.
-        reference: (3,), deg/s, the first block's mean, which is subtracted from the data.
-        time_s: Seconds since the start, gaps included.
-        blocks: Number of blocks taken.
-        states: (3, 4, 1 + p), of the walk and flicker, in y and in each column of X.
-        covariance: (3, 4, 4), of the states, (deg/s)^2.
-        information: (3, p, p), on c.
-        weighted: (3, p), the sum of e_X e_y / S.
-        squares: (3,), the sum of e_y^2 / S.
-    """
+    """State after some blocks; an update makes a new one, so one can go back to an older one."""
 
     noise: Noise
     block_s: float
-    age_s: float | None
-    reference: Array
-    time_s: float
-    blocks: int
-    states: Array
-    covariance: Array
-    information: Array
-    weighted: Array
-    squares: Array
+    age_s: float | None  # from power-on to the start; None: a warm-up's amplitude is free
+    reference: Array  # (3,), deg/s, the first block's mean, which is subtracted from the data
+    time_s: float  # since the start, gaps included
+    blocks: int  # taken so far
+    states: Array  # (3, 4, 1 + p), of the walk and flicker, in y and in each column of X
+    covariance: Array  # (3, 4, 4), of the states, (deg/s)^2
+    information: Array  # (3, p, p), on c
+    weighted: Array  # (3, p), the sum of e_X e_y / S
+    squares: Array  # (3,), the sum of e_y^2 / S
 
     @classmethod
     def start(cls, noise: Noise, block_s: float, age_s: float | None = None) -> Self:
@@ -264,4 +243,4 @@ def _inverse(matrices: Array) -> Array:
 
 
 def _times(matrices: Array, vectors: Array) -> Array:
-    return np.sum(matrices * vectors[..., None, :], axis=-1)
+    return np.asarray((matrices @ vectors[..., None])[..., 0])

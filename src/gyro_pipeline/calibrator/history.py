@@ -16,7 +16,7 @@ direction u in the axes of the device, latitude phi and an unknown heading, the 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -41,71 +41,41 @@ Fitted = dict[str, tuple[float, float]]
 
 @dataclass(frozen=True)
 class Calibration:
-    """Evidence of one calibration.
+    """Evidence of one calibration, by its own data alone; arrays are (3,)."""
 
-    Attributes:
-        mean: (3,), deg/s, by its own data alone.
-        variance: (3,), of the mean.
-        day: When it was made, in days since any epoch; None where that is not known.
-        temperature_c: Mean; None where it was not measured.
-        up: (3,), the direction of the mean acceleration, a unit vector; None where not measured.
-        outcome: What became of the history on each axis.
-        noise: N, (3,), deg/s * sqrt(s), as these data show it.
-        freedom: Its degrees of freedom.
-    """
-
-    mean: Array
-    variance: Array
-    day: float | None = None
+    mean: Array  # deg/s
+    variance: Array  # of the mean
+    day: float | None = None  # when it was made, in days since any epoch
     temperature_c: float | None = None
-    up: Array | None = None
-    outcome: tuple[str, ...] = ("none",) * 3
-    noise: Array | None = None
-    freedom: float = 0.0
+    up: Array | None = None  # the direction of the mean acceleration, a unit vector
+    outcome: tuple[str, ...] = ("none",) * 3  # what became of the history on each axis
+    noise: Array | None = None  # N, deg/s * sqrt(s), as these data show it
+    freedom: float = 0.0  # its degrees of freedom
 
 
 @dataclass(frozen=True)
 class Circumstances:
-    """What is known of a calibration besides its rates; see :class:`Calibration`.
-
-    Attributes:
-        day: Days since the same epoch.
-        temperature_c: Now.
-        up: Now.
-        same_heading: Whether the heading is declared to be that of the history.
-        latitude_deg: None where it is not known.
-    """
+    """What is known of a calibration besides its rates."""
 
     day: float | None = None
     temperature_c: float | None = None
     up: Array | None = None
-    same_heading: bool = False
+    same_heading: bool = False  # whether the heading is declared to be that of the history
     latitude_deg: float | None = None
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What the history says, (3,) each; NaN and infinite where it says nothing.
+    """What the history says, (3,) each; NaN and infinite where it says nothing."""
 
-    Attributes:
-        mean: Of the bias, deg/s.
-        narrow: Variance where the history is right, (deg/s)^2.
-        wide: Variance where it is wrong.
-        slope: Of the bias, deg/s a degree Celsius; the type's where there is no history.
-        slope_sigma: Its standard deviation.
-        count: Calibrations that make the level of each axis.
-        reasons: What widened it.
-        fitted: What ``model.json`` shows of each axis.
-    """
-
-    mean: Array
-    narrow: Array
-    wide: Array
-    slope: Array
+    mean: Array  # of the bias, deg/s
+    narrow: Array  # variance where the history is right
+    wide: Array  # variance where it is wrong
+    slope: Array  # of the bias, deg/s a degree Celsius; the type's where there is no history
     slope_sigma: Array
-    count: tuple[int, ...] = (0, 0, 0)
-    reasons: tuple[Reason, ...] = ()
-    fitted: tuple[Fitted, ...] = field(default=(), repr=False)
+    count: tuple[int, ...] = (0, 0, 0)  # calibrations that make the level of each axis
+    reasons: tuple[Reason, ...] = ()  # what widened it
+    fitted: tuple[Fitted, ...] = ()
 
 
 def prior_of(
@@ -116,24 +86,26 @@ def prior_of(
     if not past:
         none, infinite = np.full(3, np.nan), np.full(3, np.inf)
         return Prior(none, infinite, infinite, device_type.slope, device_type.slope_spread)
-    days = _days(past, now)
+    days = _known([*(c.day for c in past), now.day])  # a gap that is not known is of one day
+    days = np.append(0.0, np.cumsum(np.nan_to_num(np.abs(np.diff(days)), nan=1.0)))
     members = [level_members(past, axis, device_type.turn_on[axis]) for axis in range(3)]
-    mean, variance, tau, fitted = zip(
-        *(
-            _axis_prior([past[i] for i in chosen], days[[*chosen, -1]], axis, device_type, now)
-            for axis, chosen in enumerate(members)
-        ),
-        strict=True,
-    )
+    axes = [
+        _axis_prior([past[i] for i in chosen], days[[*chosen, -1]], axis, device_type, now)
+        for axis, chosen in enumerate(members)
+    ]
+    mean, variance, tau, fitted = zip(*axes, strict=True)
     slope, slope_sigma = np.array([of_axis["slope"] for of_axis in fitted]).T
-    heading, reasons = _earth(past, now)
-    if _spread_deg(past) > SAME_ATTITUDE_DEG:  # then tau holds it already
-        heading = np.maximum(heading - np.array(tau), 0)
-    beyond, too_warm = _beyond(past, device_type, now)
+    heading, of_heading = _earth(past, now, np.array(tau))
+    beyond, of_temperature = _beyond(past, device_type, now)
     narrow = np.array(variance) + heading + beyond
     wide = np.maximum(device_type.wide**2, 9 * narrow)  # at least three times as far
-    count, said = tuple(map(len, members)), (*reasons, *too_warm)
-    return Prior(np.array(mean), narrow, wide, slope, slope_sigma, count, said, fitted)
+    count, reasons = tuple(map(len, members)), (*of_heading, *of_temperature)
+    return Prior(np.array(mean), narrow, wide, slope, slope_sigma, count, reasons, fitted)
+
+
+def _known(values: Sequence[float | None]) -> Array:
+    """An array, NaN for None."""
+    return np.array(values, np.float64)
 
 
 def level_members(past: Sequence[Calibration], axis: int, turn_on: float) -> list[int]:
@@ -160,23 +132,21 @@ def _agree(first: Calibration, second: Calibration, axis: int, turn_on: float) -
     return bool(abs(first.mean[axis] - second.mean[axis]) < 3 * np.sqrt(variance))
 
 
-def _days(past: Sequence[Calibration], now: Circumstances) -> Array:
-    """Days from the first calibration to each and to now, (n + 1,); one where it is not known."""
-    times = np.array([*(c.day for c in past), now.day], np.float64)  # None is NaN
-    return np.append(0.0, np.cumsum(np.nan_to_num(np.abs(np.diff(times)), nan=1.0)))
-
-
 def _axis_prior(
     past: Sequence[Calibration], days: Array, axis: int, device_type: DeviceType, now: Circumstances
 ) -> tuple[float, float, float, Fitted]:
     """Mean and variance of the next bias without the Earth, tau squared, and what was fitted."""
-    warmth, type_slope = _warmth(past, now), device_type.slope[axis]
-    spread = device_type.slope_spread[axis] ** 2
+    temperatures = _known([*(c.temperature_c for c in past), now.temperature_c])
+    unknown = np.isnan(temperatures[:-1])
+    seen = temperatures[:-1][~unknown] if not unknown.all() else np.zeros(1)
+    warmth = np.nan_to_num(temperatures - seen.mean()) * (not unknown.all())
+    type_slope, spread = device_type.slope[axis], device_type.slope_spread[axis] ** 2
     tau, walk, logs = _grid(device_type, axis)
     days = days - days[0]
     of_walk = walk[:, None, None] ** 2 * np.minimum(days[:, None], days)
     moving = of_walk + spread * np.outer(warmth, warmth)
-    variances = _variances(past, axis, spread) + tau[:, None] ** 2
+    variances = np.array([c.variance[axis] for c in past]) + unknown * spread * seen.var()
+    variances = variances + tau[:, None] ** 2
     among = moving[:, :-1, :-1] + variances[:, :, None] * np.eye(len(past))
     slope = np.broadcast_to(spread * warmth[:-1], variances.shape)
     cross = np.stack([moving[:, :-1, -1], of_walk[:, :-1, -1], slope], axis=-1)
@@ -191,13 +161,6 @@ def _axis_prior(
     fitted = dict(zip(("tau", "walk"), _moments(weights, grid, np.zeros_like(grid)), strict=True))
     fitted |= {"level": level, "slope": (float(type_slope + extra), slope_sigma)}
     return bias + type_slope * warmth[-1], sigma**2, float(weights @ tau**2), fitted
-
-
-def _variances(past: Sequence[Calibration], axis: int, spread: float) -> Array:
-    """Of the evidence, (n,); larger for those whose temperature alone is not known."""
-    seen = _temperatures(past)
-    unknown = spread * float(np.var(seen)) if seen else 0.0
-    return np.array([c.variance[axis] + (c.temperature_c is None) * unknown for c in past])
 
 
 def _levelled(past: Sequence[Calibration], axis: int, now: Circumstances) -> Array:
@@ -254,24 +217,14 @@ def _moments(weights: Array, mean: Array, variance: Array) -> list[tuple[float, 
     return [(float(m), float(np.sqrt(v))) for m, v in zip(means, variances, strict=True)]
 
 
-def _temperatures(past: Sequence[Calibration]) -> list[float]:
-    return [c.temperature_c for c in past if c.temperature_c is not None]
-
-
-def _warmth(past: Sequence[Calibration], now: Circumstances) -> Array:
-    """Degrees above the mean of the history, (n + 1,), 0 where they are not known."""
-    values = np.array([*(c.temperature_c for c in past), now.temperature_c], np.float64)
-    return np.nan_to_num(values - np.mean(_temperatures(past) or np.nan))
-
-
 def _beyond(
     past: Sequence[Calibration], device_type: DeviceType, now: Circumstances
 ) -> tuple[Array, list[Reason]]:
     """Variance of a temperature that the history has not seen, or that is not known now."""
-    seen, value = _temperatures(past), now.temperature_c
+    seen = [c.temperature_c for c in past if c.temperature_c is not None]
     if not seen or not np.any(device_type.slope_spread):
         return np.zeros(3), []
-    least, most = min(seen), max(seen)
+    least, most, value = min(seen), max(seen), now.temperature_c
     distance = most - least if value is None else max(value - most, least - value, 0.0)
     if not distance:
         return np.zeros(3), []
@@ -280,31 +233,22 @@ def _beyond(
     return (device_type.slope_spread * distance) ** 2, [told]
 
 
-def _mean_up(past: Sequence[Calibration]) -> Array | None:
-    total = np.sum([np.zeros(3), *(c.up for c in past if c.up is not None)], axis=0)
-    length = np.linalg.norm(total)
-    return np.asarray(total / length) if length > 0 else None
-
-
-def _spread_deg(past: Sequence[Calibration]) -> float:
-    """The largest angle between the attitude of a calibration and their mean, degrees."""
-    mean = _mean_up(past)
-    angles = [angle_deg(c.up, mean) for c in past if c.up is not None and mean is not None]
-    return max(angles, default=0.0)
-
-
 def angle_deg(first: Array, second: Array) -> float:
     """Angle between two directions, degrees."""
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second)))
 
 
-def _earth(past: Sequence[Calibration], now: Circumstances) -> tuple[Array, list[Reason]]:
+def _earth(
+    past: Sequence[Calibration], now: Circumstances, tau_squared: Array
+) -> tuple[Array, list[Reason]]:
     """Variance of the Earth's rate between the history's headings and this one, (3,), (deg/s)^2.
 
     Two unknown headings: (4.18 cos phi)^2 on a horizontal axis, 0 on a vertical one. Nothing where
-    the heading is declared to repeat and no other attitude is seen.
+    the heading is declared to repeat and no other attitude is seen. Where past attitudes differ,
+    tau holds it already.
     """
-    before, up, latitude = _mean_up(past), now.up, now.latitude_deg
+    ups, up, latitude = [c.up for c in past if c.up is not None], now.up, now.latitude_deg
+    before = np.sum(ups, axis=0) / np.linalg.norm(np.sum(ups, axis=0)) if ups else None
     turned = 0.0 if before is None or up is None else angle_deg(up, before)
     if turned > SAME_ATTITUDE_DEG:
         told = reason("attitude history", turned, SAME_ATTITUDE_DEG)
@@ -313,11 +257,13 @@ def _earth(past: Sequence[Calibration], now: Circumstances) -> tuple[Array, list
     else:
         told = reason("heading")
     horizontal = (EARTH_DPS * (1.0 if latitude is None else np.cos(np.radians(latitude)))) ** 2
-    if before is None or up is None:
-        return np.full(3, horizontal), [told]
-    variance = horizontal * (1 - (up**2 + before**2) / 2)
-    if latitude is None:
-        variance = variance + (EARTH_DPS * (up - before)) ** 2
+    variance = np.full(3, horizontal)
+    if before is not None and up is not None:
+        variance = horizontal * (1 - (up**2 + before**2) / 2)
+        if latitude is None:
+            variance = variance + (EARTH_DPS * (up - before)) ** 2
+    if before is not None and max(angle_deg(u, before) for u in ups) > SAME_ATTITUDE_DEG:
+        variance = np.maximum(variance - tau_squared, 0)
     return variance, [told]
 
 

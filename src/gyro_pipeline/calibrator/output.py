@@ -8,6 +8,7 @@ from typing import Any
 import click
 import numpy as np
 
+from gyro_pipeline.calibrator.calibrator import Calibrator
 from gyro_pipeline.calibrator.state import DROPPED, NONE, STILL, USED, Array, State
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 
@@ -37,14 +38,17 @@ def numbers(values: Array) -> list[float | None]:
     return [value if math.isfinite(value) else None for value in values.tolist()]
 
 
-def as_text(state: State, target_mdps: float | None, temperature_c: float | None, past: str) -> str:
+def as_text(state: State, target_mdps: float | None, calibrator: Calibrator) -> str:
     """A table of the axes, with a line above and what is left to do below; coloured."""
     still = state.rest == STILL
     cut = ", ".join(f"{r.value:.1f} s" for r in state.reasons if r.code == "cut")
     first = "" if still else f"not at rest ({state.rest}): "
     first += f"at rest for {state.seconds_at_rest:.1f} of {state.time_s:.1f} s"
     first += f" (a motion at {cut} was cut)" if cut else ""
-    first += "" if temperature_c is None else f"; {temperature_c:.1f} °C"
+    temperature, count = calibrator.best.current.temperature, max(calibrator.best.prior.count)
+    first += f"; {temperature.mean:.1f} °C" if temperature.blocks else ""
+    heading = f"heading {'' if calibrator.now.same_heading else 'not '}declared to repeat"
+    past = f"{count} calibration{'s' * (count != 1)}, {heading}" if count else "none"
     lines = [click.style(f"{first}; history: {past}", fg="green" if still else "red")]
     lines.append(f"{'bias, deg/s':>17}{'σ, mdps':>11}   from")
     sigmas = state.sigma_dps / MDPS

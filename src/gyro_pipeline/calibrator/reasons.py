@@ -64,21 +64,13 @@ _SENTENCES = {  # by code, and what distinguishes several of one code
 
 @dataclass(frozen=True)
 class Reason:
-    """Something that a user or a program should know.
+    """Something that a user or a program should know."""
 
-    Attributes:
-        code: One word for programs, such as ``conflict``, ``motion`` or ``floor``.
-        sentence: The same for people.
-        axis: x, y or z; None where it is about all.
-        value: What was found, in the unit of the sentence.
-        limit: What it was compared with.
-    """
-
-    code: str
-    sentence: str
-    axis: str | None = None
-    value: float | None = None
-    limit: float | None = None
+    code: str  # one word for programs, such as ``conflict``, ``motion`` or ``floor``
+    sentence: str  # the same for people
+    axis: str | None = None  # x, y or z; None where it is about all
+    value: float | None = None  # what was found, in the unit of the sentence
+    limit: float | None = None  # what it was compared with
 
 
 def reason(
@@ -116,7 +108,7 @@ def reasons_of(counts: "Counts", stretch: "Stretch", target_dps: float | None) -
     noise, freedom = stretch.log_noise()
     if noise is not None and freedom >= _ENOUGH and np.all(stretch.freedom > 0):
         factors = noise / (np.sqrt(stretch.scale) * stretch.noise.white)  # also too little noise
-        if told := unit_reason(float(np.median(factors)), stretch.device_type.name):
+        if told := unit_reason(sorted(factors.tolist())[1], stretch.device_type.name):
             yield told
     if np.isfinite(stretch.prior.narrow).any():
         yield from stretch.prior.reasons

@@ -21,36 +21,20 @@ USED, DROPPED, NONE = "used", "dropped", "none"
 
 @dataclass(frozen=True)
 class State:
-    """The answer so far; NaN and infinity stand where there is no number. Arrays are (3,).
+    """The answer so far; NaN and infinity stand where there is no number. Arrays are (3,)."""
 
-    Attributes:
-        bias_dps: The bias now; what it settles to, where the device warms up.
-        sigma_dps: Its standard deviation; the bias is within 1.96 of it in 95 % of cases.
-        own_dps: The bias by this log alone.
-        own_sigma_dps: Its standard deviation.
-        history_dps: The bias by the history alone.
-        history_sigma_dps: Its standard deviation.
-        rest: STILL, MOVING or UNSURE.
-        time_s: Seconds since the first sample.
-        seconds_at_rest: Length of the stretch that the answer is from.
-        history: USED, DROPPED or NONE for each axis.
-        reasons: What a user should know, the most important first.
-        reached: Whether all axes reach the target; true where none is given.
-        look_ahead: Computes ``seconds_left``, which takes some time.
-    """
-
-    bias_dps: Array
-    sigma_dps: Array
-    own_dps: Array
+    bias_dps: Array  # now; what it settles to, where the device warms up
+    sigma_dps: Array  # the bias is within 1.96 of it in 95 % of cases
+    own_dps: Array  # by this log alone
     own_sigma_dps: Array
-    history_dps: Array
+    history_dps: Array  # by the history alone
     history_sigma_dps: Array
-    rest: str
-    time_s: float
-    seconds_at_rest: float
-    history: tuple[str, ...]
-    reasons: tuple[Reason, ...]
-    reached: bool
+    rest: str  # STILL, MOVING or UNSURE
+    time_s: float  # since the first sample
+    seconds_at_rest: float  # of the stretch that the answer is from
+    history: tuple[str, ...]  # USED, DROPPED or NONE for each axis
+    reasons: tuple[Reason, ...]  # the most important first
+    reached: bool  # whether all axes are at the target; true where none is given
     look_ahead: Callable[[], Array] = field(repr=False, compare=False)
 
     @cached_property

@@ -234,10 +234,9 @@ class Stretch:
         if seen is not None and seen.log_e > np.log(CONFLICT):
             self._drop(seen)
             _, bias, variance = self._posterior(self.estimate)
-        temperature = self.current.temperature  # the answer is of the last block's
-        warmer = np.nan_to_num(temperature.last - temperature.mean)
-        self.bias = bias + self.prior.slope * warmer
-        self.variance = variance + np.square(self.prior.slope_sigma * warmer)
+        warmer = _warmer(self.current.temperature.last, self.current.temperature.mean)
+        self.bias = bias + self.prior.slope * warmer  # as in the last block
+        self.variance = variance + (self.prior.slope_sigma * warmer) ** 2
 
     def _drop(self, seen: Posterior) -> None:
         """Drop the history on axes; a heading that one of them contradicts is not believed."""
@@ -257,7 +256,7 @@ class Stretch:
 
     def _prior_mean(self) -> Array:
         """Mean of the prior at the mean temperature of the blocks, by its slope."""
-        warmer = np.nan_to_num(self.current.temperature.mean - self.current.prior_c)
+        warmer = _warmer(self.current.temperature.mean, self.current.prior_c)
         return np.asarray(self.prior.mean + self.prior.slope * warmer)
 
     def _posterior(self, estimate: Estimate) -> tuple[Posterior | None, Array, Array]:
@@ -309,6 +308,11 @@ class Stretch:
             left = np.minimum(left, first * self.block_s)
             done += _AHEAD
         return np.where(below, np.inf, left)
+
+
+def _warmer(now: float, then: float) -> float:
+    """Degrees; 0 where one of them is not known."""
+    return 0.0 if np.isnan(now - then) else now - then
 
 
 def _conflict(axis: SupportsIndex, away: float, sigma: float) -> Reason:
