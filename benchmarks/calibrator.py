@@ -22,9 +22,9 @@ from functools import partial
 import numpy as np
 from scipy import stats
 
-from gyro_pipeline.calibrator import Calibration, Calibrator, Circumstances, State
+from gyro_pipeline.calibrator import Calibration, Calibrator, Circumstances
 from gyro_pipeline.calibrator.device_types import type_of
-from gyro_pipeline.calibrator.filter import FLICKER_S, Estimate, Filter, estimates
+from gyro_pipeline.calibrator.filter import FLICKER_S, Filter, estimates
 from gyro_pipeline.conventions import MDPS
 from gyro_pipeline.physics.noise import simulate_noise, warm_up
 from gyro_pipeline.physics.recording_model import (
@@ -80,38 +80,21 @@ class Result:
     rest: str = ""
     codes: tuple[str, ...] = ()
 
-    def add(self, seconds: int, state: State, truth: np.ndarray, mean: np.ndarray) -> None:
-        off, sigma = state.bias_dps / MDPS - truth, state.sigma_dps / MDPS
-        if self.stop is None and state.done:
-            self.stop, self.stop_s = (off, sigma), seconds
-        if "dropped" in state.history:
-            self.seen_s = min(self.seen_s, seconds)
-        if seconds in MARKS:
-            self.error.append(off)
-            self.sigma.append(sigma)
-            self.mean.append(mean - truth)
-
-    def finish(self, state: State) -> None:
-        self.dropped = np.array([outcome == "dropped" for outcome in state.history])
-        self.rest, self.codes = state.rest, tuple(reason.code for reason in state.reasons)
-
 
 def kind_of(world: World):
     """The type, as fitted to 30 devices of it: a little is left open."""
-    noise = {"noise_mdps_rts": world.white} if world.known else {}
-    settling = dict(
-        zip(("amplitude_mdps", "spread_mdps", "time_constant_s"), world.warm_up or (), strict=False)
-    )
-    return type_of(
-        {
-            "type": "simulated", **noise, "flicker_mdps": world.flicker,
-            "random_walk_mdps_per_rts": world.walk, "turn_on_mdps": world.type_tau or world.tau,
-            "turn_on_factor": 1.3,
-            "walk_mdps_per_rtday": 0.03, "walk_factor": 2.0, "warm_up": settling or None,
-            **({"temperature_spread_mdps_per_c": 5.0} if world.ramp else {}),
-        },
-        "benchmark",
-    )  # fmt: skip
+    content = {
+        "type": "simulated", "noise_mdps_rts": world.white, "flicker_mdps": world.flicker,
+        "random_walk_mdps_per_rts": world.walk, "turn_on_mdps": world.type_tau or world.tau,
+        "turn_on_factor": 1.3, "walk_mdps_per_rtday": 0.03, "walk_factor": 2.0,
+        "temperature_spread_mdps_per_c": 5.0 * (world.ramp > 0),
+    }  # fmt: skip
+    if world.warm_up:
+        keys = "amplitude_mdps", "spread_mdps", "time_constant_s"
+        content["warm_up"] = dict(zip(keys, world.warm_up, strict=True))
+    if not world.known:
+        del content["noise_mdps_rts"]
+    return type_of(content, "benchmark")
 
 
 def earth(heading: float) -> np.ndarray:
@@ -138,25 +121,18 @@ def one(world: World, history_variance: np.ndarray, seed: Sequence[int]) -> Resu
     """One device with its history, and one calibration of it."""
     rng = np.random.default_rng(seed)
     level, heading = rng.uniform(-500, 500, 3), rng.uniform(0, 2 * np.pi)
-    past = []
+    up, past = np.array([0, 0, 1.0]) if world.accel_ug else None, []
     for _ in range(world.past):
         if world.turn is None:
             heading = rng.uniform(0, 2 * np.pi)
         bias = level + rng.normal(0, world.tau, 3) + earth(heading)
         mean = bias + rng.normal(0, np.sqrt(history_variance))
-        up = np.array([0, 0, 1.0]) if world.accel_ug else None
         warmth = 25 + rng.normal(0, 0.5) if world.ramp else None
-        mean = mean + (SLOPE * (warmth - 25) if warmth else 0)
-        past.append(
-            Calibration(mean * MDPS, history_variance * MDPS**2, temperature_c=warmth, up=up)
-        )
+        mean = (mean + (SLOPE * (warmth - 25) if warmth else 0)) * MDPS
+        variance = history_variance * MDPS**2
+        past.append(Calibration(mean, variance, temperature_c=warmth, up=up))
     heading = rng.uniform(0, 2 * np.pi) if world.turn is None else heading + np.radians(world.turn)
     bias = level + rng.normal(0, world.tau, 3) + earth(heading) + world.step
-    return measured(rng, world, past, bias)
-
-
-def measured(rng, world: World, past, bias: np.ndarray) -> Result:
-    """One calibration of a device with this history and this bias at its start, mdps."""
     time_s, samples, accel, warmth, truth = simulated(rng, world, bias)
     now = Circumstances(same_heading=world.declared, latitude_deg=LATITUDE)
     age = 0.0 if world.warm_up else None
@@ -172,9 +148,19 @@ def measured(rng, world: World, past, bias: np.ndarray) -> Result:
         rows = np.flatnonzero(kept[first:last]) + first
         beside = (None if x is None else x[rows] for x in (accel, warmth))
         state = calibrator.update(stamps[rows], samples[rows], *beside)
-        result.add(edge, state, truth[last - 1], samples[:last].mean(axis=0) / MDPS)
+        error, sigma = state.bias_dps / MDPS - truth[last - 1], state.sigma_dps / MDPS
+        if result.stop is None and state.done:
+            result.stop, result.stop_s = (error, sigma), edge
+        if "dropped" in state.history:
+            result.seen_s = min(result.seen_s, edge)
+        if edge in MARKS:
+            result.error.append(error)
+            result.sigma.append(sigma)
+            result.mean.append(samples[:last].mean(axis=0) / MDPS - truth[last - 1])
         first = last
-    result.finish(calibrator.finish())
+    state = calibrator.finish()
+    result.dropped = np.array([outcome == "dropped" for outcome in state.history])
+    result.rest, result.codes = state.rest, tuple(reason.code for reason in state.reasons)
     return result
 
 
@@ -274,34 +260,36 @@ def coverage(pool, count: int) -> None:
     stop_table(pool, COVERAGE, count, 100)
 
 
+def table(head: str) -> None:
+    print(f"| {head.replace('|', ' | ')} |\n|{'---|' * (head.count('|') + 1)}")
+
+
+def row(*cells) -> None:
+    print(f"| {' | '.join(map(str, cells))} |", flush=True)
+
+
 def stop_table(pool, worlds: dict[str, World], count: int, seed: int) -> None:
     """Coverage and RMSE at the stop, by axis and by what became of the history."""
-    head = "world|target|median stop, s|RMSE|x / y / z|all, 99 % interval|dropped in"
-    head += "|used / dropped / none|not at rest|said"
-    print(f"| {head.replace('|', ' | ')} |\n|{'---|' * 10}")
+    table(
+        "world|target|median stop, s|RMSE|x / y / z|all, 99 % interval|dropped in"
+        "|used / dropped / none|not at rest|said"
+    )
     for number, (name, world) in enumerate(worlds.items()):
         results = many(pool, world, count, seed + number)
         stops = [r for r in results if r.stop is not None]
         inside = np.array([covered(*r.stop) for r in stops]).reshape(-1, 3)
         drops = np.array([r.dropped for r in stops]).reshape(-1, 3)
-        kinds = {
-            "used": ~drops & (world.past > 0),
-            "dropped": drops,
-            "none": ~drops & (world.past == 0),
-        }
-        outcome = ", ".join(
-            f"{k} {inside[m].mean():.3f} of {m.sum()}" for k, m in kinds.items() if m.any()
-        )
+        kinds = {"used" if world.past else "none": ~drops, "dropped": drops}
+        outcome = [f"{k} {inside[m].mean():.3f} of {m.sum()}" for k, m in kinds.items() if m.any()]
         codes = Counter(code for r in results for code in r.codes if code not in SILENT)
-        cells = (
+        row(
             name, f"{world.target:g}", f"{np.median([r.stop_s for r in results]):g}",
             f"{rms(np.array([r.stop[0] for r in stops])):.2f}" if stops else "–",
             " / ".join(f"{x:.3f}" for x in inside.mean(axis=0)), share(inside),
-            f"{np.mean([r.dropped.any() for r in results]):.4f}", outcome,
-            str(sum(r.rest != "still" for r in results)),
+            f"{np.mean([r.dropped.any() for r in results]):.4f}", ", ".join(outcome),
+            sum(r.rest != "still" for r in results),
             ", ".join(f"{code} {n}" for code, n in codes.most_common(3)),
         )  # fmt: skip
-        print(f"| {' | '.join(cells)} |", flush=True)
 
 
 PAIRS = {
@@ -338,14 +326,13 @@ TURNED = {
 def turned(pool, count: int) -> None:
     print("\n## History that is wrong: RMSE, mdps / over the mean's / coverage, all axes\n")
     marks = [mark for mark in MARKS if mark <= World().longest_s]
-    print(f"| world | {' | '.join(f'{m} s' for m in marks)} | dropped | by 10 s |")
-    print(f"|{'---|' * (len(marks) + 3)}")
+    table(f"world|{'|'.join(f'{m} s' for m in marks)}|dropped|by 10 s")
     for number, (name, world) in enumerate(TURNED.items()):
         results = many(pool, world, count, 200 + number)
+        dropped = np.mean([r.dropped.any() for r in results])
+        seen = np.mean([r.seen_s <= marks[2] for r in results])
         cells = [mark_cell(results, i) for i in range(len(marks))]
-        cells += [f"{np.mean([r.dropped.any() for r in results]):.4f}"]
-        cells += [f"{np.mean([r.seen_s <= marks[2] for r in results]):.3f}"]
-        print(f"| {name} | {' | '.join(cells)} |", flush=True)
+        row(name, *cells, f"{dropped:.4f}", f"{seen:.3f}")
 
 
 def mark_cell(results: list[Result], mark: int) -> str:
@@ -373,17 +360,13 @@ def filters(pool, count: int) -> None:
     print(
         "\n## The filter alone: RMSE over the exact best linear estimate; must be at most 1.005\n"
     )
-    worlds = {
-        "white": World(),
-        "flicker 3": World(flicker=3),
-        "walk 1": World(walk=1),
-        "warm-up 5±2, 20 s": World(warm_up=(5, 2, 20)),
-    }
-    print("| world | prior | 1 s | 3 s | 10 s | 30 s |\n|---|---|---|---|---|---|")
-    for name, world in worlds.items():
+    settling = World(warm_up=(5, 2, 20))
+    worlds = {"white": World(), "flicker 3": World(flicker=3), "walk 1": World(walk=1)}
+    table("world|prior|1 s|3 s|10 s|30 s")
+    for name, world in (worlds | {"warm-up 5±2, 20 s": settling}).items():
         for prior in (None, 0.31):
             cells = [f"{against_exact(world, seconds, prior):.5f}" for seconds in (1, 3, 10, 30)]
-            print(f"| {name} | {'flat' if prior is None else 'narrow'} | {' | '.join(cells)} |")
+            row(name, "flat" if prior is None else "narrow", *cells)
 
 
 def against_exact(world: World, seconds: int, prior: float | None) -> float:
@@ -409,9 +392,9 @@ def against_exact(world: World, seconds: int, prior: float | None) -> float:
         current = filter_
         for block in range(blocks):
             current, _ = current.update(np.full(3, 1.0 if block == unit_block else 0.0))
-        last = Estimate(*(x[0] for x in estimates([current])))
-        gain = 1.0 if prior is None else spread / (spread + last.start_variance[0] / MDPS**2)
-        columns.append(last.bias[0] + last.follows[0] * (gain - 1) * last.start[0])
+        last = estimates([current])
+        gain = 1.0 if prior is None else spread / (spread + last.start_variance[0, 0] / MDPS**2)
+        columns.append(last.bias[0, 0] + last.transfer[0, 0] * (gain - 1) * last.start[0, 0])
     own_weights = np.array(columns[1:]) - columns[0]
     return float(np.sqrt(squares(own_weights) / squares(weights)))
 
@@ -435,14 +418,13 @@ for size, axis in ((3.13, 0), (30, 0), (300, 0), (3.13, 1), (3.13, 2), (30, 2), 
 
 def rest(pool, count: int) -> None:
     print("\n## At rest or not: 'moving' in at most 6 of 3,000, 3.13 mdps about x seen in 0.95\n")
-    print("| world | still | moving | unsure | a motion cut | rotation seen |")
-    print(f"|{'---|' * 6}")
+    table("world|still|moving|unsure|a motion cut|rotation seen")
     for number, (name, world) in enumerate(REST.items()):
         results = many(pool, world, count, 400 + number)
         rests = [r.rest for r in results]
         cells = [rests.count(word) for word in ("still", "moving", "unsure")]
         cells += [sum(code in r.codes for r in results) for code in ("cut", "rotation")]
-        print(f"| {name} | {' | '.join(map(str, cells))} |", flush=True)
+        row(name, *cells)
 
 
 def speed(pool, count: int) -> None:
@@ -462,11 +444,7 @@ def speed(pool, count: int) -> None:
         print(f"chunks of {seconds} s: {len(samples) / best:.3g} samples a second", flush=True)
 
 
-SECTIONS: dict[str, Callable[..., None]] = {
-    "filters": filters, "coverage": coverage, "pairs": pairs, "turned": turned,
-    "drops": drops,
-    "rest": rest, "speed": speed,
-}  # fmt: skip
+SECTIONS = {f.__name__: f for f in (filters, coverage, pairs, turned, drops, rest, speed)}
 
 
 def main(arguments: Iterable[str] | None = None) -> None:
