@@ -9,7 +9,7 @@ are installed (the extra [bench]). CONTRIBUTING.md says which real recordings ar
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,9 @@ from calibrator import (
     noise,
     own_variance,
     rms,
+    row,
     share,
+    table,
 )
 
 from gyro_pipeline.calibrator import Calibration, Calibrator, Circumstances, read_type
@@ -93,17 +95,16 @@ RULES: dict[str, Rule] = {
 def rules(count: int = 200) -> None:
     print("\n## Rules of practice on the same windows: RMSE, mdps, by length of the window\n")
     windows = {"simulated": list(simulated_windows(count)), "Memsense": list(memsense_windows())}
-    print("| rule | simulated 1 s | 30 s | Memsense 1 s | 10 s | 30 s |\n|---|---|---|---|---|---|")
+    table("rule|simulated 1 s|30 s|Memsense 1 s|10 s|30 s")
     for name, rule in RULES.items():
         try:
-            print(f"| {name} | {' | '.join(rule_cells(windows, rule))} |", flush=True)
+            row(name, *rule_cells(windows, lambda w, rule=rule: applied(rule, w)))
         except ImportError as error:
-            print(f"| {name} | {error} |")
-    if STATED:
-        print(f"(VQF states {np.median(STATED):.3g} mdps)")
-    for name, same in (("no history", None), ("history", True)):
-        cells = rule_cells(windows, partial(by_calibrator, with_history=same))
-        print(f"| calibrator, {name} | {' | '.join(cells)} |", flush=True)
+            row(name, error)
+    print(f"(VQF states {np.median(STATED or [np.nan]):.3g} mdps)")
+    for name, with_history in (("no history", False), ("history", True)):
+        cells = rule_cells(windows, lambda w, h=with_history: state_of(w, h).bias_dps)
+        row(f"calibrator, {name}", *cells)
 
 
 @dataclass
@@ -152,77 +153,57 @@ def memsense_windows() -> Iterable[Window]:
         past.append(calibrator.evidence())
 
 
-def by_calibrator(samples, accel, rate, *, window: Window, with_history: bool | None) -> np.ndarray:
-    past = window.past if with_history else []
-    calibrator = Calibrator(window.kind, rate, past, Circumstances(same_heading=True))
-    return calibrator.update(None, samples).bias_dps
+def state_of(window: Window, with_history: bool, target: float | None = None, seconds: float = 1e3):
+    past, now = window.past if with_history else [], Circumstances(same_heading=True)
+    target_dps = None if target is None else target * MDPS
+    calibrator = Calibrator(window.kind, window.rate, past, now, target_dps)
+    return calibrator.update(None, window.samples[: round(seconds * window.rate)])
 
 
-def rule_cells(windows: dict[str, list[Window]], rule: Rule) -> Iterable[str]:
+def rule_cells(windows: dict[str, list[Window]], bias_of: Callable) -> Iterable[str]:
     """RMSE of a rule; the variance of a measured truth is taken off."""
     for source, lengths in (("simulated", (1, 30)), ("Memsense", (1, 10, 30))):
         for seconds in lengths:
             chosen = [w for w in windows[source] if w.seconds == seconds]
-            squares = [np.square(applied(rule, w) - w.truth) - w.variance for w in chosen]
+            squares = [np.square(bias_of(w) - w.truth) - w.variance for w in chosen]
             yield f"{np.sqrt(max(np.mean(squares), 0)) / MDPS:.2f}" if chosen else "–"
 
 
 def applied(rule: Rule, window: Window) -> np.ndarray:
-    rng = np.random.default_rng(1)
-    accel = rng.normal([0, 0, 1], 1e-3, window.samples.shape)
-    more = {"window": window} if isinstance(rule, partial) else {}
-    return rule(window.samples, accel, window.rate, **more)
+    accel = np.random.default_rng(1).normal([0, 0, 1], 1e-3, window.samples.shape)
+    return rule(window.samples, accel, window.rate)
 
 
 def memsense() -> None:
     """The eleven recordings in order, as calibrations of one device."""
     windows = list(memsense_windows())
-    print(
-        "\n## Memsense, eleven recordings in order: σ and RMSE against the rest, mdps, x / y / z\n"
-    )
-    print("| window | history | σ | RMSE | within 1.96 √(σ² + truth's) |\n|---|---|---|---|---|")
-    for seconds in SECONDS:
-        for with_history in (False, True):
-            states = [
-                (w, state_of(w, with_history)) for w in windows
-                if w.seconds == seconds and (w.past or not with_history)
-            ]  # fmt: skip
-            sigma = np.array([s.sigma_dps for _, s in states]) / MDPS
-            error = np.array([s.bias_dps - w.truth for w, s in states]) / MDPS
-            truth = states[0][0].variance / MDPS**2
-            squares = np.mean(error**2, axis=0) - truth
-            inside = np.abs(error) <= 1.96 * np.sqrt(sigma**2 + truth)
-            cells = " / ".join(f"{x:.2f}" for x in np.median(sigma, axis=0))
-            rmse = " / ".join(f"{np.sign(x) * np.sqrt(abs(x)):.2f}" for x in squares)
-            print(
-                f"| {seconds} s | {'yes' if with_history else 'no'} | {cells} | {rmse} "
-                f"| {inside.mean():.2f} of {inside.size} |"
-            )
+    if not windows:
+        return
+    print("\n## Memsense, eleven in order: σ and RMSE against the rest, mdps, x / y / z\n")
+    table("window|history|σ|RMSE|within 1.96 √(σ² + truth's)")
+    for seconds, with_history in product(SECONDS, (False, True)):
+        chosen = [w for w in windows if w.seconds == seconds and (w.past or not with_history)]
+        states = [state_of(w, with_history) for w in chosen]
+        sigma = np.array([s.sigma_dps for s in states]) / MDPS
+        error = np.array([s.bias_dps - w.truth for w, s in zip(chosen, states, strict=True)]) / MDPS
+        truth = chosen[0].variance / MDPS**2
+        squares = np.mean(error**2, axis=0) - truth
+        inside = np.abs(error) <= 1.96 * np.sqrt(sigma**2 + truth)
+        rmse = per_axis(np.sign(squares) * np.sqrt(np.abs(squares)))
+        covered = f"{inside.mean():.2f} of {inside.size}"
+        row(f"{seconds} s", with_history, per_axis(np.median(sigma, axis=0)), rmse, covered)
     print("\nMedian seconds to a target (* from the look-ahead: the recording is too short):\n")
-    for target in (1.0, 2.0):
-        for with_history in (False, True):
-            times = [
-                seconds_to(w, with_history, target)
-                for w in windows
-                if w.seconds == SECONDS[-1] and (w.past or not with_history)
-            ]
-            cells = " / ".join(
-                f"{x:g}{'*' if x > LENGTH_S else ''}" for x in np.median(times, axis=0)
-            )
-            print(f"{target:g} mdps, history {'yes' if with_history else 'no'}: {cells}")
+    for target, with_history in product((1.0, 2.0), (False, True)):
+        chosen = [w for w in windows if w.seconds == SECONDS[-1] and (w.past or not with_history)]
+        # of each axis, as the first half second says
+        left = [0.5 + state_of(w, with_history, target, 0.5).seconds_left for w in chosen]
+        median = np.median(left, axis=0)
+        cells = " / ".join(f"{x:g}{'*' if x > LENGTH_S else ''}" for x in median)
+        print(f"{target:g} mdps, history {'yes' if with_history else 'no'}: {cells}")
 
 
-def state_of(window: Window, with_history: bool, target: float | None = None, seconds: float = 1e9):
-    past = window.past if with_history else []
-    target_dps = None if target is None else target * MDPS
-    now = Circumstances(same_heading=True)
-    calibrator = Calibrator(window.kind, window.rate, past, now, target_dps)
-    return calibrator.update(None, window.samples[: round(min(seconds * window.rate, 1e9))])
-
-
-def seconds_to(window: Window, with_history: bool, target: float) -> np.ndarray:
-    """Seconds of each axis, as the first half second says."""
-    return 0.5 + state_of(window, with_history, target, 0.5).seconds_left
+def per_axis(values: np.ndarray) -> str:
+    return " / ".join(f"{x:.2f}" for x in values)
 
 
 def dot() -> None:
@@ -235,25 +216,15 @@ def dot() -> None:
     inside, errors, sigmas = [], [], []
     for unit, samples in enumerate(logs):
         others = np.array([fits[other] for other in range(len(logs)) if other != unit])
-        white, flicker = np.sqrt(np.mean(others**2, axis=0)).T / MDPS
-        content = {
-            "type": "dot",
-            "noise_mdps_rts": white.tolist(),
-            "flicker_mdps": flicker.tolist(),
-        }
-        kind = type_of({**content, "noise_spread": 0.1}, "benchmark")
+        white, flicker = np.sqrt(np.mean(others**2, axis=0)).T
+        content = {"noise_mdps_rts": white / MDPS, "flicker_mdps": flicker / MDPS}
+        kind = type_of({"type": "dot", "noise_spread": 0.1, **content}, "benchmark")
+        figures = [NoiseFigures(w, f, 0) for w, f in zip(white, flicker, strict=True)]
         for start in range(0, len(samples) - 1200 + 1, 1200):
-            window, rest = (
-                samples[start : start + 1200],
-                np.delete(samples, slice(start, start + 1200), 0),
-            )
-            calibrator = Calibrator(kind, 120.0)
-            state = calibrator.update(None, window)
-            truth = [
-                outside_noise(NoiseFigures(w * MDPS, f * MDPS, 0), len(samples), 120.0, start, 1200)
-                for w, f in zip(white, flicker, strict=True)
-            ]  # fmt: skip
-            error = state.bias_dps - rest.mean(axis=0)
+            part = slice(start, start + 1200)
+            state = Calibrator(kind, 120.0).update(None, samples[part])
+            truth = [outside_noise(f, len(samples), 120.0, start, 1200) for f in figures]
+            error = state.bias_dps - np.delete(samples, part, 0).mean(axis=0)
             inside.append(np.abs(error) <= 2 * np.sqrt(state.sigma_dps**2 + truth))
             errors.append(error / MDPS)
             sigmas.append(state.sigma_dps / MDPS)
