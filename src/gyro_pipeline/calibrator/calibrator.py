@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from gyro_pipeline.calibrator.device_types import DeviceType, read_type
 from gyro_pipeline.calibrator.history import (
+    DAY_S,
     Calibration,
     Circumstances,
     Prior,
@@ -53,7 +54,6 @@ class Counts:
     jumps: int = 0
     constant: Array = field(default_factory=lambda: np.zeros(3))  # blocks in a row of one value
     dead: Mask = field(default_factory=lambda: np.zeros(3, bool))
-    most_constant: int = _DEAD_BLOCKS
     ended: dict[str, Reason] = field(default_factory=dict)  # why stretches ended, the last of each
 
 
@@ -114,20 +114,16 @@ class Calibrator:
             registry: Folder; None: the environment's, or the user's own.
             started_at: Of the first sample, POSIX seconds; None: one day after the last one.
             since_power_on_s: Of the first sample.
-            device_type: None: what ``device.toml`` says.
-            same_heading: Whether the heading repeats; None: what ``device.toml`` says.
-            latitude_deg: None: what ``device.toml`` says.
+            device_type: Its type; None, here and below: what ``device.toml`` says.
+            same_heading: Whether the heading repeats.
+            latitude_deg: Of the place.
             known_still: The device is declared to be at rest.
             without: Hash of a log whose own stored calibration is not to count.
 
         Raises:
             InputError: The registry holds something that is not as it should be.
         """
-        from gyro_pipeline.calibrator.registry import (  # noqa: PLC0415 - files, not needed below
-            DAY_S,
-            Device,
-            registry_folder,
-        )
+        from gyro_pipeline.calibrator.registry import Device, registry_folder  # noqa: PLC0415
 
         folder = registry_folder(registry)
         stored = None if device is None else Device(folder, device)

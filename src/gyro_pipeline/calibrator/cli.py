@@ -67,6 +67,7 @@ _SHARED = {
     "rate_hz": _option("--rate", type=float, help="samples a second, where times do not tell"),
     **_JSON,
 }
+Source = dict[str, str]
 _FOLDER = {"folder": _DEVICE["registry"]}
 
 
@@ -216,12 +217,8 @@ def _feed(calibrator: Calibrator, recording: Any, chunk_s: float) -> list[State]
     times = np.arange(count) / calibrator.rate_hz
     for row in recording.gap_rows:  # how long a gap is, a log does not say
         times[row:] += 2 * BLOCK_S
-    columns: list[Any] = [
-        times,
-        recording.samples,
-        recording.acceleration_g,
-        recording.temperature_c,
-    ]
+    beside = recording.acceleration_g, recording.temperature_c
+    columns: list[Any] = [times, recording.samples, *beside]
     step, states = max(round(min(chunk_s * calibrator.rate_hz, count)), 1), []
     for row in range(0, count, step):
         chunk: list[Any] = [None if x is None else x[row : row + step] for x in columns]
@@ -263,11 +260,7 @@ def _code(state: State, job: SimpleNamespace) -> int:
 
 
 def _store(
-    calibrator: Calibrator,
-    state: State,
-    job: SimpleNamespace,
-    device: Device,
-    source: dict[str, str],
+    calibrator: Calibrator, state: State, job: SimpleNamespace, device: Device, source: Source
 ) -> None:
     """Add the calibration, or the attempt, to the device's history."""
     name, known = source["source"], job.known

@@ -28,6 +28,8 @@ from gyro_pipeline.conventions import MDPS
 EARTH_DPS = 4.178e-3
 """The Earth's rate, 15.041 deg/h."""
 
+DAY_S = 86400.0
+
 SAME_ATTITUDE_DEG = 5.0
 """Attitudes that differ by more are different ones."""
 

@@ -24,8 +24,8 @@ _ENOUGH = 6  # blocks that tell a unit by their noise
 _UNITS = {57.3: "rad/s", 1e3: "mdps", 3600.0: "deg/h", 6.0: "rpm"}
 
 _SENTENCES = {  # by code, and what distinguishes several of one code
-    "dead": "one value for {limit} blocks: a dead sensor, or steps far above its noise; check the "
-    "sensor and its resolution",
+    "dead": "one value for 2 s: a dead sensor, or steps far above its noise; check the sensor and "
+    "its resolution",
     "dead zero": "all samples are zero: a dead sensor; check its wiring",
     "dead nan": "no sample is a finite number; check the columns (--columns)",
     "unit": "the noise is {ratio:.3g} times {way} that of {name}: a wrong unit? {unit} differ by "
@@ -121,7 +121,7 @@ def reasons_of(counts: "Counts", stretch: "Stretch", target_dps: float | None) -
 
 def _of_data(counts: "Counts") -> Iterator[Reason]:
     for axis in np.flatnonzero(counts.dead):
-        yield reason("dead", limit=counts.most_constant, axis=axis)
+        yield reason("dead", axis=axis)
     if counts.samples and counts.zero == counts.samples:
         yield reason("dead zero")
     elif counts.samples and counts.not_finite == counts.samples:

@@ -23,14 +23,12 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from gyro_pipeline.calibrator.calibrator import Calibrator
-from gyro_pipeline.calibrator.history import Calibration
+from gyro_pipeline.calibrator.history import DAY_S, Calibration
 from gyro_pipeline.calibrator.state import STILL, State
 from gyro_pipeline.conventions import MDPS, InputError
 
 VARIABLE = "GYRO_CALIBRATE_REGISTRY"
 """The environment variable that names the folder."""
-
-DAY_S = 86400.0
 
 _NAME = re.compile(r"[\w][\w.-]{0,63}")
 _LOCK_S = 10.0

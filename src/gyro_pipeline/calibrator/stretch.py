@@ -68,15 +68,13 @@ class Stretch:
     """What is known from blocks at rest in one attitude.
 
     Args:
-        device_type: Its noise, and more.
+        device_type, known_still: Those of the calibrator.
         prior_of: What the history says.
-        scale: (3,), N^2 over that of the type, as known beforehand.
-        freedom: (3,), its degrees of freedom; infinite where N is known, 0 where it is not.
-        size: Samples in a block.
-        block_s: Its length, seconds.
-        known_still: The device is declared to be at rest: nothing is tested.
+        scale, freedom: (3,), N^2 over that of the type as known beforehand, and its degrees of
+            freedom: infinite where N is known, 0 where it is not.
+        size, block_s: Samples in a block, and its length in seconds.
         start_s: When it starts, seconds since the first sample.
-        age_s: Seconds from power-on to that; None where that is unknown.
+        age_s: Seconds from power-on to the start; None where that is unknown.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917 - what stretches share, and two that differ
