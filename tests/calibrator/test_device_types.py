@@ -59,8 +59,11 @@ def test_a_file_that_is_not_as_it_should_be_is_refused(content, match):
         type_of(content, "here")
 
 
-def test_every_shipped_number_has_a_source():
+def test_every_shipped_type_is_read_and_each_number_has_a_source():
+    with pytest.raises(InputError, match="expected consumer, dot, memsense, got 'dott'"):
+        read_type("dott")
     for path in (files("gyro_pipeline.calibrator") / "types").iterdir():
         content = json.loads(path.read_text())
+        assert read_type(content["type"]).noise_freedom > 0
         numbers = {key for key in content if "_mdps" in key and key != "conflict_mdps"}
         assert numbers <= set(content["sources"]), path.name
