@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -161,8 +162,8 @@ class Calibrator:
             rows = np.vstack([self._pending, rows])
             gaps = np.diff(rows[:, 0])
             edges = np.flatnonzero((gaps > BLOCK_S / 2) | (gaps < -1 / self.rate_hz)) + 1
-            for part in np.split(rows, edges):
-                self._pending = self._take_whole_blocks(part)
+            for first, last in pairwise([0, *edges, len(rows)]):
+                self._pending = self._take_whole_blocks(rows[first:last])
         return self.state()
 
     def finish(self) -> State:
@@ -184,8 +185,8 @@ class Calibrator:
         return State(
             stretch.bias, np.sqrt(stretch.variance), own.bias, np.sqrt(own.variance), prior.mean,
             np.sqrt(prior.narrow), self._rest(stretch, finished), self.time_s, stretch.seconds,
-            stretch.outcome, tuple(reasons_of(self.counts, stretch, target)),
-            reached and left_s == 0, look_ahead,
+            stretch.outcome, reached and left_s == 0, look_ahead,
+            partial(reasons_of, copy(self.counts), stretch, target),
         )  # fmt: skip
 
     def evidence(self) -> Calibration:
@@ -286,7 +287,8 @@ class Calibrator:
             "rate": alarm.value / MDPS,
             "sigma": alarm.sigma / MDPS,
         }
-        self.counts.ended[alarm.code] = told or reason(alarm.code, self.time_s, name=name, **words)
+        told = told or reason(alarm.code, self.time_s, name=name, **words)
+        self.counts.ended = {**self.counts.ended, alarm.code: told}
 
     def _new_stretch(self) -> Stretch:
         age = None if self.since_power_on_s is None else self.since_power_on_s + self.time_s

@@ -1,6 +1,6 @@
 """What the calibrator answers after each call."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -33,9 +33,14 @@ class State:
     time_s: float  # since the first sample
     seconds_at_rest: float  # of the stretch that the answer is from
     history: tuple[str, ...]  # USED, DROPPED or NONE for each axis
-    reasons: tuple[Reason, ...]  # the most important first
     reached: bool  # whether all axes are at the target; true where none is given
     look_ahead: Callable[[], Array] = field(repr=False, compare=False)
+    explain: Callable[[], Iterable[Reason]] = field(repr=False, compare=False)
+
+    @cached_property
+    def reasons(self) -> tuple[Reason, ...]:
+        """What should be known about the answer, the most important first."""
+        return tuple(self.explain())
 
     @cached_property
     def seconds_left(self) -> Array:
