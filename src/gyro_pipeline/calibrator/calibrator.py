@@ -282,12 +282,8 @@ class Calibrator:
         told, name = None, self.device_type.name
         if alarm.code == NOISE:
             told = unit_reason(alarm.value, name)
-        words: dict[str, Any] = {
-            "factor": alarm.value,
-            "rate": alarm.value / MDPS,
-            "sigma": alarm.sigma / MDPS,
-        }
-        told = told or reason(alarm.code, self.time_s, name=name, **words)
+        words: dict[str, Any] = {"name": name, "factor": alarm.value, "rate": alarm.value / MDPS}
+        told = told or reason(alarm.code, self.time_s, sigma=alarm.sigma / MDPS, **words)
         self.counts.ended = {**self.counts.ended, alarm.code: told}
 
     def _new_stretch(self) -> Stretch:

@@ -45,23 +45,27 @@ def _posix(text: str) -> float:
         raise click.BadParameter(f"expected {expected}, got {text!r}") from error
 
 
-_option = partial(partial, click.option)
-_DEVICE = {  # arguments of Calibrator.open, and their options
+_option = partial(partial, click.option)  # still without the name of its argument
+_DEVICE = {  # by the arguments of Calibrator.open
     "device": _option("--device", help="name in the registry; its history is used and added to"),
     "device_type": _option("--type", help="of the device: noise, turn-on spread, ..."),
     "registry": _option("--registry", help="folder of the devices"),
     "target_mdps": _option("--target", type=float, help="standard deviation to reach, mdps"),
-    "same_heading": _option("--same-heading/--any-heading", default=None, help="it repeats"),
+    "same_heading": _option(
+        "--same-heading/--any-heading", default=None, help="whether the heading repeats"
+    ),
     "latitude_deg": _option("--latitude", type=float, help="of the place, degrees"),
     "started_at": _option(
-        "--started-at", type=_posix, help="time of the first sample, ISO 8601 or POSIX seconds"
+        "--started-at", type=_posix, metavar="TIME", help="first sample, ISO 8601 or POSIX seconds"
     ),
     "since_power_on_s": _option("--since-power-on", type=float, help="of the first sample, s"),
     "known_still": _option("--known-still", is_flag=True, help="it was at rest: cut nothing"),
 }
 _JSON = {"as_json": _option("--json", is_flag=True, help="one JSON object")}
 _SHARED = {
-    "require_history": _option("--require-history", is_flag=True, help="exit 5 without"),
+    "require_history": _option(
+        "--require-history", is_flag=True, help="exit 5 where it is not used"
+    ),
     "store": _option("--store/--no-store", default=True, help="add to the device's history"),
     "plot": _option("--plot", type=Path, help="file to draw the running estimate to"),
     "rate_hz": _option("--rate", type=float, help="samples a second, where times do not tell"),
