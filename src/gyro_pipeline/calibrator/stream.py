@@ -158,17 +158,12 @@ class Parser:
 
 
 def _times(file: Any) -> tuple[list[int], float, float]:
-    """The column of times: the option's, or the first of such a name, if its unit is known."""
-    from gyro_pipeline.units import Unit, read_unit  # noqa: PLC0415
+    """The column of times that the readers try first, if its unit is known."""
+    from gyro_pipeline.readers.stamps import stated_unit_s, time_columns  # noqa: PLC0415
 
-    column, given = file.options.time_column, file.options.time_units
-    named = [number for number, header in enumerate(file.headers) if header.names_time]
-    for number in named if column is None else [file.find(column)]:
-        unit = file.headers[number].unit
-        if given is not None:
-            unit = read_unit(given) if isinstance(given, str) else Unit("time", given)
-        if unit is not None and unit.quantity == "time":
-            return [number], unit.factor, 0.0
+    for number, unit_s, by_name in time_columns(file):
+        if by_name and (factor := stated_unit_s(file) or unit_s):
+            return [number], factor, 0.0
     return [], 1.0, 0.0
 
 
