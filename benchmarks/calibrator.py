@@ -117,22 +117,26 @@ def noise(rng, world: World) -> np.ndarray:
     return simulate_noise(rng, (3, drawn), *figures)[:, :count].T.astype(np.float64)
 
 
-def one(world: World, history_variance: np.ndarray, seed: Sequence[int]) -> Result:
-    """One device with its history, and one calibration of it."""
-    rng = np.random.default_rng(seed)
+def device(rng, world: World, variance: np.ndarray) -> tuple[list[Calibration], np.ndarray]:
+    """The calibrations of a device, each of this variance, and its next bias, mdps."""
     level, heading = rng.uniform(-500, 500, 3), rng.uniform(0, 2 * np.pi)
     up, past = np.array([0, 0, 1.0]) if world.accel_ug else None, []
     for _ in range(world.past):
         if world.turn is None:
             heading = rng.uniform(0, 2 * np.pi)
         bias = level + rng.normal(0, world.tau, 3) + earth(heading)
-        mean = bias + rng.normal(0, np.sqrt(history_variance))
+        mean = bias + rng.normal(0, np.sqrt(variance))
         warmth = 25 + rng.normal(0, 0.5) if world.ramp else None
         mean = (mean + (SLOPE * (warmth - 25) if warmth else 0)) * MDPS
-        variance = history_variance * MDPS**2
-        past.append(Calibration(mean, variance, temperature_c=warmth, up=up))
+        past.append(Calibration(mean, variance * MDPS**2, temperature_c=warmth, up=up))
     heading = rng.uniform(0, 2 * np.pi) if world.turn is None else heading + np.radians(world.turn)
-    bias = level + rng.normal(0, world.tau, 3) + earth(heading) + world.step
+    return past, level + rng.normal(0, world.tau, 3) + earth(heading) + world.step
+
+
+def calibrate(world: World, history_variance: np.ndarray, seed: Sequence[int]) -> Result:
+    """One calibration of one device."""
+    rng = np.random.default_rng(seed)
+    past, bias = device(rng, world, history_variance)
     time_s, samples, accel, warmth, truth = simulated(rng, world, bias)
     now = Circumstances(same_heading=world.declared, latitude_deg=LATITUDE)
     age = 0.0 if world.warm_up else None
@@ -188,7 +192,7 @@ def simulated(rng, world: World, bias: np.ndarray):
 def many(pool, world: World, count: int, seed: int) -> list[Result]:
     variance = own_variance(world, HISTORY_S)
     seeds = [(seed, number) for number in range(count)]
-    return list(pool.map(partial(one, world, variance), seeds, chunksize=20))
+    return list(pool.map(partial(calibrate, world, variance), seeds, chunksize=20))
 
 
 def share(inside: np.ndarray) -> str:
