@@ -123,6 +123,17 @@ def test_how_a_recording_is_cut_changes_no_bit(seed):
     assert {"cut", "attitude", "gap", "not_finite", "conflict"} <= codes(one)
 
 
+def test_an_answer_stays_as_it_was_when_more_samples_come():
+    samples = still(30)
+    samples[KNOCK[0]] += KNOCK[1]
+    calibrator = Calibrator(KIND, RATE, target_dps=1.0001e-3)
+    before = calibrator.update(None, samples[:500])
+    calibrator.update(None, samples[500:])
+    assert "cut" in codes(calibrator.state())
+    assert "cut" not in codes(before)
+    np.testing.assert_array_equal(before.seconds_left, [4, 11, 20])
+
+
 def test_seconds_left_are_the_ones_it_takes():
     samples = still(60)
     calibrator = Calibrator(KIND, RATE, target_dps=1.0001e-3)

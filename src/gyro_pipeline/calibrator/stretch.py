@@ -89,7 +89,7 @@ class Stretch:
         self.previous: tuple[Snapshot, Array] | None = None  # before the last block, and its mean
         self.moving = 0  # blocks of motion that just came
         self._turned = np.zeros(3)  # degrees, over them
-        self.motions: list[float] = []  # when each started, seconds since the first sample
+        self.motions: tuple[float, ...] = ()  # when each started, seconds since the first sample
         self._renew_monitor()
         self._conclude()
 
@@ -204,7 +204,7 @@ class Stretch:
             skipped = self.current.filter.skip(len(motion) * self.block_s)
             self.current = self.current._replace(filter=skipped)
         if first:
-            self.motions.append(self.start_s + self.current.filter.time_s)
+            self.motions = (*self.motions, self.start_s + self.current.filter.time_s)
         self.moving, self.previous = self.moving + len(motion), None
         self._renew_monitor()
         self._conclude()
