@@ -26,6 +26,15 @@ ALLOWED = {
     "physics": {"conventions"},
     "estimators": {"conventions", "executors", "learning", "parameters", "physics"},
     "quality": {"conventions", "logs", "parameters", "physics"},
+    "calibrator": {
+        "__init__",  # the version
+        "conventions",
+        "parameters",
+        "physics",
+        "quality",
+        "readers",
+        "units",
+    },
     "protocol": {"conventions", "fingerprints", "logs", "parameters", "physics", "quality"},
     "learning": {"conventions", "executors", "parameters", "physics"},
     "datasets": {
@@ -176,10 +185,19 @@ def test_the_test_of_rest_is_numpy_alone():
 
 
 def test_the_science_knows_neither_kedro_nor_mlflow():
-    for part in ("physics", "protocol", "quality", "estimators", "learning"):
+    for part in ("calibrator", "physics", "protocol", "quality", "estimators", "learning"):
         assert names_of(part)
         for name, names in names_of(part).items():
             assert not roots(names) & {"kedro", "kedro_datasets", "mlflow"}, name
+
+
+def test_the_calibrator_needs_little():
+    """matplotlib for --plot and pyserial for --port, and neither at import."""
+    base = {NAME, "click", "filelock", "numpy", "platformdirs", "pydantic", "scipy"}
+    for name, names in names_of("calibrator").items():
+        assert roots(names) <= base | {"matplotlib", "serial", *sys.stdlib_module_names}, name
+    for name, names in names_of("calibrator", at_import=True).items():
+        assert not roots(names) & {"matplotlib", "serial", "scipy", "pydantic"}, name
 
 
 def test_stages_do_not_know_where_runs_are_kept():

@@ -36,13 +36,14 @@ quarter of the sample rate is taken for devices.
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from gyro_pipeline.conventions import AXES, InputError
 from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding, Log
-from gyro_pipeline.parameters import Quality
-from gyro_pipeline.quality import masks, motion, values
-from gyro_pipeline.quality.recording import Recording
 from gyro_pipeline.quality.rest import Mask
+
+if TYPE_CHECKING:
+    from gyro_pipeline.parameters import Quality
 
 
 @dataclass(frozen=True)
@@ -64,12 +65,16 @@ class Inspected:
     findings: tuple[Finding, ...]
 
 
-def inspect(log: Log, rate_hz: float, quality: Quality) -> Inspected:
+def inspect(log: Log, rate_hz: float, quality: "Quality") -> Inspected:
     """Judge a recording of so many samples a second, and say which of its rows can be used.
 
     Raises:
         InputError: If the samples are not three columns.
     """
+    # the calibrator shares the test of rest, and needs NumPy alone for it
+    from gyro_pipeline.quality import masks, motion, values  # noqa: PLC0415
+    from gyro_pipeline.quality.recording import Recording  # noqa: PLC0415
+
     if log.samples.shape[1:] != (len(AXES),):
         expected = f"expected samples of {len(AXES)} axes, (n, {len(AXES)})"
         raise InputError(f"{expected}, got shape {log.samples.shape}")

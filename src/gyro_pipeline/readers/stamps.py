@@ -37,7 +37,7 @@ def timing_of(file: File, keep: Mask) -> Timing:
         InputError: The column that the options name holds no times.
     """
     problem, stepwise = "", file.options.time_is == "steps"
-    for number, unit_s, by_name in _candidates(file):
+    for number, unit_s, by_name in time_columns(file):
         values = file.table.columns[number]
         times = values if values.dtype.kind == "f" else seconds(values, None)
         if times is None or len(times) != len(keep):
@@ -66,7 +66,7 @@ def _increase(times: Floats, share: float) -> bool:
     return share == 0 or bool(np.count_nonzero(np.diff(finite) >= 0) > share * (len(finite) - 1))
 
 
-def _candidates(file: File) -> list[tuple[int, float | None, bool]]:
+def time_columns(file: File) -> list[tuple[int, float | None, bool]]:
     """Columns that may be of times: number, seconds in a unit by the file, and whether by name.
 
     The format's go first, then others in the file's order; those with a time's name and a unit
@@ -75,7 +75,7 @@ def _candidates(file: File) -> list[tuple[int, float | None, bool]]:
     times, column = file.form.times if file.form else (), file.options.time_column
     by_format = {n: unit_s for name, unit_s in times for n in find_all(file.table, name)}
     order = dict.fromkeys([*by_format, *range(len(file.headers))])
-    candidates, options_s = [], _options_s(file)
+    candidates, options_s = [], stated_unit_s(file)
     for number in order if column is None else [file.find(column)]:
         header, unit = file.headers[number], file.headers[number].unit
         unit_s = unit.factor if unit and header.measures("time") else by_format.get(number)
@@ -87,7 +87,7 @@ def _candidates(file: File) -> list[tuple[int, float | None, bool]]:
     return [candidate for _, candidate in sorted(candidates, key=lambda pair: pair[0])]
 
 
-def _options_s(file: File) -> float | None:
+def stated_unit_s(file: File) -> float | None:
     """Seconds in the options' unit of time."""
     units = file.options.time_units
     return (read_unit(units) or Unit("time")).factor if isinstance(units, str) else units
@@ -102,7 +102,7 @@ def _measured(
     """
     if file.table.columns[number].dtype.kind != "f":
         return from_stamps(times, 1.0, numbers)
-    name, unit_s = file.listed([number]), _options_s(file) or header_s
+    name, unit_s = file.listed([number]), stated_unit_s(file) or header_s
     match = _TIME_SCALE.search(file.table.preamble)
     line_s = float(match[1]) if match else 1.0
     timing = from_stamps(times, unit_s, numbers)

@@ -1,0 +1,30 @@
+"""A gyroscope at rest in, its bias out: with a standard deviation, and the seconds still needed.
+
+    from gyro_pipeline.calibrator import Calibrator
+
+    calibrator = Calibrator.open("B17", rate_hz=200, target_mdps=0.5)
+    for time_s, gyro_dps in samples:
+        state = calibrator.update(time_s, gyro_dps)
+        if state.done:
+            break
+
+Importing it imports NumPy alone. ``docs/calibrator.md`` is the tutorial; the command line is
+``gyro-calibrate``.
+"""
+
+from gyro_pipeline.calibrator.calibrator import Calibrator
+from gyro_pipeline.calibrator.device_types import DeviceType, read_type, type_of_models
+from gyro_pipeline.calibrator.history import Calibration, Circumstances
+from gyro_pipeline.calibrator.reasons import Reason
+from gyro_pipeline.calibrator.state import State
+
+__all__ = [
+    "Calibration",
+    "Calibrator",
+    "Circumstances",
+    "DeviceType",
+    "Reason",
+    "State",
+    "read_type",
+    "type_of_models",
+]

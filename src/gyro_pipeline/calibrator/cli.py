@@ -1,0 +1,455 @@
+"""``gyro-calibrate``: what a person types. Results go to standard output, words to standard error.
+
+Exit codes, the highest of several files: 0 done; 2 usage; 3 target not reached; 4 not at rest;
+5 history not used where --require-history asks for it; 6 data that cannot be used; 7 nothing can be
+stored.
+"""
+
+import hashlib
+import json
+import re
+import sys
+import time
+from collections.abc import Callable, Sequence
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import click
+import numpy as np
+
+import gyro_pipeline
+from gyro_pipeline.calibrator import output, registry
+from gyro_pipeline.calibrator.calibrator import BLOCK_S, Calibrator
+from gyro_pipeline.calibrator.device_types import names
+from gyro_pipeline.calibrator.reasons import UNUSABLE_CODES
+from gyro_pipeline.calibrator.registry import Device, RegistryError, registry_folder
+from gyro_pipeline.calibrator.state import STILL, USED, State
+from gyro_pipeline.conventions import MDPS, InputError
+
+DONE, USAGE, NOT_REACHED, NOT_AT_REST, NO_HISTORY, UNUSABLE, NOT_STORED = 0, 2, 3, 4, 5, 6, 7
+
+
+def _posix(text: str) -> float:
+    """POSIX seconds of such, or of an ISO 8601 time."""
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    try:
+        return datetime.fromisoformat(text).timestamp()
+    except ValueError as error:
+        expected = "2026-01-31T12:00:00+00:00 or POSIX seconds"
+        raise click.BadParameter(f"expected {expected}, got {text!r}") from error
+
+
+_option = partial(partial, click.option)  # still without the name of its argument
+_DEVICE = {  # by the arguments of Calibrator.open
+    "device": _option("--device", help="name in the registry; its history is used and added to"),
+    "device_type": _option("--type", help="of the device: noise, turn-on spread, ..."),
+    "registry": _option("--registry", help="folder of the devices"),
+    "target_mdps": _option("--target", type=float, help="standard deviation to reach, mdps"),
+    "same_heading": _option(
+        "--same-heading/--any-heading", default=None, help="whether the heading repeats"
+    ),
+    "latitude_deg": _option("--latitude", type=float, help="of the place, degrees"),
+    "started_at": _option(
+        "--started-at", type=_posix, metavar="TIME", help="first sample, ISO 8601 or POSIX seconds"
+    ),
+    "since_power_on_s": _option("--since-power-on", type=float, help="of the first sample, s"),
+    "known_still": _option("--known-still", is_flag=True, help="it was at rest: cut nothing"),
+}
+_JSON = {"as_json": _option("--json", is_flag=True, help="one JSON object")}
+_SHARED = {
+    "require_history": _option(
+        "--require-history", is_flag=True, help="exit 5 where it is not used"
+    ),
+    "store": _option("--store/--no-store", default=True, help="add to the device's history"),
+    "plot": _option("--plot", type=Path, help="file to draw the running estimate to"),
+    "rate_hz": _option("--rate", type=float, help="samples a second, where times do not tell"),
+    **_JSON,
+}
+Source = dict[str, str]
+_FOLDER = {"folder": _DEVICE["registry"]}
+
+
+def _with(options: dict[str, Any]) -> Callable[[Any], Any]:
+    """Add options to a command, by the names of its arguments."""
+
+    def add(command: Any) -> Any:
+        for name, option in reversed(options.items()):
+            command = option(name)(command)
+        return command
+
+    return add
+
+
+def _reader_options() -> dict[str, Any]:
+    from gyro_pipeline.parameters import ReaderOptions  # noqa: PLC0415
+
+    texts = {
+        name: info.description or "a name, or a number from 0"
+        for name, info in ReaderOptions.model_fields.items()
+    }
+    return {name: _option(_flag(name), help=text, metavar="VALUE") for name, text in texts.items()}
+
+
+def _flag(name: str) -> str:
+    return "--scale" if name == "scale_dps" else "--" + name.replace("_", "-")
+
+
+def _read_reader_options(texts: dict[str, str]) -> Any:
+    """The readers' options of what was typed: lists with commas, ``rows`` as COLUMN=VALUE."""
+    from pydantic import ValidationError  # noqa: PLC0415
+
+    from gyro_pipeline.parameters import ReaderOptions  # noqa: PLC0415
+
+    given: dict[str, Any] = {name: _value(text) for name, text in texts.items() if text is not None}
+    for name in {"columns", "acceleration_columns", "rows"} & given.keys():
+        given[name] = [_value(part.strip()) for part in texts[name].split(",")]
+    if "rows" in given:
+        pairs = (part.partition("=") for part in texts["rows"].split(","))
+        given["rows"] = {_value(column.strip()): _value(value) for column, _, value in pairs}
+    try:
+        return ReaderOptions(**given)
+    except ValidationError as error:
+        first = error.errors()[0]
+        text = first["msg"].removeprefix("Value error, ")
+        name, _, rest = text.partition(": ")
+        name, rest = (str(first["loc"][0]), text) if first["loc"] else (name, rest)
+        raise InputError(f"{_flag(name)}: {rest}") from error
+
+
+def _value(text: str) -> Any:
+    """A number or true or false, or else the text."""
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
+
+
+def _in_options(message: str) -> str:
+    """A reader's message with options of the command line in place of keys of a catalog."""
+    from gyro_pipeline.parameters import ReaderOptions  # noqa: PLC0415
+    from gyro_pipeline.readers.table import IN_READER  # noqa: PLC0415
+
+    if IN_READER not in message:
+        return message
+    text, _, advice = message.replace(f" {IN_READER}", "").partition("; ")
+    for name in sorted(ReaderOptions.model_fields, key=len, reverse=True):
+        advice = re.sub(rf"(?<![\w-])`?{name}\b(?!-):?`?", _flag(name), advice)
+    return f"{text}; {advice}"
+
+
+def _say(text: str, colour: str = "yellow") -> None:
+    click.secho(text, fg=colour, err=True)
+
+
+class Commands(click.Group):
+    """Commands that return exit codes, and whose errors are one sentence."""
+
+    def invoke(self, ctx: click.Context) -> None:
+        """Run a command, and end with its code."""
+        try:
+            code = super().invoke(ctx)
+        except (InputError, RegistryError) as error:
+            _say(_in_options(str(error)), "red")
+            code = USAGE if isinstance(error, InputError) else NOT_STORED
+        ctx.exit(code or DONE)
+
+
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(gyro_pipeline.__version__)
+def main() -> None:
+    """Calibrate a gyroscope at rest: its bias, a standard deviation, the seconds still needed."""
+
+
+def _job(values: dict[str, Any]) -> SimpleNamespace:
+    """What ``log`` and ``stream`` were asked for: ``known`` is for :meth:`.Calibrator.open`."""
+    known = {name: values.pop(name) for name in _DEVICE}
+    shared = {name: values.pop(name) for name in _SHARED}
+    return SimpleNamespace(known=known, reader=_read_reader_options(values), **shared)
+
+
+def _device(job: SimpleNamespace) -> Device | None:
+    """Where to store; that it can be written is seen before anything is measured."""
+    if job.known["device"] is None or not job.store:
+        return None
+    device = Device(registry_folder(job.known["registry"]), job.known["device"])
+    device.create(job.known["device_type"])
+    return device
+
+
+@main.command()
+@click.argument("files", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@_with({**_DEVICE, **_SHARED, **_reader_options()})
+def log(files: tuple[Path, ...], **values: Any) -> int:
+    """Calibrate from each of some files."""
+    job = _job(values)
+    return max(_log(path, job) for path in files)
+
+
+def _log(path: Path, job: SimpleNamespace) -> int:
+    """One file; returns the exit code."""
+    from gyro_pipeline.readers import read_log  # noqa: PLC0415
+    from gyro_pipeline.readers.table import IN_READER  # noqa: PLC0415
+
+    device = _device(job)
+    try:
+        recording = read_log(path, job.reader, job.rate_hz)
+    except InputError as error:
+        _say(_in_options(str(error)), "red")
+        return USAGE if IN_READER in str(error) else UNUSABLE
+    for finding in recording.findings:
+        if finding.outcome == "rejected":
+            _say(_in_options(f"{path}: {finding.check}: {finding.detail}"), "red")
+            return UNUSABLE
+    rate_hz = recording.rate_hz or job.rate_hz
+    if rate_hz is None:
+        raise InputError(f"{path}: expected times that tell the rate, got none; give --rate")
+    source = hashlib.sha256(path.read_bytes()).hexdigest()
+    calibrator = Calibrator.open(rate_hz=rate_hz, **job.known, without=source)
+    states = _feed(calibrator, recording, 1.0 if job.plot else np.inf)
+    return _report(calibrator, job, states, device, source, path.name)
+
+
+def _feed(calibrator: Calibrator, recording: Any, chunk_s: float) -> list[State]:
+    """Feed a log in chunks; the states after each."""
+    count = len(recording.samples)
+    times = np.arange(count) / calibrator.rate_hz
+    for row in recording.gap_rows:  # how long a gap is, a log does not say
+        times[row:] += 2 * BLOCK_S
+    beside = recording.acceleration_g, recording.temperature_c
+    columns: list[Any] = [times, recording.samples, *beside]
+    step, states = max(round(min(chunk_s * calibrator.rate_hz, count)), 1), []
+    for row in range(0, count, step):
+        chunk: list[Any] = [None if x is None else x[row : row + step] for x in columns]
+        states.append(calibrator.update(*chunk))
+    return states
+
+
+def _report(  # noqa: PLR0917 - what an answer is made of
+    calibrator: Calibrator, job: SimpleNamespace, states: Sequence[State], device: Device | None,
+    source: str, name: str,
+) -> int:  # fmt: skip
+    """Print, plot and store; returns the exit code."""
+    state, target = calibrator.finish(), job.known["target_mdps"]
+    code = _code(state, job)
+    if job.as_json:
+        answer = output.as_json(state, job.known["device"], source=name)
+        click.echo(json.dumps(answer, allow_nan=False))
+    else:
+        if code != UNUSABLE:
+            click.echo(output.as_text(state, target, calibrator))
+        for sentence in output.notes(state):
+            _say(sentence, "red" if code in {UNUSABLE, NOT_AT_REST} else "yellow")
+    if job.plot:
+        output.plot(job.plot, [*states, state], target)
+    if device is not None and code != UNUSABLE:
+        _store(calibrator, state, job, device, {"hash": source, "source": name})
+    return code
+
+
+def _code(state: State, job: SimpleNamespace) -> int:
+    """The exit code of an answer."""
+    if any(reason.code in UNUSABLE_CODES for reason in state.reasons):
+        return UNUSABLE
+    if job.require_history and not all(outcome == USED for outcome in state.history):
+        return NO_HISTORY
+    if state.rest != STILL:
+        return NOT_AT_REST
+    return DONE if state.reached else NOT_REACHED
+
+
+def _store(
+    calibrator: Calibrator, state: State, job: SimpleNamespace, device: Device, source: Source
+) -> None:
+    """Add the calibration, or the attempt, to the device's history."""
+    name, known = source["source"], job.known
+    declared = {
+        "time": known["started_at"], "since_power_on_s": known["since_power_on_s"],
+        "same_heading": calibrator.now.same_heading, "known_still": known["known_still"],
+        "version": gyro_pipeline.__version__,
+    }  # fmt: skip
+    if not device.append(registry.line_of(calibrator, state, {**source, **declared})):
+        _say(f"{name} is stored already; it is not stored again")
+        return
+    try:
+        device.write_model(Calibrator.open(rate_hz=calibrator.rate_hz, **known))
+    except RegistryError as error:
+        _say(f"{name} is stored, but model.json is not made anew: {error}")
+
+
+@main.command()
+@click.option("--port", help="serial port; else standard input")
+@click.option("--baud", type=int, default=115200, show_default=True)
+@click.option("--timeout", type=float, default=5.0, show_default=True, help="of silence, seconds")
+@_with({**_DEVICE, **_SHARED, **_reader_options()})
+def stream(port: str | None, baud: int, timeout: float, **values: Any) -> int:
+    """Calibrate from lines as they come, until the target is reached: a JSON line a second."""
+    from gyro_pipeline.calibrator import stream as lines  # noqa: PLC0415
+
+    job = _job(values)
+    device, parser = _device(job), lines.Parser(job.reader, job.rate_hz)
+    job.known["started_at"] = job.known["started_at"] or time.time()
+    calibrator, states = None, list[State]()
+
+    def show(state: State) -> None:
+        answer = output.as_json(state, job.known["device"])
+        click.echo(json.dumps(answer, allow_nan=False))
+        states.append(state)
+
+    with lines.source(port, baud) as descriptor:
+        for samples in parser.seconds(lines.lines_of(descriptor, timeout, _say)):
+            if calibrator is None:  # the first answer is the history's
+                calibrator = Calibrator.open(rate_hz=parser.rate_hz or 0.0, **job.known)
+                show(calibrator.state())
+            state = calibrator.update(*samples)
+            if int(state.time_s) > int(states[-1].time_s):
+                show(state)
+            if state.done and job.known["target_mdps"] is not None:
+                break
+    if calibrator is None:
+        raise InputError("stream: expected lines of samples, got none; check what sends them")
+    if parser.bad:
+        _say(f"{parser.bad} lines were of another shape and were left out")
+    source = hashlib.sha256(f"{job.known['started_at']} {state.own_dps}".encode()).hexdigest()
+    return _report(calibrator, job, states, device, source, port or "standard input")
+
+
+@main.command()
+@click.option("--heading", help="a drift of the heading in place of --target, such as 1deg/h")
+@_with({**{name: _DEVICE[name] for name in [*_DEVICE][:6]}, **_JSON})
+def plan(heading: str | None, as_json: bool, **known: Any) -> int:
+    """How many seconds at rest a standard deviation takes."""
+    if (heading is None) == (known["target_mdps"] is None):
+        raise InputError("plan: expected either --target 0.3 (mdps) or --heading 1deg/h")
+    target_mdps = known["target_mdps"] = known["target_mdps"] or _heading_mdps(str(heading))
+    calibrator = Calibrator.open(rate_hz=100.0, **known)
+    if not np.all(calibrator.freedom > 0):
+        listed = ", ".join(names(registry_folder(known["registry"])))
+        text = f"expected a device of known noise; give --type ({listed})"
+        raise InputError(f"plan: {text} or a --device with history")
+    seconds = calibrator.state().seconds_left
+    if as_json:
+        answer = {"target_mdps": target_mdps, "seconds": output.numbers(seconds)}
+        click.echo(json.dumps(answer))
+    else:
+        floors = calibrator.device_type.noise.floor_dps / MDPS
+        click.echo("\n".join(output.planned(seconds, floors, target_mdps)))
+    return DONE if np.isfinite(seconds).all() else NOT_REACHED
+
+
+def _heading_mdps(text: str) -> float:
+    """A rate such as 1deg/h in mdps."""
+    from gyro_pipeline.units import read_unit  # noqa: PLC0415
+
+    match = re.fullmatch(r"([\d.]+) *(.+)", text)
+    unit = read_unit(match[2]) if match else None
+    if match is None or unit is None or unit.quantity != "rate":
+        raise InputError(f"--heading: expected such as 1deg/h, got {text!r}")
+    return float(match[1]) * unit.factor / MDPS
+
+
+@main.group()
+def devices() -> None:
+    """List and look after the devices of the registry."""
+
+
+def _existing(folder: str | None, name: str) -> Device:
+    device = Device(registry_folder(folder), name)
+    if not device.folder.is_dir():
+        listed = ", ".join(d.name for d in registry.devices(registry_folder(folder))) or "none"
+        raise InputError(f"device: expected one of {listed}, got {name!r}; see devices list")
+    return device
+
+
+@devices.command("list")
+@_with({**_FOLDER, **_JSON})
+def list_devices(folder: str | None, as_json: bool) -> None:
+    """Devices, their types and how many calibrations count."""
+    rows = [
+        {"device": d.name, "type": d.settings().get("type"), "calibrations": len(d.calibrations())}
+        for d in registry.devices(registry_folder(folder))
+    ]
+    if as_json:
+        click.echo(json.dumps(rows))
+        return
+    for row in rows:
+        click.echo(f"{row['device']:<24} {row['type'] or '-':<12} {row['calibrations']:>4}")
+    _say(f"types: {', '.join(names(registry_folder(folder)))}")
+
+
+@devices.command()
+@click.argument("name")
+@_with({**_FOLDER, **_JSON})
+def show(name: str, folder: str | None, as_json: bool) -> None:
+    """Level over time, turn-on spread, walk, temperature slope and noise of a device."""
+    device = _existing(folder, name)
+    lines, model = device.lines(), device.model()
+    if as_json:
+        click.echo(json.dumps({"lines": lines, "model": model}))
+    else:
+        click.echo("\n".join(output.device_table(lines, device.calibrations(), model)))
+
+
+@devices.command()
+@click.argument("name")
+@click.argument("text")
+@_with(_FOLDER)
+def note(name: str, text: str, folder: str | None) -> None:
+    """Append a note to a device's history."""
+    _existing(folder, name).append({"event": "note", "time": time.time(), "text": text})
+
+
+@devices.command()
+@click.argument("name")
+@click.argument("source", required=False)
+@click.option("--all", "everything", is_flag=True, help="remove the device's folder")
+@_with(_FOLDER)
+def forget(name: str, source: str | None, everything: bool, folder: str | None) -> None:
+    """Withdraw a calibration, by its file's name or hash: it stays stored, and counts no more."""
+    device = _existing(folder, name)
+    if everything:
+        device.remove()
+        return
+    lines = [line for line in device.lines() if line["event"] == "calibration"]
+    hashes = [
+        line["hash"] for line in lines
+        if source and (line["source"] == source or line["hash"].startswith(source))
+    ]  # fmt: skip
+    if not hashes:
+        known = ", ".join(line["source"] for line in lines) or "none"
+        raise InputError(f"forget: expected one of {known}, or a hash, got {source!r}; or --all")
+    for withdrawn in hashes:
+        device.append({"event": "forget", "time": time.time(), "of": withdrawn})
+
+
+@devices.command()
+@click.argument("name")
+@click.argument("file", type=click.Path(dir_okay=False, path_type=Path))
+@_with(_FOLDER)
+def save(name: str, file: Path, folder: str | None) -> None:
+    """Write a device to one file."""
+    file.write_text(json.dumps(_existing(folder, name).content(), indent=1) + "\n", "utf-8")
+
+
+@devices.command()
+@click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.option("--as", "name", help="another name")
+@_with(_FOLDER)
+def load(file: Path, name: str | None, folder: str | None) -> None:
+    """Read a device from such a file; what is there already is kept, and nothing is doubled."""
+    try:
+        content = json.loads(file.read_text("utf-8"))
+        Device(registry_folder(folder), name or content["device"]).restore(content)
+    except (ValueError, KeyError, TypeError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{file}: expected what devices save writes, but: {error!r}") from error
+
+
+if __name__ == "__main__":
+    sys.exit(main())

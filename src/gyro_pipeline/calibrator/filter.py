@@ -1,0 +1,246 @@
+"""The Kalman filter of one stretch at rest: block means in, the bias and its variance out.
+
+The mean of block k of each axis is
+
+    y_k = X_k c + walk + flicker + white noise,    c = (bias at the start, warm-up's amplitude)
+
+with X_k = (1, mean of exp(-t / time constant) in the block). The rate random walk starts at 0 with
+the stretch, flicker is the sum of three AR(1) processes, and white noise has variance N^2 / block.
+The filter runs over y and over the columns of X with the same gains, so what it leaves of them is
+white: e_y of variance S, and e_X. Then (generalised least squares, the sequential form of
+:class:`gyro_pipeline.physics.recording_model.WindowModel`)
+
+    information = sum of e_X e_X' / S,    c = information^-1 (sum of e_X e_y / S)
+
+so an unknown bias needs no large variance anywhere. Everything but y is independent of the data:
+the variance at any later time is known now.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from gyro_pipeline.calibrator.state import Array
+
+FLICKER_S = 120.0
+"""Flicker counts down to one cycle in two such times; what is slower is turn-on bias."""
+
+# Three AR(1) processes whose block means have, in the sums that estimates of 1 to 30 s make, the
+# covariance of B = 1 in recordings of FLICKER_S (tests/calibrator/test_filter.py).
+_TIME_CONSTANTS_S = np.array([0.19990, 1.57091, 13.58328])
+_VARIANCES = np.array([0.826513, 0.602418, 0.896548])
+_WITHIN_BLOCK = 0.009284  # faster flicker, as white noise of a block of 0.5 s
+
+_FREE_DPS = 1.0  # standard deviation of a warm-up's amplitude where the time of power-on is unknown
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Noise figures of three axes (IEEE Std 952), (3,) each, and the warm-up."""
+
+    white: Array  # N, deg/s * sqrt(s)
+    instability: Array  # B, deg/s
+    random_walk: Array  # K, deg/s / sqrt(s)
+    # Mean and standard deviation of the amplitude at power-on, deg/s; time constant, s.
+    warm_up: tuple[Array, Array, float] | None = None
+
+    @property
+    def floor_dps(self) -> Array:
+        """The flicker floor of the Allan deviation, (3,): no average comes below it."""
+        return np.sqrt(2 * np.log(2) / np.pi) * self.instability
+
+
+class Estimate(NamedTuple):
+    """Estimates by the data alone after each of n filters; infinite before the first block.
+
+    The bias now is ``transfer`` times the bias at the start, plus something independent of it.
+    """
+
+    bias: Array  # (n, 3), now
+    variance: Array  # (n, 3)
+    start: Array  # (n, 3), the bias at the start
+    start_variance: Array  # (n, 3)
+    transfer: Array  # (n, 3)
+    squares: Array  # (n, 3), of the residuals over their variances
+    freedom: Array  # (n, 1), degrees of freedom of those
+
+
+class _Step(NamedTuple):
+    """What some seconds do to the four processes, the walk first (exact integrals)."""
+
+    keep: Array  # (4,), F
+    read: Array  # (4,), H: the mean over the step, per value at its start
+    added: Array  # (3, 4, 4), Q
+    shared: Array  # (3, 4), covariance of what is added to the end and to the mean
+    white: Array  # (3,), R
+
+
+@lru_cache(maxsize=64)
+def _step(noise: Noise, step_s: float) -> _Step:
+    d = step_s / _TIME_CONSTANTS_S
+    decay, mean = np.exp(-d), -np.expm1(-d) / d
+    flicker = noise.instability[:, None] ** 2 * _VARIANCES
+    walk = noise.random_walk[:, None] ** 2 * step_s
+    within = flicker * (2 * (d - 1 + decay) / d**2 - mean**2)
+    white = noise.white**2 / step_s + _WITHIN_BLOCK * noise.instability**2
+    return _Step(
+        keep=np.append(1.0, decay),
+        read=np.append(1.0, mean),
+        added=np.hstack([walk, flicker * (1 - decay**2)])[:, :, None] * np.eye(4),
+        shared=np.hstack([walk / 2, flicker * (1 - decay) ** 2 / d]),
+        white=white + walk[:, 0] / 3 + within.sum(axis=1),
+    )
+
+
+class Filter(NamedTuple):
+    """State after some blocks; an update makes a new one, so one can go back to an older one."""
+
+    noise: Noise
+    block_s: float
+    age_s: float | None  # from power-on to the start; None: a warm-up's amplitude is free
+    reference: Array  # (3,), deg/s, the first block's mean, which is subtracted from the data
+    time_s: float  # since the start, gaps included
+    blocks: int  # taken so far
+    states: Array  # (3, 4, 1 + p), of the walk and flicker, in y and in each column of X
+    covariance: Array  # (3, 4, 4), of the states, (deg/s)^2
+    information: Array  # (3, p, p), on c
+    weighted: Array  # (3, p), the sum of e_X e_y / S
+    squares: Array  # (3,), the sum of e_y^2 / S
+
+    @classmethod
+    def start(cls, noise: Noise, block_s: float, age_s: float | None = None) -> Self:
+        """The filter before the first block."""
+        p, zero = 1 if noise.warm_up is None else 2, np.zeros(3)
+        flicker = noise.instability[:, None] ** 2 * _VARIANCES
+        covariance = np.hstack([np.zeros((3, 1)), flicker])[:, :, None] * np.eye(4)
+        information, weighted = np.zeros((3, p, p)), np.zeros((3, p))
+        if noise.warm_up is not None:
+            mean, spread, _ = noise.warm_up
+            if age_s is None:
+                mean, spread = zero, np.full(3, _FREE_DPS)
+            information[:, 1, 1] = 1 / spread**2
+            weighted[:, 1] = mean / spread**2
+        states = np.zeros((3, 4, 1 + p))
+        return cls(
+            noise, block_s, age_s, zero, 0.0, 0, states, covariance, information, weighted, zero
+        )
+
+    def update(self, mean: Array | None) -> tuple[Self, Array]:
+        """Take the mean of a block, (3,), deg/s; None looks ahead: all but the data moves on.
+
+        Returns:
+            The next filter, and the block's innovation (3,) in units of its standard deviation;
+            0 at the first block.
+        """
+        reference = self.reference if self.blocks or mean is None else mean
+        step = _step(self.noise, self.block_s)
+        to_mean = self.covariance @ step.read
+        variance = to_mean @ step.read + step.white
+        residuals = (
+            self._columns(0.0 if mean is None else mean - reference) - step.read @ self.states
+        )
+        of_y, of_x = residuals[:, 0], residuals[:, 1:]
+        gain = (step.keep * to_mean + step.shared) / variance[:, None]
+        scaled = of_x / variance[:, None]
+        explained = (variance[:, None] * gain)[:, :, None] * gain[:, None, :]
+        following = self.skip(self.block_s)
+        following = following._replace(
+            reference=reference,
+            blocks=self.blocks + 1,
+            states=following.states + gain[:, :, None] * residuals[:, None, :],
+            covariance=following.covariance - explained,
+            information=self.information + scaled[:, :, None] * of_x[:, None, :],
+            weighted=self.weighted + scaled * of_y[:, None],
+            squares=self.squares + of_y**2 / variance,
+        )
+        return following, self._innovation(of_y, of_x, variance)
+
+    def skip(self, seconds: float) -> Self:
+        """Move on over a gap without data."""
+        step = _step(self.noise, seconds)
+        return self._replace(
+            time_s=self.time_s + seconds,
+            states=step.keep[:, None] * self.states,
+            covariance=step.keep[:, None] * step.keep * self.covariance + step.added,
+        )
+
+    def _columns(self, y: Array | float) -> Array:
+        """(3, 1 + p): y about the reference, 1, and the decay's mean in the block."""
+        columns = np.ones((3, self.states.shape[-1]))
+        columns[:, 0] = y
+        if self.noise.warm_up is not None:
+            length = self.block_s / self.noise.warm_up[2]
+            columns[:, 2] = self._decay() * -np.expm1(-length) / length
+        return columns
+
+    def _decay(self) -> float:
+        """What is left now of a warm-up's amplitude at power-on, or else at the start."""
+        if self.noise.warm_up is None:
+            return 0.0
+        return float(np.exp(-(self.time_s + (self.age_s or 0.0)) / self.noise.warm_up[2]))
+
+    def _innovation(self, of_y: Array, of_x: Array, variance: Array) -> Array:
+        if not self.blocks:
+            return np.zeros(3)
+        c, uncertainty = self._constants()
+        spread = variance + np.sum(_times(uncertainty, of_x) * of_x, axis=1)
+        return np.asarray((of_y - np.sum(of_x * c, axis=1)) / np.sqrt(spread))
+
+    def _constants(self) -> tuple[Array, Array]:
+        """The constants c by the data alone, (3, p), and their covariance, (3, p, p)."""
+        uncertainty = _inverse(self.information)
+        return _times(uncertainty, self.weighted), uncertainty
+
+    def warm_up(self) -> tuple[Array, Array]:
+        """How far the warm-up still is from its end, and the standard deviation, (3,), deg/s."""
+        c, uncertainty = self._constants()
+        return self._decay() * c[:, -1], self._decay() * np.sqrt(uncertainty[:, -1, -1])
+
+    def ahead(self, blocks: int) -> list[Self]:
+        """Filters after each of the blocks to come: their variances are known now."""
+        filters = [self]
+        for _ in range(blocks):
+            filters.append(filters[-1].update(None)[0])
+        return filters[1:]
+
+
+def estimates(filters: Sequence[Filter]) -> Estimate:
+    """What filters of one stretch say by the data alone."""
+    first, blocks = filters[0], np.array([[f.blocks] for f in filters], np.float64)
+    if not first.blocks:
+        unknown, infinite = np.full((1, 3), np.nan), np.full((1, 3), np.inf)
+        one, zero = np.ones((1, 3)), np.zeros((1, 3))
+        return Estimate(unknown, infinite, unknown, infinite, one, zero, zero[:, :1])
+    uncertainty = _inverse(np.array([f.information for f in filters]))
+    weighted = np.array([f.weighted for f in filters])
+    walk = np.array([f.states[:, 0] for f in filters])  # of y, and of each column
+    walk_variance = np.array([f.covariance[:, 0, 0] for f in filters])
+    c, on_c = _times(uncertainty, weighted), -walk[..., 1:]
+    on_c[..., 0] += 1
+    shared = _times(uncertainty, on_c)
+    squares = np.array([f.squares for f in filters]) - np.sum(c * weighted, axis=-1)
+    freedom = blocks - 1
+    if first.noise.warm_up is not None:  # the amplitude's prior is one datum more
+        mean, spread, _ = first.noise.warm_up
+        free = first.age_s is None
+        squares, freedom = squares + (0 if free else (mean / spread) ** 2), freedom - free
+    return Estimate(
+        bias=first.reference + walk[..., 0] + np.sum(on_c * c, axis=-1),
+        variance=walk_variance + np.sum(shared * on_c, axis=-1),
+        start=first.reference + c[..., 0],
+        start_variance=uncertainty[..., 0, 0],
+        transfer=shared[..., 0] / uncertainty[..., 0, 0],
+        squares=squares,
+        freedom=np.maximum(freedom, 0),
+    )
+
+
+def _inverse(matrices: Array) -> Array:
+    return np.asarray(1 / matrices if matrices.shape[-1] == 1 else np.linalg.inv(matrices))
+
+
+def _times(matrices: Array, vectors: Array) -> Array:
+    return np.asarray((matrices @ vectors[..., None])[..., 0])

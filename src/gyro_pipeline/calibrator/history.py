@@ -1,0 +1,282 @@
+"""What a device's past calibrations say about its bias now (CALIBRATOR.md, section 3).
+
+Each calibration stores its evidence, the mean and the variance of its own data alone. Of one axis
+
+    evidence_i = level_i + slope (temperature_i - reference) + turn-on_i + Earth's rate_i + noise_i
+
+with a level that walks by a variance of walk^2 a day, a turn-on bias of standard deviation tau and
+noise of the stored variance. The first level is unknown, the slope has the type's normal prior.
+The bias of the next calibration is the conditional mean given the others (kriging), integrated over
+a grid of tau and walk, each point weighted by its restricted likelihood times the log-normal prior
+of the type.
+
+The Earth turns at 4.18 mdps, so a bias at rest is one of an attitude and a heading. With the up
+direction u in the axes of the device, latitude phi and an unknown heading, the Earth's rate is
+4.18 sin(phi) u and, on axis i, something horizontal of variance (4.18 cos phi)^2 (1 - u_i^2) / 2.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gyro_pipeline.calibrator.device_types import DeviceType
+from gyro_pipeline.calibrator.reasons import Reason, reason
+from gyro_pipeline.calibrator.state import DROPPED, Array
+from gyro_pipeline.conventions import MDPS
+
+EARTH_DPS = 4.178e-3
+"""The Earth's rate, 15.041 deg/h."""
+
+DAY_S = 86400.0
+
+SAME_ATTITUDE_DEG = 5.0
+"""Attitudes that differ by more are different ones."""
+
+_GRID = (11, 9)  # points of tau and of the walk, over 2.5 standard deviations to both sides
+_MOST = 100  # calibrations that are used, the latest
+_LEAST_DPS = 1e-3 * MDPS
+
+Fitted = dict[str, tuple[float, float]]
+"""Level, tau, walk and slope of an axis, each with its standard deviation."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Evidence of one calibration, by its own data alone; arrays are (3,)."""
+
+    mean: Array  # deg/s
+    variance: Array  # of the mean
+    day: float | None = None  # when it was made, in days since any epoch
+    temperature_c: float | None = None
+    up: Array | None = None  # the direction of the mean acceleration, a unit vector
+    outcome: tuple[str, ...] = ("none",) * 3  # what became of the history on each axis
+    noise: Array | None = None  # N, deg/s * sqrt(s), as these data show it
+    freedom: float = 0.0  # its degrees of freedom
+
+
+@dataclass(frozen=True)
+class Circumstances:
+    """What is known of a calibration besides its rates."""
+
+    day: float | None = None
+    temperature_c: float | None = None
+    up: Array | None = None
+    same_heading: bool = False  # whether the heading is declared to be that of the history
+    latitude_deg: float | None = None
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What the history says, (3,) each; NaN and infinite where it says nothing."""
+
+    mean: Array  # of the bias, deg/s
+    narrow: Array  # variance where the history is right
+    wide: Array  # variance where it is wrong
+    slope: Array  # of the bias, deg/s a degree Celsius; the type's where there is no history
+    slope_sigma: Array
+    count: tuple[int, ...] = (0, 0, 0)  # calibrations that make the level of each axis
+    reasons: tuple[Reason, ...] = ()  # what widened it
+    fitted: tuple[Fitted, ...] = ()
+
+
+def prior_of(
+    calibrations: Sequence[Calibration], device_type: DeviceType, now: Circumstances
+) -> Prior:
+    """The prior of a calibration under these circumstances, from those before it."""
+    past = list(calibrations)[-_MOST:]
+    if not past:
+        none, infinite = np.full(3, np.nan), np.full(3, np.inf)
+        return Prior(none, infinite, infinite, device_type.slope, device_type.slope_spread)
+    days = _known([*(c.day for c in past), now.day])  # a gap that is not known is of one day
+    days = np.append(0.0, np.cumsum(np.nan_to_num(np.abs(np.diff(days)), nan=1.0)))
+    members = [level_members(past, axis, device_type.turn_on[axis]) for axis in range(3)]
+    axes = [
+        _axis_prior([past[i] for i in chosen], days[[*chosen, -1]], axis, device_type, now)
+        for axis, chosen in enumerate(members)
+    ]
+    mean, variance, tau, fitted = zip(*axes, strict=True)
+    slope, slope_sigma = np.array([of_axis["slope"] for of_axis in fitted]).T
+    heading, of_heading = _earth(past, now, np.array(tau))
+    beyond, of_temperature = _beyond(past, device_type, now)
+    narrow = np.array(variance) + heading + beyond
+    wide = np.maximum(device_type.wide**2, 9 * narrow)  # at least three times as far
+    count, reasons = tuple(map(len, members)), (*of_heading, *of_temperature)
+    return Prior(np.array(mean), narrow, wide, slope, slope_sigma, count, reasons, fitted)
+
+
+def _known(values: Sequence[float | None]) -> Array:
+    """An array, NaN for None."""
+    return np.array(values, np.float64)
+
+
+def level_members(past: Sequence[Calibration], axis: int, turn_on: float) -> list[int]:
+    """Numbers of the calibrations that make the level of an axis.
+
+    One that contradicted the history is left out; a second that agrees with it starts a new level.
+    """
+    members: list[int] = []
+    odd: int | None = None
+    for number, calibration in enumerate(past):
+        if calibration.outcome[axis] != DROPPED:
+            members.append(number)
+            odd = None
+        elif odd is not None and _agree(past[odd], calibration, axis, turn_on):
+            members, odd = [odd, number], None
+        else:
+            odd = number
+    return members or [len(past) - 1]
+
+
+def _agree(first: Calibration, second: Calibration, axis: int, turn_on: float) -> bool:
+    """Whether two are within three standard deviations of their difference."""
+    variance = first.variance[axis] + second.variance[axis] + 2 * turn_on**2
+    return bool(abs(first.mean[axis] - second.mean[axis]) < 3 * np.sqrt(variance))
+
+
+def _axis_prior(
+    past: Sequence[Calibration], days: Array, axis: int, device_type: DeviceType, now: Circumstances
+) -> tuple[float, float, float, Fitted]:
+    """Mean and variance of the next bias without the Earth, tau squared, and what was fitted."""
+    temperatures = _known([*(c.temperature_c for c in past), now.temperature_c])
+    unknown = np.isnan(temperatures[:-1])
+    seen = temperatures[:-1][~unknown] if not unknown.all() else np.zeros(1)
+    warmth = np.nan_to_num(temperatures - seen.mean()) * (not unknown.all())
+    type_slope, spread = device_type.slope[axis], device_type.slope_spread[axis] ** 2
+    tau, walk, logs = _grid(device_type, axis)
+    days = days - days[0]
+    of_walk = walk[:, None, None] ** 2 * np.minimum(days[:, None], days)
+    moving = of_walk + spread * np.outer(warmth, warmth)
+    variances = np.array([c.variance[axis] for c in past]) + unknown * spread * seen.var()
+    variances = variances + tau[:, None] ** 2
+    among = moving[:, :-1, :-1] + variances[:, :, None] * np.eye(len(past))
+    slope = np.broadcast_to(spread * warmth[:-1], variances.shape)
+    cross = np.stack([moving[:, :-1, -1], of_walk[:, :-1, -1], slope], axis=-1)
+    own = [moving[:, -1, -1] + tau**2, of_walk[:, -1, -1], np.full(len(tau), spread)]
+    y = _levelled(past, axis, now) - type_slope * warmth[:-1]
+    flat = np.array([1.0, 1.0, 0.0])  # the bias and the level move with the level, the slope not
+    deviance, mean, variance = _krige(among, cross, np.stack(own, axis=-1), y, flat)
+    logs = logs - deviance / 2
+    weights = np.exp(logs - logs.max()) / np.exp(logs - logs.max()).sum()
+    (bias, sigma), level, (extra, slope_sigma) = _moments(weights, mean, variance)
+    grid = np.stack([tau, walk], axis=-1)
+    fitted = dict(zip(("tau", "walk"), _moments(weights, grid, np.zeros_like(grid)), strict=True))
+    fitted |= {"level": level, "slope": (float(type_slope + extra), slope_sigma)}
+    return bias + type_slope * warmth[-1], sigma**2, float(weights @ tau**2), fitted
+
+
+def _levelled(past: Sequence[Calibration], axis: int, now: Circumstances) -> Array:
+    """Evidence (n,) with the Earth's vertical rate as in the attitude of now, where it is known."""
+    means = np.array([c.mean[axis] for c in past])
+    if now.latitude_deg is None or now.up is None:
+        return means
+    ups = np.array([now.up[axis] if c.up is None else c.up[axis] for c in past])
+    return means + EARTH_DPS * np.sin(np.radians(now.latitude_deg)) * (now.up[axis] - ups)
+
+
+def _grid(device_type: DeviceType, axis: int) -> tuple[Array, Array, Array]:
+    """Points of tau and of the walk, (g,) each, and the logarithm of their prior."""
+    z = [np.linspace(-2.5, 2.5, number) for number in _GRID]
+    first, second = (grid.ravel() for grid in np.meshgrid(*z, indexing="ij"))
+    tau = max(device_type.turn_on[axis], _LEAST_DPS) * device_type.turn_on_factor**first
+    walk = max(device_type.walk[axis], _LEAST_DPS) * device_type.walk_factor**second
+    return tau, walk, -(first**2 + second**2) / 2
+
+
+def _krige(
+    among: Array, cross: Array, own: Array, y: Array, flat: Array
+) -> tuple[Array, Array, Array]:
+    """Restricted deviance, conditional means and variances of k targets at each point of a grid.
+
+    Args:
+        among: (g, n, n), covariance of the evidence.
+        cross: (g, n, k), of the evidence with the targets.
+        own: (g, k), variances of the targets.
+        y: (n,), the evidence, about an unknown level.
+        flat: (k,), by how much a target moves with the level.
+    """
+    reference = y.mean()
+    columns = np.stack([np.ones(len(y)), y - reference], axis=-1)
+    columns = np.broadcast_to(columns, (len(among), *columns.shape))
+    root = np.linalg.cholesky(among)
+    white = np.linalg.solve(root, np.concatenate([columns, cross], axis=-1))
+    ones, data, to_targets = white[:, :, 0], white[:, :, 1], white[:, :, 2:]
+    information = np.sum(ones**2, axis=1)
+    level = np.sum(ones * data, axis=1) / information
+    residuals = data - level[:, None] * ones
+    deviance = 2 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+    deviance = deviance + np.log(information) + np.sum(residuals**2, axis=1)
+    missing = flat - np.einsum("gn,gnk->gk", ones, to_targets)
+    mean = flat * (level[:, None] + reference) + np.einsum("gn,gnk->gk", residuals, to_targets)
+    variance = own - np.sum(to_targets**2, axis=1) + missing**2 / information[:, None]
+    return deviance, mean, np.maximum(variance, 0)
+
+
+def _moments(weights: Array, mean: Array, variance: Array) -> list[tuple[float, float]]:
+    """Means and standard deviations of k mixtures over the grid, from (g, k) of each."""
+    means = weights @ mean
+    variances = weights @ (variance + (mean - means) ** 2)
+    return [(float(m), float(np.sqrt(v))) for m, v in zip(means, variances, strict=True)]
+
+
+def _beyond(
+    past: Sequence[Calibration], device_type: DeviceType, now: Circumstances
+) -> tuple[Array, list[Reason]]:
+    """Variance of a temperature that the history has not seen, or that is not known now."""
+    seen = [c.temperature_c for c in past if c.temperature_c is not None]
+    if not seen or not np.any(device_type.slope_spread):
+        return np.zeros(3), []
+    least, most, value = min(seen), max(seen), now.temperature_c
+    distance = most - least if value is None else max(value - most, least - value, 0.0)
+    if not distance:
+        return np.zeros(3), []
+    key = "temperature unknown" if value is None else "temperature beyond"
+    told = reason(key, value, distance, least=least, most=most)
+    return (device_type.slope_spread * distance) ** 2, [told]
+
+
+def angle_deg(first: Array, second: Array) -> float:
+    """Angle between two directions, degrees."""
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second)))
+
+
+def _earth(
+    past: Sequence[Calibration], now: Circumstances, tau_squared: Array
+) -> tuple[Array, list[Reason]]:
+    """Variance of the Earth's rate between the history's headings and this one, (3,), (deg/s)^2.
+
+    Two unknown headings: (4.18 cos phi)^2 on a horizontal axis, 0 on a vertical one. Nothing where
+    the heading is declared to repeat and no other attitude is seen. Where past attitudes differ,
+    tau holds it already.
+    """
+    ups, up, latitude = [c.up for c in past if c.up is not None], now.up, now.latitude_deg
+    before = np.sum(ups, axis=0) / np.linalg.norm(np.sum(ups, axis=0)) if ups else None
+    turned = 0.0 if before is None or up is None else angle_deg(up, before)
+    if turned > SAME_ATTITUDE_DEG:
+        told = reason("attitude history", turned, SAME_ATTITUDE_DEG)
+    elif now.same_heading:
+        return np.zeros(3), []
+    else:
+        told = reason("heading")
+    horizontal = (EARTH_DPS * (1.0 if latitude is None else np.cos(np.radians(latitude)))) ** 2
+    variance = np.full(3, horizontal)
+    if before is not None and up is not None:
+        variance = horizontal * (1 - (up**2 + before**2) / 2)
+        if latitude is None:
+            variance = variance + (EARTH_DPS * (up - before)) ** 2
+    if before is not None and max(angle_deg(u, before) for u in ups) > SAME_ATTITUDE_DEG:
+        variance = np.maximum(variance - tau_squared, 0)
+    return variance, [told]
+
+
+def noise_of(calibrations: Sequence[Calibration], device_type: DeviceType) -> tuple[Array, Array]:
+    """N^2 over that of the type, (3,), and its degrees of freedom: of type and history together."""
+    freedom = np.full(3, device_type.noise_freedom)
+    if np.isinf(device_type.noise_freedom):
+        return np.ones(3), freedom
+    total = freedom.copy()
+    for past in calibrations:
+        if past.noise is not None and past.freedom > 0:
+            total += past.freedom * (past.noise / device_type.noise.white) ** 2
+            freedom += past.freedom
+    return np.where(freedom > 0, total / np.maximum(freedom, 1e-9), 1.0), freedom

@@ -1,0 +1,179 @@
+"""Answers as text for people and as JSON for programs, and a picture of how one came about."""
+
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from gyro_pipeline.calibrator.calibrator import Calibrator
+from gyro_pipeline.calibrator.state import DROPPED, NONE, STILL, USED, Array, State
+from gyro_pipeline.conventions import AXES, MDPS, InputError
+
+HEADING_DEG = 3.6
+"""Degrees of heading an hour in one mdps."""
+
+_IN_TEXT = {"conflict", "cut", "floor", "rotation_bound"}  # reasons that the text says itself
+
+
+def as_json(state: State, device: str | None, **more: Any) -> dict[str, Any]:
+    """One object for a program; null stands where there is no number."""
+    return {
+        "device": device,
+        "bias_dps": numbers(state.bias_dps),
+        "sigma_dps": numbers(state.sigma_dps),
+        "rest": state.rest,
+        "seconds_at_rest": state.seconds_at_rest,
+        "seconds_left": numbers(state.seconds_left),
+        "history": list(state.history),
+        "reasons": [vars(reason) for reason in state.reasons],
+        **more,
+    }
+
+
+def numbers(values: Array) -> list[float | None]:
+    """Numbers of JSON."""
+    return [value if math.isfinite(value) else None for value in values.tolist()]
+
+
+def as_text(state: State, target_mdps: float | None, calibrator: Calibrator) -> str:
+    """A table of the axes, with a line above and what is left to do below; coloured."""
+    still = state.rest == STILL
+    cut = ", ".join(f"{r.value:.1f} s" for r in state.reasons if r.code == "cut")
+    first = "" if still else f"not at rest ({state.rest}): "
+    first += f"at rest for {state.seconds_at_rest:.1f} of {state.time_s:.1f} s"
+    first += f" (a motion at {cut} was cut)" if cut else ""
+    temperature, count = calibrator.best.current.temperature, max(calibrator.best.prior.count)
+    first += f"; {temperature.mean:.1f} °C" if temperature.blocks else ""
+    heading = f"heading {'' if calibrator.now.same_heading else 'not '}declared to repeat"
+    past = f"{count} calibration{'s' * (count != 1)}, {heading}" if count else "none"
+    lines = [click.style(f"{first}; history: {past}", fg="green" if still else "red")]
+    lines.append(f"{'bias, deg/s':>17}{'σ, mdps':>11}   from")
+    sigmas = state.sigma_dps / MDPS
+    for axis, name in enumerate(AXES):
+        row = f"{name}{state.bias_dps[axis]:+16.6f}{sigmas[axis]:11.2f}   {_from(state, axis)}"
+        dropped = state.history[axis] == DROPPED
+        lines.append(click.style(row, fg="yellow") if dropped else row)
+    if target_mdps is not None:
+        lines.append(_left(state, target_mdps))
+    if np.isfinite(sigmas).all():
+        drifts = zip(sigmas * HEADING_DEG, AXES, strict=True)
+        listed = ", ".join(f"{drift:.2g}° about {name}" for drift, name in drifts)
+        lines.append(f"In one hour the heading drifts by {listed} (1 σ of the bias alone).")
+    bounds = [r.sentence for r in state.reasons if r.code == "rotation_bound"]
+    return "\n".join([*lines, *bounds])
+
+
+def notes(state: State) -> Iterator[str]:
+    """What should be known and the text does not say."""
+    for reason in state.reasons:
+        if reason.code not in _IN_TEXT:
+            yield f"{reason.axis}: {reason.sentence}" if reason.axis else reason.sentence
+
+
+def _from(state: State, axis: int) -> str:
+    """What an axis's answer is made of."""
+    if state.history[axis] == USED:
+        own, past = state.own_sigma_dps[axis] / MDPS, state.history_sigma_dps[axis] / MDPS
+        return f"this log {own:.2f}, history {past:.2f}"
+    conflicts = [r for r in state.reasons if r.code == "conflict" and r.axis == AXES[axis]]
+    return f"this log alone: {conflicts[0].sentence}" if conflicts else "this log"
+
+
+def _left(state: State, target_mdps: float) -> str:
+    """How long it still takes."""
+    floors = {r.axis: f", below its floor of {r.value:.2g}" for r in state.reasons
+              if r.code == "floor"}  # fmt: skip
+    parts = []
+    for name, seconds in zip(AXES, state.seconds_left, strict=True):
+        if np.isinf(seconds):
+            why = floors.get(name, " within an hour")
+            parts.append(f"{name} does not reach {target_mdps:g} mdps{why}")
+        elif seconds:
+            needed = f"{math.ceil(seconds)} s more at rest for {target_mdps:g} mdps"
+            parts.append(f"{name} needs {needed}")
+    return f"{'; '.join(parts)}." if parts else f"The target of {target_mdps:g} mdps is reached."
+
+
+def planned(seconds: Array, floors_mdps: Array, target_mdps: float) -> Iterator[str]:
+    """A line an axis: the seconds that a target takes, or why it is not reached."""
+    same = f"{target_mdps:.3g} mdps ({target_mdps * HEADING_DEG:.3g}° of heading an hour)"
+    for name, needed, floor in zip(AXES, seconds, floors_mdps, strict=True):
+        if np.isfinite(needed):
+            yield f"{name}: {needed:.1f} s at rest for {same}"
+        elif floor > target_mdps:
+            yield f"{name}: not with this sensor: its floor is {floor:.2g} mdps"
+        else:
+            yield f"{name}: not within an hour"
+
+
+def device_table(
+    lines: Sequence[Mapping[str, Any]], counting: Collection[str], model: Mapping[str, Any]
+) -> Iterator[str]:
+    """The history of a device, and what is derived from it."""
+    yield f"{'source':<24}{'rest':>8}{'s':>8}  {'bias, deg/s':^36}{'σ, mdps':^20}  history"
+    for line in lines:
+        if line["event"] == "note":
+            yield f"note: {line['text']}"
+        elif line["event"] == "calibration":
+            head = f"{line['source'][:23]:<24}{line['rest']:>8}{line['seconds']:8.1f}"
+            mean = "".join(f"{m:+12.6f}" for m in line["mean_dps"] or [])
+            sigma = "".join(f"{v**0.5 / MDPS:7.2f}" for v in line["variance_dps2"] or [])
+            out = "" if line["hash"] in counting else "  (does not count)"
+            yield f"{head}{mean}{sigma}  {'/'.join(line['outcome'])}{out}"
+    if model:
+        for name, fit, noise in zip(AXES, model["axes"], model["noise_mdps_rts"], strict=False):
+            figures = ", ".join(f"{key} {value:.3g} ± {sd:.2g}" for key, (value, sd) in fit.items())
+            known = "not known" if noise is None else f"{noise:.3g} mdps·√s"
+            yield f"{name}: noise {known}; {figures} (mdps, √day, °C)"
+
+
+def plot(path: Path, states: Sequence[State], target_mdps: float | None) -> None:
+    """A picture of the running estimate with its band, the history, the stop and what was cut.
+
+    Args:
+        path: Of the picture; its ending says of which kind.
+        states: One a second or so, the last one finished.
+        target_mdps: To mark the stop.
+
+    Raises:
+        InputError: matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure  # noqa: PLC0415 - the extra [plot]
+    except ImportError as error:
+        text = "--plot needs matplotlib: pip install 'gyro-pipeline[plot]'"
+        raise InputError(text) from error
+    figure = Figure(figsize=(8, 7), layout="constrained")
+    panels = figure.subplots(3, 1, sharex=True)
+    stop = next((state.time_s for state in states if state.done), None)
+    for axis, panel in enumerate(panels):
+        _draw(panel, states, axis)
+        if target_mdps is not None and stop is not None:
+            panel.axvline(stop, color="C2", linestyle="--", label=f"{target_mdps:g} mdps reached")
+    panels[0].legend(loc="upper right", fontsize="small")
+    panels[-1].set_xlabel("time, s")
+    figure.savefig(path)
+
+
+def _draw(panel: Any, states: Sequence[State], axis: int) -> None:
+    """One axis, in mdps about its last estimate."""
+    last, times = states[-1], [state.time_s for state in states]
+    centre = last.bias_dps[axis]
+    bias = np.array([state.bias_dps[axis] - centre for state in states]) / MDPS
+    band = 1.96 * np.array([state.sigma_dps[axis] for state in states]) / MDPS
+    panel.fill_between(times, bias - band, bias + band, alpha=0.25, label="95 %")
+    panel.plot(times, bias, label="estimate")
+    if last.history[axis] != NONE:
+        past, width = last.history_dps[axis] - centre, 1.96 * last.history_sigma_dps[axis]
+        low, high = (past - width) / MDPS, (past + width) / MDPS
+        panel.axhspan(low, high, color="C1", alpha=0.2, label="history, 95 %")
+    for reason in last.reasons:
+        if reason.code == "cut":
+            panel.axvline(reason.value, color="C3", label="cut")
+    usual = np.median(band[np.isfinite(band)]) if np.isfinite(band).any() else 1.0
+    panel.set_ylim(-5 * usual, 5 * usual)
+    panel.set_ylabel(f"{AXES[axis]}, mdps")
+    panel.set_title(f"{AXES[axis]} about {centre:+.6f} deg/s", loc="left", fontsize="small")

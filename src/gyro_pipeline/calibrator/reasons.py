@@ -1,0 +1,175 @@
+"""What should be known about an answer: codes for programs, sentences for people."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, SupportsIndex
+
+import numpy as np
+
+from gyro_pipeline.conventions import AXES, MDPS
+
+if TYPE_CHECKING:
+    from gyro_pipeline.calibrator.calibrator import Counts
+    from gyro_pipeline.calibrator.stretch import Stretch
+
+UNUSABLE_CODES = {"dead", "unit"}
+"""Codes of data that cannot be used at all."""
+
+VERTICAL = 0.9
+"""Cosine of the angle between an axis that counts as vertical and the vertical."""
+
+_FAR = 15.0  # factor on the noise that another unit makes, not another device
+_WARMER_C = 1.0  # over a log, from which on it is said
+_ENOUGH = 6  # blocks that tell a unit by their noise
+_UNITS = {57.3: "rad/s", 1e3: "mdps", 3600.0: "deg/h", 6.0: "rpm"}
+
+_SENTENCES = {  # by code, and what distinguishes several of one code
+    "dead": "one value for 2 s: a dead sensor, or steps far above its noise; check the sensor and "
+    "its resolution",
+    "dead zero": "all samples are zero: a dead sensor; check its wiring",
+    "dead nan": "no sample is a finite number; check the columns (--columns)",
+    "unit": "the noise is {ratio:.3g} times {way} that of {name}: a wrong unit? {unit} differ by "
+    "{near:g}; give --units, or another --type",
+    "cut": "a motion at {value:.1f} s was cut",
+    "motion": "in motion up to {value:.1f} s; the stretch that knows most counts",
+    "attitude": "the device was turned before {value:.1f} s; the stretch that knows most counts",
+    "noise": "up to {value:.1f} s the rates scatter {factor:.1f} times as much as {name} does at "
+    "rest: not at rest, or another --type",
+    "rotation": "the accelerometer sees a rotation of {rate:.2g} mdps (σ {sigma:.2g}) about a "
+    "horizontal axis before {value:.1f} s: not at rest",
+    "attitude history": "the attitude differs by {value:.0f}° from that of the history: it counts "
+    "less",
+    "heading": "the heading is not declared to repeat, so the history holds less about horizontal "
+    "axes; declare it with --same-heading, or mounted = true in device.toml",
+    "temperature unknown": "the temperature is not known, in the history it was {least:.1f} to "
+    "{most:.1f} °C: it counts less",
+    "temperature beyond": "{value:.1f} °C is beyond the {least:.1f} to {most:.1f} °C of the "
+    "history: it counts less",
+    "temperature missing": "the temperature is missing in {value:.0f} of {limit} blocks",
+    "temperature moved": "the temperature moved by {value:.1f} °C; the bias may have moved with it",
+    "conflict": "the history is {away:.1f} mdps away (1 in {chance:,.0f}) and was dropped",
+    "colour": "the colour of the noise is not known, and σ holds for white noise; give --type",
+    "floor": "the target is below the floor of {value:.2g} mdps, which no longer average of this "
+    "sensor goes below",
+    "warm_up": "warming up, still {value:+.1f} mdps; the bias is what it settles to",
+    "not_finite": "{value} of {limit} samples are not finite and were left out",
+    "zero": "{value} of {limit} samples are zero on all axes and were left out",
+    "gap": "samples are missing at {places} places, {value:.3g} s in all",
+    "clock": "the clock jumped {value} times; time goes on from there",
+    "rotation_bound": "A steady rotation about {about} below {value:.2g} mdps cannot be told from "
+    "a bias.",
+    "rotation_bound none": "A steady rotation about {about} cannot be told from a bias.",
+}
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Something that a user or a program should know."""
+
+    code: str  # one word for programs, such as ``conflict``, ``motion`` or ``floor``
+    sentence: str  # the same for people
+    axis: str | None = None  # x, y or z; None where it is about all
+    value: float | None = None  # what was found, in the unit of the sentence
+    limit: float | None = None  # what it was compared with
+
+
+def reason(
+    key: str, value: float | None = None, limit: float | None = None,
+    axis: SupportsIndex | None = None, **words: Any,
+) -> Reason:  # fmt: skip
+    """A reason with its sentence from the table."""
+    sentence = _SENTENCES[key].format(value=value, limit=limit, **words)
+    return Reason(
+        key.partition(" ")[0], sentence, None if axis is None else AXES[axis], value, limit
+    )
+
+
+def unit_reason(factor: float, name: str) -> Reason | None:
+    """That the noise is so far off that of the type that the unit must be wrong."""
+    if not 0 < factor < np.inf or 1 / _FAR < factor < _FAR:
+        return None
+    ratio, way = max(factor, 1 / factor), "above" if factor > 1 else "below"
+    near = min(_UNITS, key=lambda unit: abs(np.log(ratio / unit)))
+    words: dict[str, Any] = {
+        "ratio": ratio,
+        "way": way,
+        "name": name,
+        "unit": _UNITS[near],
+        "near": near,
+    }
+    return reason("unit", factor, _FAR, **words)
+
+
+def reasons_of(counts: "Counts", stretch: "Stretch", target_dps: float | None) -> Iterator[Reason]:
+    """All that should be known, the most important first."""
+    yield from _of_data(counts)
+    yield from (reason("cut", start) for start in stretch.motions)
+    yield from counts.ended.values()
+    noise, freedom = stretch.log_noise()
+    if noise is not None and freedom >= _ENOUGH and np.all(stretch.freedom > 0):
+        factors = noise / (np.sqrt(stretch.scale) * stretch.noise.white)  # also too little noise
+        if told := unit_reason(sorted(factors.tolist())[1], stretch.device_type.name):
+            yield told
+    if np.isfinite(stretch.prior.narrow).any():
+        yield from stretch.prior.reasons
+    yield from stretch.current.conflicts
+    yield from _of_noise(stretch, target_dps)
+    yield from _of_samples(counts)
+    yield from _of_temperature(stretch)
+    yield from _of_rotation(stretch)
+
+
+def _of_data(counts: "Counts") -> Iterator[Reason]:
+    for axis in np.flatnonzero(counts.dead):
+        yield reason("dead", axis=axis)
+    if counts.samples and counts.zero == counts.samples:
+        yield reason("dead zero")
+    elif counts.samples and counts.not_finite == counts.samples:
+        yield reason("dead nan")
+
+
+def _of_noise(stretch: "Stretch", target_dps: float | None) -> Iterator[Reason]:
+    if not stretch.device_type.noise_freedom:
+        yield reason("colour")
+    floor = stretch.floor_dps / MDPS
+    if target_dps is not None:
+        for axis in np.flatnonzero(stretch.floor_dps > target_dps):
+            yield reason("floor", float(floor[axis]), target_dps / MDPS, axis)
+    if stretch.noise.warm_up is not None and stretch.blocks:
+        left, sigma = stretch.current.filter.warm_up()
+        for axis in np.flatnonzero(np.abs(left) > np.maximum(2 * sigma, MDPS)):
+            yield reason("warm_up", float(left[axis] / MDPS), axis=axis)
+
+
+def _of_samples(counts: "Counts") -> Iterator[Reason]:
+    for code, number in (("not_finite", counts.not_finite), ("zero", counts.zero)):
+        if 0 < number < counts.samples:
+            yield reason(code, number, counts.samples)
+    if counts.gaps:
+        yield reason("gap", counts.gap_s, places=counts.gaps)
+    if counts.jumps:
+        yield reason("clock", counts.jumps)
+
+
+def _of_temperature(stretch: "Stretch") -> Iterator[Reason]:
+    measured = stretch.current.temperature
+    if 0 < measured.blocks < stretch.blocks:
+        yield reason("temperature missing", stretch.blocks - measured.blocks, stretch.blocks)
+    moved = measured.most - measured.least
+    if moved > _WARMER_C:
+        yield reason("temperature moved", moved, _WARMER_C)
+
+
+def _of_rotation(stretch: "Stretch") -> Iterator[Reason]:
+    """The bound on a rotation that nothing sees, about the vertical where gravity is measured."""
+    if not stretch.blocks:
+        return
+    up = stretch.up
+    about = "any axis" if up is None else "the vertical"
+    axes = stretch.usable & (True if up is None else np.abs(up) > VERTICAL)
+    if not axes.any():
+        yield reason("rotation_bound none", about=about)
+        return
+    spread = stretch.prior.narrow + stretch.estimate.start_variance
+    bound = 1.96 * float(np.sqrt(spread[axes].max())) / MDPS
+    yield reason("rotation_bound", bound, about=about)

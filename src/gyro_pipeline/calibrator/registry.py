@@ -1,0 +1,262 @@
+"""The registry of devices: a folder each, whose history is only ever appended to.
+
+    <registry>/<device>/device.toml         written by people: type, mounted, latitude, frame, notes
+                        calibrations.jsonl  one line a calibration, note or withdrawal
+                        model.json          derived: noise, level, tau, walk, slope
+    <registry>/types/<type>.json
+
+A line is written at once, under a lock, and synced before the call returns. A line that a crash cut
+off is ignored, and the next one starts on a new line.
+"""
+
+import json
+import os
+import re
+import shutil
+import tomllib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from filelock import FileLock, Timeout
+
+from gyro_pipeline.calibrator.calibrator import Calibrator
+from gyro_pipeline.calibrator.history import DAY_S, Calibration
+from gyro_pipeline.calibrator.state import STILL, State
+from gyro_pipeline.conventions import MDPS, InputError
+
+VARIABLE = "GYRO_CALIBRATE_REGISTRY"
+"""The environment variable that names the folder."""
+
+_NAME = re.compile(r"[\w][\w.-]{0,63}")
+_LOCK_S = 10.0
+_TEMPLATE = """{type}
+# mounted = true     # the heading repeats at each calibration
+# latitude = 32.1    # degrees
+# notes = ""
+"""
+_KEYS = {"type", "mounted", "latitude", "frame", "notes"}
+
+Line = dict[str, Any]
+
+
+class RegistryError(Exception):
+    """The registry cannot be written."""
+
+
+def registry_folder(path: str | Path | None = None) -> Path:
+    """The folder that was named, the environment's, or the user's own for data."""
+    if path or os.environ.get(VARIABLE):
+        return Path(path or os.environ[VARIABLE])
+    import platformdirs  # noqa: PLC0415 - not needed where a folder is named
+
+    return Path(platformdirs.user_data_dir("gyro-calibrate"))
+
+
+def devices(registry: Path) -> list["Device"]:
+    """All devices of a registry, by name."""
+    return [Device(registry, path.parent.name) for path in sorted(registry.glob("*/device.toml"))]
+
+
+class Device:
+    """A device's folder.
+
+    Args:
+        registry: The folder of all devices.
+        name: Letters, digits, ``.``, ``-`` and ``_``.
+    """
+
+    def __init__(self, registry: Path, name: str) -> None:
+        if not _NAME.fullmatch(name) or name == "types":
+            text = "expected letters, digits, '.', '-' and '_', 64 at most, and not 'types'"
+            raise InputError(f"device: {text}, got {name!r}; give another name")
+        self.name, self.folder = name, registry / name
+        self.lines_path = self.folder / "calibrations.jsonl"
+        self.settings_path = self.folder / "device.toml"
+        self.model_path = self.folder / "model.json"
+
+    def settings(self) -> dict[str, Any]:
+        """What ``device.toml`` says; nothing where there is none."""
+        try:
+            content = tomllib.loads(_read(self.settings_path).decode())
+        except ValueError as error:
+            text = f"{self.settings_path}: expected TOML, but: {error}; correct it"
+            raise InputError(text) from error
+        if extra := set(content) - _KEYS:
+            expected = ", ".join(sorted(_KEYS))
+            text = f"{self.settings_path}: expected {expected}, got {sorted(extra)}; correct it"
+            raise InputError(text)
+        return content
+
+    def lines(self) -> list[Line]:
+        """All whole lines of its history, the oldest first."""
+        parsed = map(_parsed, _read(self.lines_path).split(b"\n"))
+        return [line for line in parsed if line is not None]
+
+    def calibrations(self) -> dict[str, Line]:
+        """The calibrations that count, by hash: at rest, and not withdrawn since."""
+        return {key: line for key, line in self._kept().items() if line["rest"] == STILL}
+
+    def _kept(self) -> dict[str, Line]:
+        """All that were not withdrawn since, attempts as well."""
+        kept: dict[str, Line] = {}
+        for line in self.lines():
+            if line["event"] == "calibration":
+                kept.setdefault(line["hash"], line)
+            elif line["event"] == "forget":
+                kept.pop(line["of"], None)
+        return kept
+
+    def history(self, without: str | None = None) -> list[Calibration]:
+        """The evidence of the calibrations that count, but for that of one hash."""
+        return [_evidence(line) for key, line in self.calibrations().items() if key != without]
+
+    def append(self, line: Mapping[str, Any]) -> bool:
+        """Write a line, synced; not if there is a calibration of the same hash.
+
+        Returns:
+            Whether it was written.
+
+        Raises:
+            RegistryError: The disk is full, or the folder cannot be written.
+        """
+        data = json.dumps({"schema": 1, **line}, allow_nan=False).encode() + b"\n"
+        with self._locked():
+            if line["event"] == "calibration" and line["hash"] in self._kept():
+                return False
+            _append(self.lines_path, data)
+        return True
+
+    def write_model(self, calibrator: Calibrator) -> None:
+        """Replace ``model.json``, for people and other programs, by what is known now."""
+        noise = np.sqrt(calibrator.scale) * calibrator.device_type.noise.white / MDPS
+        known = zip(noise.tolist(), calibrator.freedom > 0, strict=True)
+        axes = [
+            {key: [value / MDPS, sigma / MDPS] for key, (value, sigma) in axis.items()}
+            for axis in calibrator.best.prior.fitted
+        ]
+        model = {"axes": axes, "noise_mdps_rts": [n if is_known else None for n, is_known in known]}
+        temporary = self.model_path.with_suffix(".new")
+        with self._locked():
+            temporary.write_text(json.dumps(model, indent=1) + "\n", "utf-8")
+            os.replace(temporary, self.model_path)
+
+    def model(self) -> dict[str, Any]:
+        """What ``model.json`` holds; nothing where there is none."""
+        return dict(json.loads(_read(self.model_path) or "{}"))
+
+    def create(self, device_type: str | None = None, settings: str = "") -> None:
+        """Make the folder and ``device.toml``, where they are not there.
+
+        Raises:
+            RegistryError: Nothing can be written; this is said before anything is measured.
+        """
+        of_type = f'type = "{device_type}"' if device_type else '# type = "consumer"'
+        with self._locked(), open(self.lines_path, "ab"):
+            if not self.settings_path.exists():
+                self.settings_path.write_text(settings or _TEMPLATE.format(type=of_type), "utf-8")
+
+    def content(self) -> dict[str, Any]:
+        """All of it, for one file."""
+        settings = _read(self.settings_path).decode()
+        return {"device": self.name, "device_toml": settings, "lines": self.lines()}
+
+    def restore(self, content: Mapping[str, Any]) -> None:
+        """Add what such a file holds and is not there yet."""
+        lines, there = list(content["lines"]), self.lines()
+        self.create(settings=content["device_toml"])
+        for line in lines:
+            if line not in there:
+                self.append(line)
+
+    def remove(self) -> None:
+        """Remove the folder and all that is in it."""
+        shutil.rmtree(self.folder)
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with FileLock(self.folder / ".lock", timeout=_LOCK_S):
+                yield
+        except Timeout as error:
+            text = f"{self.folder}: another process has held its lock for {_LOCK_S:g} s"
+            raise RegistryError(f"{text}; end it, or give --no-store") from error
+        except OSError as error:
+            text = f"{self.folder}: nothing can be stored: {error.strerror or error}"
+            raise RegistryError(f"{text}; give another --registry, or --no-store") from error
+
+
+def _read(path: Path) -> bytes:
+    """A file's content, empty where it is not there."""
+    try:
+        return path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError):
+        return b""
+
+
+def _append(path: Path, data: bytes) -> None:
+    """All of the data at the end of a file, or none, on the disk."""
+    with open(path, "a+b", buffering=0) as file:
+        size = file.seek(0, os.SEEK_END)
+        if size and os.pread(file.fileno(), 1, size - 1) != b"\n":
+            data = b"\n" + data  # a crash cut the last line off
+        try:
+            if os.write(file.fileno(), data) < len(data):
+                raise OSError(28, "No space left on device")
+            os.fsync(file.fileno())
+        except OSError:
+            file.truncate(size)
+            raise
+
+
+def _parsed(line: bytes) -> Line | None:
+    try:
+        content = json.loads(line)
+    except ValueError:
+        return None
+    return content if isinstance(content, dict) and "event" in content else None
+
+
+def _evidence(line: Line) -> Calibration:
+    """What a stored line says."""
+    temperature, up, noise = line["temperature_c"], line["gravity"], line["noise_mdps_rts"]
+    return Calibration(
+        mean=np.array(line["mean_dps"]),
+        variance=np.array(line["variance_dps2"]),
+        day=None if line["time"] is None else line["time"] / DAY_S,
+        temperature_c=None if temperature is None else temperature[0],
+        up=None if up is None else np.array(up),
+        outcome=tuple(line["outcome"]),
+        noise=None if noise is None else np.array(noise) * MDPS,
+        freedom=line["noise_freedom"],
+    )
+
+
+def line_of(calibrator: Calibrator, state: State, source: Mapping[str, Any]) -> Line:
+    """The line of a calibration, or of an attempt.
+
+    Args:
+        calibrator: After its last sample.
+        state: Its answer.
+        source: ``hash``, ``time`` (POSIX), ``source`` and what else is to be kept of it.
+    """
+    evidence, seen = calibrator.evidence(), calibrator.best.current.temperature
+    usable = state.rest == STILL and bool(np.isfinite(evidence.variance).all())
+    noise = None if evidence.noise is None else (evidence.noise / MDPS).tolist()
+    return {
+        "event": "calibration",
+        **source,
+        "seconds": state.seconds_at_rest,
+        "mean_dps": evidence.mean.tolist() if usable else None,
+        "variance_dps2": evidence.variance.tolist() if usable else None,
+        "temperature_c": [seen.mean, seen.least, seen.most] if seen.blocks else None,
+        "gravity": None if evidence.up is None else evidence.up.tolist(),
+        "rest": state.rest,
+        "outcome": list(evidence.outcome),
+        "noise_mdps_rts": noise,
+        "noise_freedom": evidence.freedom,
+        "reasons": [reason.sentence for reason in state.reasons],
+    }

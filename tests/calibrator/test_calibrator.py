@@ -1,0 +1,279 @@
+"""Samples in, a state out: what holds for every recording."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from gyro_pipeline.calibrator import Calibration, Calibrator, Circumstances
+from gyro_pipeline.calibrator.device_types import type_of
+from gyro_pipeline.conventions import InputError
+
+RATE = 100.0
+BIAS = np.array([0.412, -0.104, 0.087])  # three different axes
+KIND = type_of({"type": "test", "noise_mdps_rts": [3, 4, 5], "turn_on_mdps": 0.3}, "here")
+UNKNOWN = type_of({}, "here")
+
+
+def still(seconds, seed=1, rate=RATE):
+    noise = np.array([3, 4, 5]) * 1e-3 * np.sqrt(rate)
+    return BIAS + np.random.default_rng(seed).normal(0, noise, (round(seconds * rate), 3))
+
+
+def history(count=14, seed=2, spread=0.3e-3):
+    rng = np.random.default_rng(seed)
+    return [Calibration(BIAS + rng.normal(0, spread, 3), np.full(3, 1e-8)) for _ in range(count)]
+
+
+DECLARED = Circumstances(same_heading=True)
+
+
+def fed(samples, kind=KIND, gravity=None, warmth=None, time_s=None, **options):
+    calibrator = Calibrator(kind, RATE, **options)
+    calibrator.update(time_s, samples, gravity, warmth)
+    return calibrator
+
+
+def finished(samples, **options):
+    return fed(samples, **options).finish()
+
+
+def codes(state):
+    return {reason.code for reason in state.reasons}
+
+
+def test_importing_it_imports_numpy_alone():
+    check = (
+        "import sys, gyro_pipeline.calibrator as _;"
+        "roots = {name.split('.')[0] for name in sys.modules};"
+        "heavy = roots - set(sys.stdlib_module_names) - {'gyro_pipeline', 'numpy', '__main__'};"
+        "print({name for name in heavy if not name.startswith('_')})"
+    )
+    options = [sys.executable, "-S", "-c", f"import sys; sys.path[:] = {sys.path!r}; {check}"]
+    out = subprocess.run(options, capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "set()"
+
+
+def test_without_history_it_is_the_mean():
+    samples = still(20)
+    state = finished(samples)
+    np.testing.assert_allclose(state.bias_dps, samples.mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(state.sigma_dps, np.array([3, 4, 5]) * 1e-3 / np.sqrt(20))
+    assert (state.rest, state.seconds_at_rest, state.history) == ("still", 20.0, ("none",) * 3)
+
+
+def test_before_any_sample_the_answer_is_the_history():
+    state = Calibrator(KIND, RATE, history(), DECLARED).state()
+    np.testing.assert_allclose(state.bias_dps, BIAS, atol=0.5e-3)
+    assert np.all(state.sigma_dps < 0.5e-3)
+    assert (state.rest, state.history) == ("unsure", ("used",) * 3)
+
+
+def test_with_history_it_is_the_posterior_mean():
+    """One calibration, N known: weights by the inverse variances, tau twice, the mixture aside."""
+    state = finished(still(10), history=history(), now=DECLARED)
+    own, past = state.own_sigma_dps**-2, state.history_sigma_dps**-2
+    expected = (own * state.own_dps + past * state.history_dps) / (own + past)
+    np.testing.assert_allclose(state.bias_dps, expected, atol=5e-5)
+    np.testing.assert_allclose(state.sigma_dps, (own + past) ** -0.5, rtol=0.03)
+
+
+def test_a_heading_that_is_not_declared_costs_the_earths_rate_twice():
+    known = DECLARED, Circumstances(latitude_deg=60.0)
+    declared, not_declared = (Calibrator(KIND, RATE, history(), now).state() for now in known)
+    added = not_declared.history_sigma_dps**2 - declared.history_sigma_dps**2
+    np.testing.assert_allclose(added, (4.178e-3 * 0.5) ** 2, rtol=1e-6)
+    assert "heading" in codes(not_declared)
+    assert "heading" not in codes(declared)
+
+
+def test_with_an_accelerometer_the_vertical_axis_is_free_of_it():
+    up, samples = np.array([0.0, 0, 1]), still(5)
+    past = [Calibration(c.mean, c.variance, up=up) for c in history()]
+    gravity = np.tile(up, (len(samples), 1))
+    sigma = finished(samples, history=past, gravity=gravity).history_sigma_dps
+    assert np.all(sigma[:2] > 4e-3)
+    assert sigma[2] < 0.5e-3
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_how_a_recording_is_cut_changes_no_bit(seed):
+    """Motion, a turn, a gap, warmth, a wrong history and lost samples included."""
+    rng = np.random.default_rng(seed)
+    samples, time_s = still(60, seed), np.arange(6000) / RATE
+    samples[1500:1530] += np.sin(np.linspace(0, 2 * np.pi, 30))[:, None] * 3
+    samples[4000:4100, 2] += 20
+    samples[2222], time_s[3000:] = np.nan, time_s[3000:] + 4.3
+    gravity = np.array([0, 0.1, 0.99]) + rng.normal(0, 1e-3, (6000, 3))
+    warmth = 25 + np.arange(6000) / 2000
+    past = [Calibration(c.mean + 0.01, c.variance, temperature_c=25.0) for c in history()]
+    kind = type_of({"noise_mdps_rts": 4, "temperature_spread_mdps_per_c": 2}, "here")
+    whole = fed(samples, kind, gravity, warmth, time_s, history=past, now=DECLARED, target_dps=1e-3)
+    parts = Calibrator(kind, RATE, past, DECLARED, 1e-3)
+    edges = [0, 1, 2, *np.sort(rng.choice(np.arange(3, 6000), 60, replace=False)), 6000]
+    for first, last in zip(edges[:-1], edges[1:], strict=True):
+        part = slice(first, last)
+        parts.update(time_s[part], samples[part], gravity[part], warmth[part])
+    one, other = whole.finish(), parts.finish()
+    for name in ("bias_dps", "sigma_dps", "history_dps", "history_sigma_dps", "seconds_left"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    assert one.reasons == other.reasons
+    assert (one.rest, one.seconds_at_rest) == (other.rest, other.seconds_at_rest)
+    assert {"cut", "attitude", "gap", "not_finite", "conflict"} <= codes(one)
+
+
+def test_an_answer_stays_as_it_was_when_more_samples_come():
+    samples = still(30)
+    samples[KNOCK[0]] += KNOCK[1]
+    calibrator = Calibrator(KIND, RATE, target_dps=1.0001e-3)
+    before = calibrator.update(None, samples[:500])
+    calibrator.update(None, samples[500:])
+    assert "cut" in codes(calibrator.state())
+    assert "cut" not in codes(before)
+    np.testing.assert_array_equal(before.seconds_left, [4, 11, 20])
+
+
+def test_seconds_left_are_the_ones_it_takes():
+    samples = still(60)
+    calibrator = Calibrator(KIND, RATE, target_dps=1.0001e-3)
+    state = calibrator.update(None, samples[:500])  # N^2 / target^2 = 9, 16, 25 s
+    np.testing.assert_array_equal(state.seconds_left, [4.0, 11.0, 20.0])
+    assert not calibrator.update(None, samples[500:2450]).done
+    assert calibrator.update(None, samples[2450:2500]).done
+
+
+def test_a_target_below_the_floor_is_not_offered():
+    kind = type_of({"noise_mdps_rts": 3, "flicker_mdps": [3, 0, 0]}, "here")
+    state = finished(still(5), kind=kind, target_dps=1.5e-3)
+    assert np.isinf(state.seconds_left).tolist() == [True, False, False]
+    (floor,) = [reason for reason in state.reasons if reason.code == "floor"]
+    assert (floor.axis, floor.value) == ("x", pytest.approx(0.664 * 3, rel=1e-3))
+
+
+def test_noise_that_is_not_known_makes_students_intervals_and_a_least_time():
+    state = finished(still(5), kind=UNKNOWN, target_dps=0.1)
+    assert not state.done
+    means = still(5).reshape(10, 50, 3).mean(axis=1)
+    sigma = means.std(axis=0, ddof=1) / np.sqrt(10) * 2.262 / 1.96
+    np.testing.assert_allclose(state.sigma_dps, sigma, rtol=2e-3)
+    assert finished(still(10), kind=UNKNOWN, target_dps=0.1).done
+    assert "colour" in codes(state)
+
+
+KNOCK = np.s_[1000:1030], 2 * np.sin(np.linspace(0, 2 * np.pi, 30))[:, None]
+TURN = np.s_[1000:1100], np.array([0, 0, 30.0])  # by 30 degrees
+HANDLED = np.s_[2000:], np.random.default_rng(4).normal(0, 20, (1000, 3))
+
+
+@pytest.mark.parametrize(
+    ("motion", "code", "least", "most"),
+    [(KNOCK, "cut", 27, 29.5), (TURN, "attitude", 18, 19.5), (HANDLED, "motion", 19, 20)],
+)
+def test_what_is_left_of_a_recording_with_a_motion(motion, code, least, most):
+    """A knock is cut, a turn ends the stretch, and what came before the end in the hand is kept."""
+    samples = still(30)
+    samples[motion[0]] += motion[1]
+    state = finished(samples)
+    assert (state.rest, code in codes(state)) == ("still", True)
+    assert least <= state.seconds_at_rest <= most
+
+
+def test_motion_throughout_is_not_at_rest():
+    samples = still(20) + 20 * np.sin(np.arange(2000) / 30)[:, None]
+    for kind in (KIND, UNKNOWN):
+        assert finished(samples, kind=kind).rest == "moving"
+
+
+def test_a_slow_rotation_is_seen_by_the_accelerometer_alone():
+    """3 times the noise of the mean, about x; 100 ug/sqrt(Hz), one-sided."""
+    samples, t = still(10), np.arange(1000) / RATE
+    rate = 3 * 3e-3 / np.sqrt(10)
+    samples[:, 0] += rate
+    gravity = np.random.default_rng(5).normal([0, 0, 1], 1e-4 * np.sqrt(RATE / 2), (1000, 3))
+    gravity[:, 1] += np.sin(np.radians(rate) * t)
+    state = finished(samples, gravity=gravity)
+    assert (state.rest, "rotation" in codes(state)) == ("moving", True)
+    assert finished(samples).rest == "still"
+
+
+def test_a_wrong_history_is_dropped_where_it_is_wrong():
+    up = np.array([0.0, 0, 1])
+    past = [Calibration(c.mean + [0, 0, 0.02], c.variance, up=up) for c in history()]
+    state = finished(still(10), history=past, now=DECLARED, gravity=np.tile(up, (1000, 1)))
+    assert state.history == ("used", "used", "dropped")
+    assert state.bias_dps[2] == state.own_dps[2]
+    assert [r.axis for r in state.reasons if r.code == "conflict"] == ["z"]
+
+
+def test_warm_up_settles_and_is_said():
+    warm = {"amplitude_mdps": 20, "spread_mdps": 5, "time_constant_s": 20}
+    kind = type_of({"noise_mdps_rts": [3, 4, 5], "warm_up": warm}, "here")
+    samples = still(30) + 0.02 * np.exp(-np.arange(3000) / RATE / 20)[:, None]
+    state = finished(samples, kind=kind, since_power_on_s=0.0)
+    assert np.all(np.abs(state.bias_dps - BIAS) < 3 * state.sigma_dps)
+    assert "warm_up" in codes(state)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "code"),
+    [
+        (np.zeros_like, "dead"),
+        (lambda x: np.round(x) + 1, "dead"),
+        (lambda x: np.full_like(x, np.nan), "dead"),
+        (lambda x: x * np.degrees(1), "unit"),
+        (np.radians, "unit"),
+    ],
+)
+def test_data_that_cannot_be_used_are_told(spoil, code):
+    assert code in codes(finished(spoil(still(10))))
+
+
+def test_samples_that_are_no_measurement_are_left_out():
+    samples = still(20)
+    samples[[3, 500]], samples[0] = np.nan, 0
+    state = finished(samples)
+    assert codes(state) >= {"not_finite", "zero"}
+    np.testing.assert_allclose(state.bias_dps, BIAS, atol=4e-3)
+
+
+def test_a_clock_that_jumps_is_said():
+    time_s = np.arange(2000) / RATE
+    time_s[700:] -= 1e6
+    time_s[1400:] += 1e9
+    state = finished(still(20), time_s=time_s)
+    assert "clock" in codes(state)
+    assert state.seconds_at_rest >= 18
+
+
+def test_the_evidence_is_of_its_own_data_alone():
+    one = fed(still(10), history=history(), now=DECLARED).evidence()
+    other = fed(still(10)).evidence()
+    np.testing.assert_array_equal(one.mean, other.mean)
+    np.testing.assert_array_equal(one.variance, other.variance)
+
+
+def test_samples_of_another_shape_are_refused():
+    with pytest.raises(InputError, match=r"gyro_dps: expected \(n, 3\)"):
+        Calibrator(KIND, RATE).update(None, np.zeros((4, 2)))
+    with pytest.raises(InputError, match="rate_hz: expected"):
+        Calibrator(KIND, 0)
+
+
+def test_a_temperature_that_moves_makes_the_bias_now_less_certain():
+    spread = type_of({"noise_mdps_rts": [3, 4, 5], "temperature_spread_mdps_per_c": 10}, "here")
+    samples, warmth = still(20), np.linspace(20, 24, 2000)
+    plain, warm = (fed(samples, kind, warmth=warmth) for kind in (KIND, spread))
+    evidence, plain, warm = warm.evidence(), plain.finish(), warm.finish()
+    added = warm.sigma_dps**2 - plain.sigma_dps**2
+    np.testing.assert_allclose(np.sqrt(added), 10e-3 * 2, rtol=0.03)  # 2 degrees from the mean
+    np.testing.assert_allclose(evidence.variance, plain.sigma_dps**2)
+    assert "temperature" in codes(warm)
+
+
+def test_a_temperature_that_is_missing_half_way_is_said():
+    warmth = np.full(2000, 25.0)
+    warmth[1000:] = np.nan
+    state = finished(still(20), warmth=warmth)
+    (reason,) = [r for r in state.reasons if r.code == "temperature"]
+    assert reason.sentence == "the temperature is missing in 20 of 40 blocks"

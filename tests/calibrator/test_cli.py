@@ -1,0 +1,222 @@
+"""What a person types and sees."""
+
+import json
+import os
+import pty
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from gyro_pipeline.calibrator.cli import main
+
+RATE = 100
+BIAS = np.array([0.412, -0.104, 0.087])
+
+
+def rates(seconds, seed=1):
+    noise = np.array([5.2, 4.7, 6.0]) * 1e-3 * np.sqrt(RATE)
+    return BIAS + np.random.default_rng(seed).normal(0, noise, (seconds * RATE, 3))
+
+
+def text(samples, header="time (s),gyro_x (deg/s),gyro_y (deg/s),gyro_z (deg/s)"):
+    rows = np.column_stack([np.arange(len(samples)) / RATE, samples])
+    return "\n".join([header, *(",".join(f"{x:.9g}" for x in row) for row in rows), ""])
+
+
+@pytest.fixture(autouse=True)
+def registry(tmp_path, monkeypatch):
+    monkeypatch.setenv("GYRO_CALIBRATE_REGISTRY", str(tmp_path / "registry"))
+    return tmp_path / "registry"
+
+
+@pytest.fixture
+def csv(tmp_path):
+    def write(samples, name="still.csv", **options):
+        path = tmp_path / name
+        path.write_text(text(samples, **options))
+        return str(path)
+
+    return write
+
+
+def run(*arguments, **options):
+    return CliRunner().invoke(main, [str(a) for a in arguments], **options)
+
+
+def said(*arguments, **options):
+    result = run(*arguments, "--json", **options)
+    return json.loads(result.stdout.splitlines()[-1]), result
+
+
+def test_a_log_needs_no_configuration(csv):
+    result = run("log", csv(rates(20)))
+    assert result.exit_code == 0
+    first, _, x, y, z, *_ = result.stdout.splitlines()
+    assert first == "at rest for 20.0 of 20.0 s; history: none"
+    for row, bias in zip((x, y, z), BIAS, strict=True):
+        assert float(row.split()[1]) == pytest.approx(bias, abs=5e-3)
+
+
+def test_ten_logs_make_a_history_that_the_next_one_uses(csv):
+    about = ("--device", "B17", "--type", "memsense", "--same-heading")
+    for seed in range(10):
+        assert run("log", csv(rates(20, seed), f"{seed}.csv"), *about).exit_code == 0
+    alone, _ = said("log", csv(rates(5, 99)), "--type", "memsense")
+    with_history, _ = said("log", csv(rates(5, 99)), *about, "--no-store")
+    assert with_history["history"] == ["used"] * 3
+    for now, before in zip(with_history["sigma_dps"], alone["sigma_dps"], strict=True):
+        assert now < 0.6 * before
+    assert "B17" in run("devices", "list").stdout
+    shown = run("devices", "show", "B17").stdout
+    assert "9.csv" in shown
+    assert "tau" in shown
+
+
+def test_the_same_log_is_stored_once_and_does_not_count_for_itself(csv):
+    path = csv(rates(20))
+    run("log", path, "--device", "B17", "--type", "memsense")
+    again, result = said("log", path, "--device", "B17")
+    assert again["history"] == ["none"] * 3
+    assert "stored already" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        ([], 0, ""),
+        (["--target", "0.1"], 3, ""),
+        (["--require-history"], 5, ""),
+        (["--units", "rad/s", "--trust", "options"], 6, "a wrong unit?"),
+        (["--type", "nope"], 2, "expected consumer, dot, memsense"),
+        (["--started-at", "yesterday"], 2, "expected 2026-01-31"),
+        (["--units", "m"], 2, "--units: "),
+        (["--columns", "a,b,c"], 2, "expected a column 'a', got 4 columns"),
+    ],
+)
+def test_exit_codes_of_a_log(csv, arguments, code, words):
+    result = run("log", csv(rates(20)), "--type", "memsense", *arguments)
+    assert (result.exit_code, words in result.stderr) == (code, True)
+
+
+def test_the_highest_code_of_several_files_counts(csv, tmp_path):
+    moving = csv(rates(20) + 20 * np.sin(np.arange(2000) / 30)[:, None], "moving.csv")
+    result = run("log", csv(rates(20)), moving, "--type", "memsense", "--device", "B17")
+    assert result.exit_code == 4
+    lines = (tmp_path / "registry/B17/calibrations.jsonl").read_text().splitlines()
+    assert [json.loads(line)["rest"] for line in lines] == ["still", "moving"]
+
+
+def test_what_is_lacking_is_named_as_an_option(tmp_path):
+    np.save(tmp_path / "still.npy", rates(20))
+    result = run("log", tmp_path / "still.npy")
+    assert (result.exit_code, "give --units" in result.stderr) == (2, True)
+    result = run("log", tmp_path / "still.npy", "--units", "deg/s")
+    assert (result.exit_code, "give --rate" in result.stderr) == (2, True)
+    assert run("log", tmp_path / "still.npy", "--units", "deg/s", "--rate", RATE).exit_code == 0
+
+
+def test_a_registry_that_cannot_be_written_is_said_before_measuring(csv, tmp_path):
+    (tmp_path / "file").write_text("")
+    where = ("--registry", tmp_path / "file")
+    result = run("log", csv(rates(20)), "--device", "B17", *where)
+    assert (result.exit_code, result.stdout) == (7, "")
+    assert run("log", csv(rates(20)), "--device", "B17", *where, "--no-store").exit_code == 0
+
+
+def test_plan_says_how_long_or_that_it_is_not_possible():
+    seconds = (5.2 / (1 / 3.6)) ** 2
+    result = run("plan", "--heading", "1deg/h", "--type", "memsense")
+    assert float(result.stdout.split()[1]) == pytest.approx(seconds, rel=0.01)
+    result = run("plan", "--target", "1", "--type", "dot")
+    assert (result.exit_code, "not with this sensor: its floor is" in result.stdout) == (3, True)
+    assert "give --type" in run("plan", "--target", "1").stderr
+
+
+def test_a_picture(csv, tmp_path):
+    pytest.importorskip("matplotlib")
+    picture = tmp_path / "a.png"
+    assert run("log", csv(rates(10)), "--type", "memsense", "--plot", picture).exit_code == 0
+    assert picture.stat().st_size > 10_000
+
+
+def test_notes_and_withdrawals_are_appended(csv, tmp_path):
+    run("log", csv(rates(20)), "--device", "B17", "--type", "memsense")
+    assert run("devices", "note", "B17", "fell").exit_code == 0
+    assert run("devices", "forget", "B17", "still.csv").exit_code == 0
+    assert "does not count" in run("devices", "show", "B17").stdout
+    assert run("devices", "save", "B17", tmp_path / "b17.json").exit_code == 0
+    assert run("devices", "load", tmp_path / "b17.json", "--as", "B18").exit_code == 0
+    assert json.loads(run("devices", "list", "--json").stdout)[1]["device"] == "B18"
+    assert run("devices", "forget", "B17", "--all").exit_code == 0
+    assert run("devices", "show", "B17").exit_code == 2
+
+
+COMMAND = [sys.executable, "-m", "gyro_pipeline.calibrator.cli", "stream", "--type", "memsense"]
+
+
+def streamed(*arguments, send=None, close=True):
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    process = subprocess.Popen([*COMMAND, *arguments], env=environment, text=True, **pipes)
+    if close:
+        return *process.communicate(send, timeout=60), process.returncode
+    process.stdin.write(send)
+    process.stdin.flush()
+    process.wait(timeout=60)
+    return process.stdout.read(), process.stderr.read(), process.returncode
+
+
+def test_a_stream_ends_when_the_target_is_reached():
+    out, _, code = streamed("--target", "2", "--json", send=text(rates(60)))
+    first, *_, last = map(json.loads, out.splitlines())
+    assert code == 0
+    assert (first["bias_dps"], first["seconds_left"]) == ([None] * 3, [7.0, 6.0, 9.5])
+    assert 8 <= last["seconds_at_rest"] <= 10  # 6.0^2 / 2^2 = 9 s
+
+
+def test_a_stream_of_json_lines_with_rows_that_are_none():
+    names = ("t (s)", "gyro_x (deg/s)", "gyro_y (deg/s)", "gyro_z (deg/s)")
+    rows = [dict(zip(names, [n / RATE, *row], strict=True)) for n, row in enumerate(rates(20))]
+    rows[700][names[1]] = None
+    lines = [json.dumps(row) for row in rows]
+    lines[500] = lines[500][:10]
+    out, err, code = streamed("--json", send="\n".join(lines))
+    assert code == 0
+    assert "1 lines were of another shape" in err
+    reasons = {reason["code"] for reason in json.loads(out.splitlines()[-1])["reasons"]}
+    assert "not_finite" in reasons
+
+
+def test_a_sensor_that_stops_sending_is_said():
+    out, err, code = streamed(
+        "--target", "0.1", "--timeout", "0.5", send=text(rates(5)), close=False
+    )
+    assert (code, "nothing came for 0.5 s" in err) == (3, True)
+    assert "needs" in out
+
+
+def test_a_stream_without_samples_or_rate_names_what_is_lacking():
+    assert streamed(send="")[2] == 2
+    header = "gyro_x (deg/s),gyro_y (deg/s),gyro_z (deg/s)"
+    rows = "\n".join([header, *(["0.1,0.2,0.3"] * 30)])
+    assert "give --rate" in streamed(send=rows)[1]
+
+
+def test_a_serial_port():
+    pytest.importorskip("serial")
+    leader, follower = pty.openpty()
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    port = ["--port", os.ttyname(follower), "--target", "4", "--json"]
+    process = subprocess.Popen(
+        [*COMMAND, *port], env=environment, stdout=subprocess.PIPE, text=True
+    )
+    time.sleep(1.5)
+    for row in text(rates(10)).splitlines():
+        os.write(leader, row.encode() + b"\n")
+    out, _ = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert json.loads(out.splitlines()[-1])["rest"] == "still"

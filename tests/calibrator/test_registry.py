@@ -1,0 +1,152 @@
+"""The registry: nothing that was stored is lost, whatever happens while it is written."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from gyro_pipeline.calibrator import Calibrator, registry
+from gyro_pipeline.calibrator.registry import Device, RegistryError
+from gyro_pipeline.conventions import InputError
+
+
+def opened(device, registry, **options):
+    return Calibrator.open(device, rate_hz=100.0, registry=registry, **options)
+
+
+def line(number, **more):
+    return {
+        "event": "calibration", "hash": f"{number:04d}", "source": f"{number}.csv", "time": None,
+        "rest": "still", "mean_dps": [0.1, 1 / 3, number * 1e-3], "variance_dps2": [1e-6] * 3,
+        "temperature_c": None, "gravity": None, "outcome": ["none"] * 3, "noise_mdps_rts": None,
+        "noise_freedom": 0, "seconds": 10.0, **more,
+    }  # fmt: skip
+
+
+@pytest.fixture
+def device(tmp_path):
+    device = Device(tmp_path, "B17")
+    device.create("dot")
+    return device
+
+
+def test_what_is_stored_comes_back_in_order(device, tmp_path):
+    for number in range(3):
+        assert device.append(line(number))
+    assert not device.append(line(1))  # the same log
+    given = opened("B17", tmp_path)
+    assert [tuple(c.mean) for c in given.history] == [(0.1, 1 / 3, n * 1e-3) for n in range(3)]
+    assert given.device_type.name == "dot"
+    assert len(opened("B17", tmp_path, without="0002").history) == 2
+
+
+def test_rejected_and_forgotten_calibrations_stay_and_do_not_count(device, tmp_path):
+    device.append(line(1))
+    device.append(line(2, rest="moving", mean_dps=None, variance_dps2=None))
+    device.append({"event": "forget", "time": 0.0, "of": "0001"})
+    assert opened("B17", tmp_path).history == ()
+    assert len(device.lines()) == 3
+    assert device.append(line(1))  # again, after it was forgotten
+    assert len(opened("B17", tmp_path).history) == 1
+
+
+def test_a_line_that_was_cut_off_is_left_out_and_the_next_starts_anew(device):
+    device.append(line(1))
+    with device.lines_path.open("ab") as file:
+        file.write(b'{"event": "calibration", "hash": "00')
+    device.append(line(2))
+    assert list(device.calibrations()) == ["0001", "0002"]
+
+
+def test_a_full_disk_leaves_the_history_as_it_was(device, monkeypatch):
+    device.append(line(1))
+    before, write = device.lines_path.read_bytes(), os.write
+    monkeypatch.setattr(registry.os, "write", lambda fd, data: write(fd, data[:20]))
+    with pytest.raises(RegistryError, match="nothing can be stored: No space left"):
+        device.append(line(2))
+    assert device.lines_path.read_bytes() == before
+
+
+def test_a_folder_that_cannot_be_made_is_said(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RegistryError, match="give another --registry, or --no-store"):
+        Device(tmp_path / "file", "B17").create()
+
+
+WRITER = """
+import sys; from pathlib import Path; from test_registry import line
+from gyro_pipeline.calibrator.registry import Device
+device = Device(Path(sys.argv[1]), "B17")
+for number in range(int(sys.argv[2]), int(sys.argv[3])):
+    device.append(line(number)); print(number, flush=True)
+"""
+
+
+def writer(folder, first, last):
+    here = os.path.dirname(__file__)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([here, *sys.path])}
+    command = [sys.executable, "-c", WRITER, str(folder), str(first), str(last)]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+
+
+def test_two_processes_write_one_after_the_other(device, tmp_path):
+    both = [writer(tmp_path, 0, 40), writer(tmp_path, 40, 80)]
+    for process in both:
+        process.communicate(timeout=60)
+    assert sorted(device.calibrations()) == [f"{n:04d}" for n in range(80)]
+
+
+def test_a_kill_loses_nothing_that_was_acknowledged(device, tmp_path):
+    process = writer(tmp_path, 0, 100_000)
+    acknowledged = [int(process.stdout.readline()) for _ in range(20)]
+    time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    rest = [int(text) for text in process.communicate()[0].split()]
+    stored = {int(key) for key in device.calibrations()}
+    assert stored >= {*acknowledged, *rest}
+    assert device.append(line(999_999))
+
+
+def test_a_device_moves_in_one_file_and_is_not_doubled(device, tmp_path):
+    device.append(line(1))
+    device.append({"event": "note", "time": 0.0, "text": "dropped on the floor"})
+    content = json.loads(json.dumps(device.content()))
+    other = Device(tmp_path / "elsewhere", "B18")
+    for _ in range(2):
+        other.restore(content)
+    assert other.lines() == device.lines()
+    assert other.settings() == {"type": "dot"}
+
+
+@pytest.mark.parametrize("name", ["", "types", "../up", "a/b", "x" * 65])
+def test_names_that_are_no_folder_are_refused(tmp_path, name):
+    with pytest.raises(InputError, match="device: expected letters, digits"):
+        Device(tmp_path, name)
+
+
+@pytest.mark.parametrize("text", ["type = ", "latitud = 32.0"])
+def test_settings_that_cannot_be_read_are_refused(device, text):
+    device.settings_path.write_text(text)
+    with pytest.raises(InputError, match=r"device\.toml: expected .*; correct it"):
+        device.settings()
+
+
+def test_what_device_toml_says_and_what_options_overrule(device, tmp_path):
+    device.settings_path.write_text('type = "memsense"\nmounted = true\nlatitude = 32.0\n')
+    options = {"device_type": "dot", "same_heading": False, "latitude_deg": 50.0}
+    for given, expected in (({}, ("memsense", True, 32)), (options, ("dot", False, 50))):
+        device = opened("B17", tmp_path, **given)
+        told = device.device_type.name, device.now.same_heading, device.now.latitude_deg
+        assert told == expected
+
+
+def test_the_registry_is_where_it_is_said_to_be(tmp_path, monkeypatch):
+    monkeypatch.setenv(registry.VARIABLE, str(tmp_path / "a"))
+    assert registry.registry_folder() == tmp_path / "a"
+    assert registry.registry_folder(tmp_path / "b") == tmp_path / "b"
+    monkeypatch.delenv(registry.VARIABLE)
+    assert registry.registry_folder().name == "gyro-calibrate"
