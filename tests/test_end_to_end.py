@@ -399,7 +399,7 @@ def test_a_second_run_does_nothing_a_change_runs_what_follows_and_a_named_node_i
     assert "runs planned" not in again.output
     assert "runs evaluated" not in again.output
     assert identities(project.runs("augmentation")) == runs
-    changed = changes | {"evaluation": {"resamples": 60}}
+    changed = changes | {"evaluation": {"resamples": 160}}
     other = project.run_here("augmentation", "smoke", **changed)
     assert other.code == 0, other.output
     stages = set(re.search(up_to_date, other.output)[3].split(", "))
