@@ -409,7 +409,9 @@ def test_a_second_run_does_nothing_a_change_runs_what_follows_and_a_named_node_i
     assert f"sparkfun: {len(runs)} runs evaluated, 0 skipped" in other.output
     bias = project.folder / "data/03_primary/simulated_smoke/sparkfun/bias.csv"
     before = bias.stat().st_mtime_ns
-    named = project.kedro_run("--pipeline=ground_truth", "--env=smoke", "--nodes=bias_sparkfun")
+    named = project.kedro_run(
+        "--pipeline=ground_truth", "--env=smoke", "--nodes=ground_truth.bias_sparkfun"
+    )
     assert named.code == 0, named.output
     assert bias.stat().st_mtime_ns > before
 
