@@ -399,7 +399,7 @@ def test_a_second_run_does_nothing_a_change_runs_what_follows_and_a_named_node_i
     assert "runs planned" not in again.output
     assert "runs evaluated" not in again.output
     assert identities(project.runs("augmentation")) == runs
-    changed = changes | {"evaluation": {"resamples": 60}}
+    changed = changes | {"evaluation": {"resamples": 160}}
     other = project.run_here("augmentation", "smoke", **changed)
     assert other.code == 0, other.output
     stages = set(re.search(up_to_date, other.output)[3].split(", "))
@@ -409,7 +409,9 @@ def test_a_second_run_does_nothing_a_change_runs_what_follows_and_a_named_node_i
     assert f"sparkfun: {len(runs)} runs evaluated, 0 skipped" in other.output
     bias = project.folder / "data/03_primary/simulated_smoke/sparkfun/bias.csv"
     before = bias.stat().st_mtime_ns
-    named = project.kedro_run("--pipeline=ground_truth", "--env=smoke", "--nodes=bias_sparkfun")
+    named = project.kedro_run(
+        "--pipeline=ground_truth", "--env=smoke", "--nodes=ground_truth.bias_sparkfun"
+    )
     assert named.code == 0, named.output
     assert bias.stat().st_mtime_ns > before
 
