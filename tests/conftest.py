@@ -36,6 +36,7 @@ from gyro_pipeline.parameters import Execution, Parameters, Quality
 from gyro_pipeline.physics.noise import simulate_noise
 from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs, label_recordings, quality_table
 from gyro_pipeline.settings import CONFIG_LOADER_ARGS
+from gyro_pipeline.store import relocate
 
 ROOT = Path(__file__).parents[1]
 ROLES = (TRAIN, VALIDATION, TEST)
@@ -233,6 +234,7 @@ def smoke(new_project: Callable[..., Project], tmp_path_factory: pytest.TempPath
             Path(f"{made}.pickle").write_bytes(pickle.dumps(ran))
             return ran
     shutil.copytree(made, project.folder, dirs_exist_ok=True)
+    relocate(project.store, str(project.folder / "mlruns"))
     return replace(pickle.loads(Path(f"{made}.pickle").read_bytes()), project=project)
 
 

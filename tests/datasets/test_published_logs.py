@@ -540,7 +540,8 @@ def test_the_environment_reads_the_published_files_of_all_sensors(server, made_u
         folder = made_up.folder / "data/02_intermediate/published_all" / sensor
         with xr.open_dataset(folder / "recordings.nc") as recordings:
             assert (recordings.sizes["imu"], recordings.sizes["recording"]) == (imus, 7)
-            assert recordings.given_split.values.tolist() == ["train"] * 5 + ["test"] * 2
+            held_out = recordings.split.values == "test"
+            assert held_out.tolist() == [False] * 5 + [True] * 2
             assert recordings.attrs["simulated"] == 0
     raw = made_up.folder / "data/01_raw/published"
     assert len([one for one in raw.iterdir() if one.suffix == ".npy"]) == 8
@@ -550,10 +551,11 @@ def test_of_devices_that_are_unseen_those_with_test_recordings_are_tested(server
     given = {"published_address": server.address, "only": {"sensor": "dot", "window_s": 10.0}}
     done = made_up.run_here("unseen_devices", "published", **given, evaluation={"resamples": 100})
     assert done.code == 0, done.output
-    assert "dot: IMUs 2, 3, 4 have no test recording and only train" in done.output
-    roles = pd.read_csv(made_up.folder / "data/05_model_input/published_all/dot/devices.csv")
-    assert roles.fold.unique().tolist() == [1]
-    assert set(zip(roles.imu, roles.role, strict=True)) == {
+    folder = made_up.folder / "data/05_model_input/published_all/dot"
+    windows = pd.read_parquet(folder / "unseen_devices_windows.parquet")
+    assert windows.fold.unique().tolist() == ["without IMU 1", "all recordings"]
+    judged = windows[windows.fold == "without IMU 1"]
+    assert set(zip(judged.imu, judged.role, strict=True)) == {
         (1, "test"),
         *((imu, "train") for imu in (2, 3, 4)),
     }
