@@ -364,9 +364,14 @@ def _note(spec: RunSpec, folds: Mapping[str, TrainingSet]) -> str:
         "recordings"
         for origin, rows in windows.groupby("origin", observed=True)
     )
+    how = (
+        "fitted once more, to all recordings:"
+        if fold == ALL_RECORDINGS
+        else f"fitted to the {fold}:"
+    )
     return (
         f"The model `{spec.estimator}` estimates the bias of {spec.sensor} from {spec.window_s:g} "
-        f"s; it was fitted to {shown or 'nothing'} ({fold}; {spec.real_gyros} real and "
+        f"s; it was {how} {shown or 'no windows'} ({spec.real_gyros} real and "
         f"{spec.virtual_gyros} virtual gyroscopes, source {spec.source}). The figures are of "
         f"the protocol {spec.protocol}, by {judged} fit{'s' * (judged > 1)}, of which none saw "
         "what it was judged on unless the protocol is a leak."
