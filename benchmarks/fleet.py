@@ -86,7 +86,7 @@ def measured(what: str, files: int) -> Iterator[dict[str, float]]:
     """Wall time of a block, and the peak memory of this process and its children meanwhile."""
     found = {"s": 0.0, "bytes": 0.0}
     stop = threading.Event()
-    watcher = threading.Thread(target=_watch, args=(found, stop))
+    watcher = threading.Thread(target=_watch, args=(found, stop), daemon=True)
     watcher.start()
     began = time.perf_counter()
     yield found
@@ -124,14 +124,15 @@ def pipeline(folder: Path, scratch: Path, processes: int) -> Callable[[], Any]:
         InspectedRecordings,
         Recordings,
     )
-    from gyro_pipeline.parameters import Execution, Quality  # noqa: PLC0415
+    from gyro_pipeline.parameters import Execution, Quality, Splits  # noqa: PLC0415
     from gyro_pipeline.pipelines.raw_logs.nodes import (  # noqa: PLC0415
         inspect_logs,
         label_recordings,
         quality_table,
     )
 
-    quality = Quality(**yaml.safe_load((CONF / "parameters" / "stages.yml").read_text())["quality"])
+    stages = yaml.safe_load((CONF / "parameters" / "stages.yml").read_text())
+    quality, splits = Quality(**stages["quality"]), Splits(**stages["splits"])
     sensor = yaml.safe_load((CONF / "globals.yml").read_text())["sensors"]["dot"]
     imus = sum(1 for _ in folder.iterdir())
     sensors = {"dot": sensor | {"imus": imus, "samples": ROWS, "recording_s": ROWS / RATE_HZ}}
@@ -148,7 +149,7 @@ def pipeline(folder: Path, scratch: Path, processes: int) -> Callable[[], Any]:
         for item in inspect_logs(files, reading.load(), quality, execution):
             reading.save(item)
         table = quality_table(files, reading.load())
-        final.save(label_recordings(files, reading.load(), table, quality))
+        final.save(label_recordings(files, reading.load(), table, quality, splits))
         return final.load()
 
     return run
