@@ -22,9 +22,6 @@ LAYOUT_TAG = "layout"
 FINGERPRINT = "fingerprint"
 """Tag: hash of all that the fits depend on. Equal fingerprints need one run."""
 
-TRAINED_IN = "trained_in"
-"""Tag: the study whose fits this run shares."""
-
 EVALUATED_WITH = "evaluated_with"
 """Tag: hash of how the run was evaluated. Another hash evaluates again, without training."""
 

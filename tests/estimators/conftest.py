@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 import xarray as xr
 
 from gyro_pipeline.conventions import AXES, DIMENSIONS, ORIGIN_REAL, RECORDING_MEAN, TRAIN
@@ -25,6 +26,14 @@ def labelled(rates, rate_hz):
     lengths = np.full(rates.shape[:2], rates.shape[-1])
     data = {"angular_rate": (DIMENSIONS, rates), "samples": (DIMENSIONS[:2], lengths)}
     return xr.Dataset(data, coords, attrs)
+
+
+@pytest.fixture(autouse=True)
+def torch_settings_restored():
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+    torch.use_deterministic_algorithms(False)
 
 
 @pytest.fixture(scope="session")

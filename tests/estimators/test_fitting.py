@@ -5,7 +5,6 @@ import sys
 
 import numpy as np
 import pytest
-import torch
 
 from gyro_pipeline.conventions import MDPS, OWN, InputError
 from gyro_pipeline.estimators import ESTIMATORS, estimator_class, fitting, make_estimator
@@ -35,14 +34,6 @@ class Half(Estimator):
 class NoEstimator:
     pass
 """
-
-
-@pytest.fixture(autouse=True)
-def torch_settings_restored():
-    threads = torch.get_num_threads()
-    yield
-    torch.set_num_threads(threads)
-    torch.use_deterministic_algorithms(False)
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 
 from gyro_pipeline.conventions import BEST, BIAS, LAST, MDPS, RECORDING_MEAN, TRAIN, InputError
 from gyro_pipeline.conventions import VALIDATION as VALIDATE
@@ -21,14 +20,6 @@ SETTINGS = Training(
     **{"epochs": 6, "batch_size": 8, "learning_rate": 1e-3, "decay": 0.1, "decay_every": 4},
 )
 ROLES = {9: VALIDATE, 10: VALIDATE}
-
-
-@pytest.fixture(autouse=True)
-def torch_settings_restored():
-    threads = torch.get_num_threads()
-    yield
-    torch.set_num_threads(threads)
-    torch.use_deterministic_algorithms(False)
 
 
 @pytest.fixture(scope="module")
