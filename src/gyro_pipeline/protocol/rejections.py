@@ -19,7 +19,7 @@ def reasons(rejected: pd.DataFrame) -> list[str]:
         for file, findings in zip(rejected.file, rejected.findings, strict=True)
     ]
     lines = []
-    for reason, alike in rejected.groupby(texts, sort=False):
+    for reason, alike in rejected.groupby(pd.Series(texts, rejected.index), sort=False):
         row, more = alike.iloc[0], f", and {len(alike) - 1} more" if len(alike) > 1 else ""
         lines.append(f"IMU {row.imu} recording {row.recording}, {row.file}{more}: {reason}")
     further = len(lines) - NAMED
