@@ -8,7 +8,7 @@ ARGS ?=
 .DEFAULT_GOAL := help
 .PHONY: run test check help
 
-run: .venv/.package  ## train and evaluate the augmentation grid, write its tables and figures
+run: .venv/.package  ## install, then train and evaluate the augmentation study
 	.venv/bin/kedro run --pipeline=augmentation $(ARGS)
 
 test: .venv/.package  ## run the tests, a file per core
@@ -19,8 +19,24 @@ check: .venv/.package  ## lint, formatting and types
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy src
 
-help:  ## list the targets
-	@sed -n 's/^\([a-z]*\):.*## /make \1\t/p' Makefile
+help:  ## list the commands
+	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' Makefile | expand -t 52
+	@echo "After installation and '. .venv/bin/activate':"
+	@sed -n 's/^#> /  /p' Makefile
+
+#> kedro run                                         train and evaluate the main studies, report
+#> kedro run --pipeline=augmentation                 one study; or: real2real, input_channels,
+#>                                                   estimators, unseen_devices, leakage
+#> kedro run --pipeline=ground_truth                 biases and noise figures, no training
+#> kedro run --pipeline=virtual_gyros                the virtual gyroscopes as well
+#> kedro run --pipeline=reporting                    tables, figures and report of what was run
+#> kedro run --env=smoke                             a small study, to try things; others are in conf/
+#> kedro run --pipeline=ground_truth --env=logs --params=logs=FOLDER
+#>                                                   biases of log files of your own
+#> kedro registry list                               the pipelines
+#> kedro viz                                         the pipelines drawn, in the browser
+#> mlflow ui                                         the runs, in the browser
+#> gyro-calibrate log FILE                           the bias of one still log
 
 # The stamps are written last: an interrupted installation has none, and is started anew.
 .venv/.requirements: requirements.lock

@@ -31,8 +31,10 @@ def base_parameters() -> "Parameters":
     """Parameters of ``conf/base``."""
     from kedro.config import OmegaConfigLoader  # noqa: PLC0415
     from kedro.framework.project import settings  # noqa: PLC0415
+    from kedro.utils import find_kedro_project  # noqa: PLC0415
 
     from gyro_pipeline.parameters import Parameters  # noqa: PLC0415
 
-    conf = OmegaConfigLoader(str(Path.cwd() / settings.CONF_SOURCE), **settings.CONFIG_LOADER_ARGS)
+    project = find_kedro_project(Path.cwd())
+    conf = OmegaConfigLoader(str(project / settings.CONF_SOURCE), **settings.CONFIG_LOADER_ARGS)
     return Parameters(**conf["parameters"])
