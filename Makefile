@@ -6,7 +6,7 @@ PYTHON ?= python3
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: run test check help
+.PHONY: run test check docs help
 
 run: .venv/.package  ## install, then train and evaluate the augmentation study
 	.venv/bin/kedro run --pipeline=augmentation $(ARGS)
@@ -18,6 +18,9 @@ check: .venv/.package  ## lint, formatting and types
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy src
+
+docs: .venv/.package  ## build the site of the documentation, build/site/index.html
+	NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --quiet
 
 help:  ## list the commands
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' Makefile | expand -t 52
