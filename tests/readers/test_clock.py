@@ -57,7 +57,7 @@ def test_clocks_that_lose_nothing_have_their_rate_and_no_gap_and_are_kept(kind, 
         span_hz = (N - 1) / (stamps[-1] - stamps[0])
         assert timing.rate_hz == pytest.approx(span_hz, rel=5e-3 + tick * rate / N), rate
         assert not len(timing.gap_rows), rate
-        assert {finding.check for finding in timing.findings} <= {"timestamps", "jitter"}
+        assert {finding.check for finding in timing.findings} <= {"timestamps"}
         assert {finding.outcome for finding in timing.findings} <= {"kept"}
 
 
@@ -191,16 +191,12 @@ def test_a_rate_that_changes_is_rejected(steps):
 @pytest.mark.parametrize("bits", [8, 16])
 def test_a_packet_counter_may_wrap_but_not_repeat_go_back_or_skip(bits):
     counts = np.mod(np.arange(1000) + 2**bits - 100, 2**bits).astype(float)
-    whole = from_counter(counts, bits)
-    assert not len(whole.gap_rows)
-    assert checks(whole) == ["wrap-around"]
+    assert from_counter(counts, bits).gap_rows.tolist() == []
     skipped = from_counter(np.delete(counts, [300, 301]), bits)
-    assert skipped.gap_rows.tolist() == [300]
-    assert checks(skipped) == ["wrap-around", "packet counter"]
+    assert skipped.gap_rows.tolist() == [300] and checks(skipped) == ["packet counter"]
     for short in ([5, 6, 6, 7], [5, 6, 3, 4], [5, 6, 8, 9]):
         timing = from_counter(np.array(short, float), bits)
         assert (timing.gap_rows.tolist(), timing.rate_hz) == ([2], None)
-        assert checks(timing) == ["packet counter"]
     for stray in (np.nan, 60_000):
         counts[300] = stray
         assert not len(from_counter(counts, bits).gap_rows)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import AXES
 from gyro_pipeline.readers.file import File
-from gyro_pipeline.readers.names import OTHER, RATE, Header, triples
+from gyro_pipeline.readers.names import RATE, Header, triples
 
 Codes = NDArray[np.intp]
 Floats = NDArray[np.float64]
@@ -41,32 +41,31 @@ def sample_rows(file: File, rates: Floats) -> Mask:
     keep = np.ones(len(rates), bool)
     for name, value in file.options.rows.items():
         keep &= _with_value(file, file.find(name), value, len(rates))
-    checks: dict[str, Callable[[Floats], Mask]]
-    checks = {"are blank, at a regular share": blank_at_regular_shares}
+    _leave_out(file, keep, rates, blank_at_regular_shares, "are blank, at a regular share")
     if file.options.repeats:
-        checks["repeat the one before"] = repeated
-    for text, no_samples in checks.items():
-        out = no_samples(rates if keep.all() else rates[keep])
-        if out.any():
-            file.note("rows", f"{out.sum()} of {len(out)} rows {text}: no samples, left out")
-            keep[np.flatnonzero(keep)[out]] = False
+        _leave_out(file, keep, rates, repeated, "repeat the one before")
     return keep
+
+
+def _leave_out(
+    file: File, keep: Mask, rates: Floats, no_samples: Callable[[Floats], Mask], text: str
+) -> None:
+    """Leave out rows (n,) that a check of those that are kept tells to be no samples."""
+    out = no_samples(rates if keep.all() else rates[keep])
+    if out.any():
+        file.note("rows", f"{out.sum()} of {len(out)} rows {text}: no samples, left out")
+        keep[np.flatnonzero(keep)[out]] = False
 
 
 def _with_value(file: File, number: int, value: str | float, count: int) -> Mask:
     """Rows (count,) with a value in a column."""
     codes, texts = _coded(file.table.columns[number])
     same = np.asarray(texts == _as_text(value))[codes]
+    got = f"{_as_text(value)} in {file.listed([number])}, got {_counted(codes, texts)}"
     if len(same) != count or not same.any():
-        raise file.refusal(
-            f"expected {count} rows, some with {_as_text(value)} in {file.table.names[number]!r}, "
-            f"got {_counted(codes, texts)}; correct rows"
-        )
-    if Header(_as_text(value)).quantity == OTHER:
-        file.contradictions.append(
-            f"rows of the options pick {_as_text(value)} in {file.listed([number])}, by its name "
-            f"no angular rate, of {_counted(codes, texts)}; correct rows"
-        )
+        raise file.refusal(f"expected {count} rows, some with {got}; correct rows")
+    if Header(_as_text(value)).quantity not in ("", RATE):
+        file.contradict(f"rows of the options pick, by its name no angular rate, {got}")
     return same
 
 
@@ -82,18 +81,14 @@ def blank_at_regular_shares(
         alike: Share of the runs of each that are about as long as their median; where rows are lost
             at random, lengths scatter.
     """
-    none = np.zeros(len(rates), bool)
-    if np.count_nonzero(np.isnan(rates[:, 0])) < least_share * len(rates):
-        return none
-    blank = np.isnan(rates).all(axis=1)
+    blank = np.isnan(rates[:, 0])
+    blank = blank & np.isnan(rates).all(axis=1) if blank.any() else blank
     lengths = np.diff(np.flatnonzero(np.diff(blank)))
-    if blank.mean() < least_share or len(lengths) < 2 * least_runs:
-        return none
-    for runs in (lengths[0::2], lengths[1::2]):
-        median = np.median(runs)
-        if (np.abs(runs - median) <= max(1, median / 4)).mean() < alike:
-            return none
-    return np.asarray(blank)
+    regular = np.count_nonzero(blank) >= least_share * len(rates) and len(lengths) >= 2 * least_runs
+    for runs in (lengths[0::2], lengths[1::2]) if regular else ():
+        near = np.abs(runs - np.median(runs)) <= max(1, np.median(runs) / 4)
+        regular &= near.mean() >= alike
+    return blank if regular else np.zeros_like(blank)
 
 
 def repeated(rates: Floats) -> Mask:
@@ -115,7 +110,7 @@ def contradict_turns(file: File, used: Collection[int], keep: Mask, rates: Float
     """
     of_axes = {number for triple in triples(file.headers) for number in triple}
     for number, (header, column) in enumerate(zip(file.headers, file.table.columns, strict=True)):
-        measures = header.has_unit or header.names_time or (number in of_axes and header.quantity)
+        measures = header.unit_text or header.names_time or (number in of_axes and header.quantity)
         if number in used or (measures and column.dtype.kind == "f") or len(column) != len(keep):
             continue
         cells = column[:: len(column) // 100 + 1].tolist()
@@ -123,11 +118,13 @@ def contradict_turns(file: File, used: Collection[int], keep: Mask, rates: Float
             continue
         codes, texts = _coded(column[keep])
         if evidence := _evidence(header.name, codes, texts, rates):
-            name, value = file.table.names[number] or number, _suggested(texts, np.bincount(codes))
-            file.contradictions.append(
+            # to pick: a rate by its word, else one without a quantity
+            known = [[text for text in texts if Header(text).quantity == q] for q in (RATE, "")]
+            pick = next((text for text in sum(known, []) if text), "…")
+            file.contradict(
                 f"{file.listed([number])} takes turns among {_counted(codes, texts)}, {evidence}, "
                 "but a recording is of one device; pick its rows, such as rows: "
-                f"{{{name}: {value}}}"
+                f"{{{file.table.names[number] or number}: {pick}}}"
             )
 
 
@@ -143,13 +140,6 @@ def _evidence(name: str, codes: Codes, texts: Texts, rates: Floats) -> str:
     if (words & (runs > 2)).sum() > 1:  # noqa: PLR2004
         return "which say what a row is"
     return _change(rates, codes)
-
-
-def _suggested(texts: Texts, rows: Codes) -> str:
-    """The value to pick: of a rate by its word, else of most rows; of no other quantity."""
-    ranks = [{RATE: 2, "": 1}.get(Header(text).quantity, 0) * bool(text) for text in texts]
-    rank, _, best = max(zip(ranks, rows.tolist(), range(len(texts)), strict=True))
-    return str(texts[best]) if rank else "…"
 
 
 def _change(rates: Floats, codes: Codes, least: float = 0.3, chance: float = 1e-12) -> str:
