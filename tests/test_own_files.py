@@ -95,14 +95,6 @@ def test_eight_lines_and_one_command_are_enough(make):
     assert len(biases(project)) == 3 * 3
 
 
-def test_other_settings_of_the_splits_are_taken_without_reading_files_again(make):
-    project = make(*THREE)
-    assert project.run_here("ground_truth", "mine").code == 0
-    again = project.run_here("ground_truth", "mine", splits={"test_fraction": 0.4})
-    check(again, [(1, 1), (1, 2), (1, 3)])
-    assert "3 of 3 recordings were read before" in again.output
-
-
 def test_one_line_is_enough(make):
     project = make(*THREE)
     (project.folder / FOLDER / "notes.txt").write_text("still_2 is the one on the concrete floor\n")

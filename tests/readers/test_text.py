@@ -110,7 +110,7 @@ REFUSED = {
     "one row": ("angles", lines(lambda t: t[:2]), "none in the first 2 lines; line 1 begins 'Time"),
     "binary zeros": ("angles", lambda t: bytes(range(4)) * 99, "got binary data"),
     "UTF-16 without mark": ("angles", lambda t: t.encode("utf-16-le"), "`encoding: utf-16-le`"),
-    "another delimiter": ("angles", lambda t: re.sub(", ?", "|", t), "or tab or blanks, got none"),
+    "another delimiter": ("angles", lambda t: re.sub(", ?", "|", t), "or '.t' or ' ', got none"),
     "fewer columns from a row on": (
         "angles", lines(lambda t: t[:31] + [line.rsplit(",", 3)[0] for line in t[31:]]),
         "got 30 of 60 that are not: row 30 .line 32."),

@@ -22,7 +22,7 @@ from gyro_pipeline.parameters import ReaderOptions
 from gyro_pipeline.readers.lines import advice, read_lines
 from gyro_pipeline.readers.table import IN_READER, Table, columns_of, few, unreadable
 
-DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab", " ": "blanks"}
+DELIMITERS = ",;\t "  # a blank: runs of them
 
 _HEAD = 1 << 14  # bytes that tell the layout
 _SAMPLE = 50  # rows of the head that tell decimal commas and columns of texts
@@ -89,8 +89,7 @@ def read_text(path: Path, options: ReaderOptions) -> Table:
     columns, damage = columns_of(rows.names, arrays, rows.decimal_point)
     if damage or odd:
         damage |= odd
-        _refuse_second_header(rows, damage)
-        _refuse_many(rows, odd)
+        _refuse_damage(rows, damage, odd)
     findings = unreadable(damage, len(columns[0]), rows.place)
     return Table(where, rows.names, columns, rows.preamble, (*findings,), rows.place)
 
@@ -120,28 +119,27 @@ def _parsed(body: memoryview | bytes, rows: _Rows, number: pa.DataType | None) -
     return list(table.columns)
 
 
-def _refuse_second_header(rows: _Rows, damage: dict[int, str]) -> None:
-    """Refuse a second header among damaged rows; a message that has delimiters in it is none."""
+def _refuse_damage(rows: _Rows, damage: dict[int, str], odd: dict[int, str]) -> None:
+    """Refuse a second header among damaged rows, and odd rows that are more than a few.
+
+    A message that happens to have delimiters in it is no header.
+    """
+    lines = [line for _, line in rows.numbered]
     for row in sorted(damage)[:100]:
-        fields = _split(line := rows.numbered[row][1], rows.delimiter)
+        fields = _split(lines[row], rows.delimiter)
         same = len(fields) == len(rows.names) or _filled(fields) == _filled([*rows.names])
         if same and not _is_row(fields):
             raise InputError(
                 f"{rows.where}: expected numbers, got a second header in {rows.place(row)}, "
-                f"{line[:80]!r}: two recordings in one file? Split it"
+                f"{lines[row][:80]!r}: two recordings in one file? Split it"
             )
-
-
-def _refuse_many(rows: _Rows, odd: dict[int, str]) -> None:
-    """Refuse a file of which more than a few rows have another number of fields."""
-    count = len(rows.numbered)
-    if not few(len(odd), count) or len(odd) >= count - 1:
+    if not few(len(odd), len(lines)) or len(odd) >= len(lines) - 1:
         shown = "; ".join(f"{rows.place(row)}: {problem}" for row, problem in [*odd.items()][:3])
         raise InputError(
             f"{rows.where}: expected rows of {len(rows.names)} columns, separated by "
-            f"{_spelt(rows.delimiter)}, got {len(odd)} of {count} that are not: {shown}; correct "
+            f"{rows.delimiter!r}, got {len(odd)} of {len(lines)} that are not: {shown}; correct "
             "or export the file anew, or, if other lines stand between the rows, "
-            f"{advice([line for _, line in rows.numbered[:200]])}"
+            f"{advice(lines[:200])}"
         )
 
 
@@ -180,13 +178,13 @@ def _rows(where: str, text: bytes, delimiter: str | None) -> _Rows:
     whole = head.splitlines(keepends=True)
     decoded = enumerate(line.decode("utf-8", "replace").strip("\r\n") for line in whole)
     numbered = {number: line for number, line in decoded if line.strip()}
-    lines, delimiters = [*numbered.values()], [delimiter] if delimiter else [*DELIMITERS]
+    lines, delimiters = [*numbered.values()], delimiter or DELIMITERS
     starts = {sign: start for sign in delimiters if (start := _first_row(lines, sign))}
     if not starts:
         number, line = next(iter(numbered.items()), (0, ""))
         raise InputError(
             f"{where}: expected two rows or more of three numbers or more, separated by "
-            f"{' or '.join(map(_spelt, delimiters))}, got none in the "
+            f"{' or '.join(map(repr, delimiters))}, got none in the "
             f"first {len(lines)} lines; line {number + 1} begins {line[:60]!r}; {advice(lines)}"
         )
     delimiter = max(starts, key=lambda sign: (sign != " ", starts[sign][-1]))
@@ -212,10 +210,6 @@ def _rows(where: str, text: bytes, delimiter: str | None) -> _Rows:
     )
 
 
-def _spelt(delimiter: str) -> str:
-    return DELIMITERS.get(delimiter, repr(delimiter))
-
-
 def _split(line: str, delimiter: str, strict: bool = False) -> Row:
     """Fields without quotes and outer blanks; none if strict and quotes are damaged."""
     if delimiter == " ":
@@ -238,15 +232,15 @@ def _is_number(field: str) -> bool:
     return True
 
 
-def _is_figure(field: str) -> bool:
-    """Whether it is a number, a time or a date."""
-    return field[0] in "+-.0123456789" or _is_number(field)
+def _figures(fields: Row) -> int:
+    """How many are numbers, times or dates."""
+    return sum(field[:1] in "+-.0123456789" or _is_number(field) for field in fields if field)
 
 
 def _is_row(fields: Row) -> bool:
     """Whether three or half of the fields are numbers, times or dates; else they are names."""
-    filled = [field for field in fields if field]
-    return sum(map(_is_figure, filled)) >= min(_LEAST, max(1, len(filled) / 2))
+    filled = len(fields) - fields.count("")
+    return _figures(fields) >= min(_LEAST, max(1, filled / 2))
 
 
 def _first_row(lines: list[str], delimiter: str) -> tuple[int, int, int] | None:
@@ -255,9 +249,9 @@ def _first_row(lines: list[str], delimiter: str) -> tuple[int, int, int] | None:
     for line in lines:
         may_be = delimiter in line and not line.lstrip().startswith(_NO_ROW)
         fields = _split(line, delimiter) if may_be else []
-        # words between blanks are a sentence
-        is_row = all(map(_is_figure, fields)) if delimiter == " " else _is_row(fields)
-        is_row = is_row and len(fields) >= _LEAST
+        is_row = len(fields) >= _LEAST and _is_row(fields)
+        if delimiter == " ":  # words between blanks are a sentence
+            is_row = is_row and _figures(fields) == len(fields)
         shapes.append((len(fields), sum(map(_is_number, fields))) if is_row else (0, 0))
         width, numbers = shapes[-1][0], max(shapes[-2][1], shapes[-1][1])
         if width == shapes[-2][0] and numbers >= _LEAST:
