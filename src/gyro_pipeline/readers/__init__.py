@@ -1,9 +1,12 @@
-"""A logger's file in, a recording in deg/s out.
+"""A logger's file in, a recording in deg/s out: :func:`log_of` is the flow.
 
-A file is a table (``table``). Names, units, format and options say which of its columns are the
-rates (``columns``) and in which unit (``scales``); some of its rows are samples (``rows``); their
-time is told by content (``stamps``, ``times``, ``clock``), and their values must be a gyroscope's
-(``counts``).
+A file is a table (``table``, made by ``text``, ``lines``, ``stored``, ``vehicles``). Names, units,
+format and options say which of its columns are the rates (``columns``) and in which unit
+(``scales``). Some of its rows are samples (``rows``), their time is told by content (``stamps``,
+``times``), and their values must be a gyroscope's (``counts``). Whatever contradicts each other is
+collected, then refused at once (``File.settle``) unless the options are trusted: so ends a file in
+which devices take turns. Where samples are missing (``clock``) is a row in ``Log.gap_rows``, and
+quality control keeps the longest stretch between two of them: so ends a file with a gap.
 """
 
 from pathlib import Path
@@ -72,7 +75,7 @@ def log_of(
     raw = raw if keep.all() else raw[keep]
     rates = _in_dps(file, raw, scale, timing.rate_hz or expected_rate_hz)
     contradict_values(file, raw, rates, are_counts)
-    contradict_turns(file, {*columns, *temperature[0], *acceleration[0]}, keep, rates)
+    contradict_turns(file, {*columns, *temperature[0], *acceleration[0]}, keep)
     compare_rates(file, timing.rate_hz, expected_rate_hz, keep)
     file.settle()
     gap_rows = np.union1d(timing.gap_rows, counted_gaps(file, keep)).astype(np.intp)

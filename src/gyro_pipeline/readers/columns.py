@@ -149,15 +149,18 @@ def temperature_of(file: File) -> Beside:
     numbers = measured or [n for n in named if not headers[n].unit_text]
     if file.options.temperature_column is not None:
         numbers = [file.find(file.options.temperature_column)]
-    elif len(numbers) > 1:
-        text = f"none of {file.listed(numbers)} is kept; name one by temperature_column"
-        file.note("temperature", text)
+    if len(numbers) != 1:
+        if numbers:
+            text = f"none of {file.listed(numbers)} is kept; name one by temperature_column"
+            file.note("temperature", text)
         return (), celsius
-    elif numbers and not measured:
+    unit = headers[numbers[0]].unit
+    if unit and unit.quantity == "temperature":
+        return numbers, unit
+    if file.options.temperature_column is None:
         text = f"{file.listed(numbers)} has no unit and is taken for degrees Celsius"
         file.note("temperature", text)
-    unit = headers[numbers[0]].unit if numbers else None
-    return numbers, unit if unit and unit.quantity == "temperature" else celsius
+    return numbers, celsius
 
 
 def acceleration_of(file: File, rates: Columns) -> Beside:

@@ -31,7 +31,7 @@ class Table:
 
     Attributes:
         where: Path of the file, for messages, and what may be wrong with its names.
-        names: The header, with units in brackets where a row or an attribute of units gives them;
+        names: The header, with units in brackets where a row of units gives them;
             an empty string for each column that it says nothing of.
         columns: Each (n,): float64, with NaN where a value is missing or cannot be read; objects,
             str or None, of a column of texts; or datetime64[ns] or timedelta64[ns]. The columns of

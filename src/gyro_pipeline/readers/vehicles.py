@@ -122,21 +122,19 @@ def _pick(path: Path, options: ReaderOptions, streams: Iterable[Stream]) -> Stre
     Raises:
         InputError: There is none, or more than one; names them all.
     """
-    allowed = [
-        (topic, instance)
-        for topic, instance in streams
-        if options.topic in (None, topic) and options.instance in (None, instance)
-    ]
+    topic, instance, allowed, listed = options.topic, options.instance, [], []
+    for name, number in streams:
+        listed.append(
+            f"topic: {name}" + (f" with instance: {number}" if number is not None else "")
+        )
+        if topic in (None, name) and instance in (None, number):
+            allowed.append((name, number))
     if len(allowed) == 1:
         return allowed[0]
-    listed = ", ".join(
-        f"topic: {topic}" + ("" if instance is None else f" with instance: {instance}")
-        for topic, instance in streams
-    )
     if not listed:
         raise InputError(f"{path}: expected messages with angular rates, got none")
-    got = "" if allowed else f", got topic: {options.topic}, instance: {options.instance}"
+    got = "" if allowed else f", got topic: {topic}, instance: {instance}"
     raise InputError(
-        f"{path}: expected one device's angular rates{got}; the log has {listed}; give these "
-        f"{IN_READER}"
+        f"{path}: expected one device's angular rates{got}; the log has {', '.join(listed)}; give "
+        f"these {IN_READER}"
     )
