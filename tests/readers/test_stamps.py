@@ -87,17 +87,10 @@ def test_times_that_contradict_or_are_none_are_refused(header, column, options, 
         assert {finding.outcome for finding in log.findings} == {"kept"}
 
 
-@pytest.mark.parametrize(
-    ("rate_hz", "advice"),
-    [
-        (200, "expected 200 Hz within 2 %, got 100 Hz; check the file's time"),
-        (1e5, "it is off by 10^-3: check time_units"),
-        (1e-4, "it is off by 10^6: check time_units"),
-    ],
-)
-def test_a_rate_beyond_the_tolerance_is_rejected_with_advice(rate_hz, advice, read):
-    (finding,) = read(f"time (s),{RATES}", S, X, rate_hz=rate_hz).findings
-    assert finding.outcome == "rejected" and advice in finding.detail
+def test_a_rate_beyond_the_tolerance_is_rejected_with_advice(read):
+    (finding,) = read(f"time (s),{RATES}", S, X, rate_hz=200).findings
+    assert finding.outcome == "rejected"
+    assert finding.detail.startswith("expected 200 Hz within 2 %, got 100 Hz; check time_units")
 
 
 def test_rows_that_are_left_out_take_time_but_have_no_number(read, details):
