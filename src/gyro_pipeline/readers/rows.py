@@ -26,8 +26,8 @@ MOST_VALUES = 32
 
 _DEVICE = re.compile(
     r"(?i)(?:^|[ _.])(?:device|dev|sensor|imu|gyro|gyroscope|board|chip|unit|module|channel|ch|"
-    r"port|bus|node|source|src|serial|mac|topic|id|name|addr|address|tag|instance)"
-    r"(?:[ _]?(?:id|no|num|number|name|index|tag|addr|address))?$"
+    r"port|slot|mux|bus|node|source|src|serial|mac|topic|id|name|addr|address|tag|instance)"
+    r"(?:[ _]?(?:id|no|nr|num|number|name|index|tag|addr|address))?$"
 )
 _NUMBER_OR_FLAG = re.compile(r"(?i)[-+.\de]*|inf|-inf|true|false|t|f|yes|no|y|n|on|off")
 
@@ -110,8 +110,10 @@ def contradict_turns(file: File, used: Collection[int], keep: Mask) -> None:
     for number, (header, column) in enumerate(zip(file.headers, file.table.columns, strict=True)):
         is_text, measures = column.dtype.kind != "f", header.unit_text or header.names_time
         says = is_text or (_DEVICE.search(header.name) and not measures)
-        cells = {c for c in column[:: len(column) // 100 + 1].tolist() if c == c}  # noqa: PLR0124
-        if number in used or not says or len(column) != len(keep) or len(cells) > MOST_VALUES:
+        if number in used or not says or len(column) != len(keep):
+            continue
+        cells = column[:: len(column) // 100 + 1].tolist()
+        if len({cell for cell in cells if cell == cell}) > MOST_VALUES:  # noqa: PLR0124 - not NaN
             continue
         codes, texts = _coded(column[keep])
         if 1 < len(texts) <= MOST_VALUES and (evidence := _evidence(header.name, codes, texts)):

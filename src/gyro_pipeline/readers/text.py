@@ -179,7 +179,8 @@ def _rows(where: str, text: bytes, delimiter: str | None) -> _Rows:
     decoded = enumerate(line.decode("utf-8", "replace").strip("\r\n") for line in whole)
     numbered = {number: line for number, line in decoded if line.strip()}
     lines, delimiters = [*numbered.values()], delimiter or DELIMITERS
-    starts = {sign: start for sign in delimiters if (start := _first_row(lines, sign))}
+    there = [sign for sign in delimiters if sign.encode() in head]
+    starts = {sign: start for sign in there if (start := _first_row(lines, sign))}
     if not starts:
         number, line = next(iter(numbered.items()), (0, ""))
         raise InputError(
@@ -206,7 +207,7 @@ def _rows(where: str, text: bytes, delimiter: str | None) -> _Rows:
         delimiter=delimiter,
         decimal_point=_decimal_point(where, [*chain(*columns)]),
         quoted='"' in lines[first],
-        texts=[not all(map(_is_number, column)) for column in columns],
+        texts=[not _are_numbers(*column) for column in columns],
     )
 
 
@@ -223,10 +224,11 @@ def _split(line: str, delimiter: str, strict: bool = False) -> Row:
     return [field.strip() for field in fields]
 
 
-def _is_number(field: str) -> bool:
-    """Whether it is a number, with a point or a comma, or NaN or infinity."""
+def _are_numbers(*fields: str) -> bool:
+    """Whether all are numbers, with a point or a comma, or NaN or infinity."""
     try:
-        float(field.replace(",", "."))
+        for field in fields:
+            float(field.replace(",", "."))
     except ValueError:
         return False
     return True
@@ -234,7 +236,7 @@ def _is_number(field: str) -> bool:
 
 def _figures(fields: Row) -> int:
     """How many are numbers, times or dates."""
-    return sum(field[:1] in "+-.0123456789" or _is_number(field) for field in fields if field)
+    return sum(field[:1] in "+-.0123456789" or _are_numbers(field) for field in fields if field)
 
 
 def _is_row(fields: Row) -> bool:
@@ -252,7 +254,7 @@ def _first_row(lines: list[str], delimiter: str) -> tuple[int, int, int] | None:
         is_row = len(fields) >= _LEAST and _is_row(fields)
         if delimiter == " ":  # words between blanks are a sentence
             is_row = is_row and _figures(fields) == len(fields)
-        shapes.append((len(fields), sum(map(_is_number, fields))) if is_row else (0, 0))
+        shapes.append((len(fields), sum(map(_are_numbers, fields))) if is_row else (0, 0))
         width, numbers = shapes[-1][0], max(shapes[-2][1], shapes[-1][1])
         if width == shapes[-2][0] and numbers >= _LEAST:
             break
@@ -261,7 +263,7 @@ def _first_row(lines: list[str], delimiter: str) -> tuple[int, int, int] | None:
     first = len(shapes) - 3
     while shapes[first][0]:  # a row of which numbers are missing, or a damaged one
         first -= 1
-    by_pandas = [field for field in _split(lines[first], delimiter) if _is_number(field)]
+    by_pandas = [field for field in _split(lines[first], delimiter) if _are_numbers(field)]
     is_header = first == 0 and by_pandas == [str(number) for number in range(len(by_pandas))]
     return first + is_header, width, numbers
 
@@ -331,7 +333,8 @@ def _joined(upper: Row, lower: Row) -> Row:
 
 def _decimal_point(where: str, fields: Row) -> str:
     """A comma where numbers have one that cannot separate thousands."""
-    commas = [field for field in fields if re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", field)]
+    commas = [field for field in fields if "," in field]
+    commas = [field for field in commas if re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", field)]
     if commas and all(re.fullmatch(r"[+-]?[1-9]\d*,\d{3}", field) for field in commas):
         raise InputError(
             f"{where}: expected decimal points, or decimal commas, got a comma before three digits "
