@@ -148,10 +148,16 @@ class ReaderOptions(Parameter):
     refused, unless ``trust: options`` says which is right.
     """
 
-    format: str = Field(
+    format: Literal[
         "auto",
-        description="name in gyro_pipeline.readers.FORMATS; general: none of them; auto: told",
-    )
+        "general",
+        "movella_dot",
+        "movella_dot_angles",
+        "xsens_mt_manager",
+        "openlog_artemis",
+        "ros_imu",
+        "px4_sensor_combined",
+    ] = Field("auto", description="the vendor's (readers.FORMATS); general: none; auto: told")
     columns: Triple | dict[int, Triple] | None = Field(
         None, description="of the angular rates about x, y, z; or these of each IMU, by number"
     )

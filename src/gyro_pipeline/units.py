@@ -12,14 +12,10 @@ _DEFINITIONS = """
 nano- = 1e-9 = n-
 micro- = 1e-6 = u- = µ- = μ-
 milli- = 1e-3 = m-
-centi- = 1e-2 = c-
-hecto- = 1e2 = h-
 kilo- = 1e3 = k-
-mega- = 1e6 = M-
 second = [time] = s = sec = secs
 minute = 60 * second = min
 hour = 60 * minute = h = hr
-day = 24 * hour
 millis = 0.001 * second
 micros = 0.000001 * second
 degree = [angle] = deg = degs
@@ -33,20 +29,10 @@ turn_per_second = turn / second = rps
 turn_per_minute = turn / minute = rpm
 count = [count] = counts = lsb = LSB = digit = digits = raw
 meter = [length] = m = metre
-foot = 0.3048 * meter = ft
 earth_gravity = 9.80665 * meter / second ** 2 = g
 kelvin = [temperature] = K
 celsius = kelvin; offset: 273.15 = C = degC = degc
 fahrenheit = 5 / 9 * kelvin; offset: 459.67 * 5 / 9 = F = degF = degf
-hertz = 1 / second = Hz
-newton = [force] = N
-pascal = newton / meter ** 2 = Pa
-bar = 100000 * pascal
-volt = [voltage] = V
-ampere = [current] = A
-tesla = [magnetic_field] = T
-gauss = 0.0001 * tesla
-percent = [share]
 """
 _REFERENCES = {
     "rate": "degree_per_second",
@@ -58,7 +44,7 @@ _REFERENCES = {
 }
 """What is told apart, and the unit in which each is used here."""
 
-_SPELLINGS = {"º": "°", "˚": "°", "℃": "°C", "℉": "°F", "°": "deg", "%": "percent"}
+_SPELLINGS = {"º": "°", "˚": "°", "℃": "°C", "℉": "°F", "°": "deg"}
 _SPELLINGS |= {"·": "*", "⋅": "*", "⁻¹": "^-1", "⁻²": "^-2", "²": "^2"}
 _TERM = r"[^\W\d_][^\W\d]*(?:\^?-?[1-3])?"
 # words, products and quotients, but neither numbers nor roots; pint would evaluate 9**9**9
@@ -69,8 +55,7 @@ class Unit(NamedTuple):
     """A unit: a value in it, times ``factor`` plus ``offset``, is in deg/s, deg, s, g, °C, counts.
 
     Attributes:
-        quantity: ``rate``, ``angle``, ``time``, ``acceleration``, ``temperature``, ``count`` or
-            ``other``.
+        quantity: ``rate``, ``angle``, ``time``, ``acceleration``, ``temperature`` or ``count``.
         factor: As above.
         offset: As above; of temperatures only.
     """
@@ -96,7 +81,7 @@ def read_unit(text: str) -> Unit | None:
     """Read a unit such as ``deg/s``, ``rad s^-1``, ``°/sec``, ``mdps``, ``m/s²`` or ``degC``.
 
     Returns:
-        What it measures; ``other`` for known units of anything else; None where it is no unit.
+        What it measures; None where it is none of these, or is not known.
     """
     text = text.strip()
     for spelling, of_pint in _SPELLINGS.items():
@@ -113,9 +98,7 @@ def _parsed(expression: str) -> Unit | None:
     units, quantities = _registry()
     try:
         unit = units.parse_units(expression)
-        quantity = quantities.get(unit.dimensionality, "other")
-        if quantity == "other":
-            return Unit(quantity)
+        quantity = quantities[unit.dimensionality]
         zero, one = (units.Quantity(v, unit).to(_REFERENCES[quantity]).magnitude for v in (0, 1))
     except Exception:  # pint raises what its parser and Python's tokenizer do
         return None

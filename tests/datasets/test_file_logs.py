@@ -157,7 +157,7 @@ PATTERNS = [
         *(({"pattern": pattern}, "pattern in the catalog entry: expected {imu} or {imu:name}, ")
           for pattern in PATTERNS),
         ({"reader": {"unit": "deg/s"}}, "dot: reader in the catalog entry"),
-        ({"reader": {"format": "movela_dot"}}, "reader in the catalog entry: expected format auto"),
+        ({"reader": {"format": "movela_dot"}}, "Input should be 'auto', 'general'"),
     ],
 )  # fmt: skip
 def test_a_wrong_entry_is_refused_before_anything_is_read(tmp_path, options, words):

@@ -31,7 +31,6 @@ def axes(name, order="xyz"):
         (axes("Gyro (rad/s).#"), X * RAD, {}),
         (f"{T}gyro[0],gyro[1],gyro[2]", X, DEG),
         (f"{T}angular_velocity[0],angular_velocity[1],angular_velocity[2]", X, DEG),
-        (axes("#", "zyx"), X[:, ::-1], DEG | {"columns": ("x", "y", "z")}),
         (axes(""), X, BY_NUMBER),
         (f"{T}roll (deg/s),pitch (deg/s),yaw (deg/s)", X, {"columns": (1, 2, 3)}),
         (f"{T}yaw_rate (deg/s),pitch_rate (deg/s),roll_rate (deg/s)", X[:, ::-1], {}),
@@ -49,7 +48,7 @@ def axes(name, order="xyz"):
 def test_rates_are_told_by_name_and_unit_or_by_the_users_word(header, columns, options, read):
     log = read(header, S, columns, rate_hz=100, **options)
     np.testing.assert_allclose(log.samples, X, rtol=1e-12)
-    assert not log.findings
+    assert [finding.check for finding in log.findings] == ["increments"] * ("increments" in options)
 
 
 @pytest.mark.parametrize(
@@ -60,13 +59,16 @@ def test_rates_are_told_by_name_and_unit_or_by_the_users_word(header, columns, o
         (f"{T}roll (deg/s),pitch (deg/s),yaw (deg/s)", {}, "expected three columns"),
         (axes("gyro_bias_#"), DEG, "expected three columns"),
         (axes("g# (LSB)"), {}, "raw counts: give units: raw and scale_dps"),
-        (axes("g#"), {"columns": ("gx", "gy", "wz")}, "expected a column 'wz', got 4 columns"),
-        (axes("g#"), {"columns": (1, 2, 9)}, r"expected a column 9 \(from 0\), got 4"),
+        (
+            axes("g#"),
+            {"columns": ("gx", "gy", "wz")},
+            "expected one column 'wz', got 0.* in 4 columns",
+        ),
+        (axes("g#"), {"columns": (1, 2, 9)}, "expected one column 9, got 0"),
         (f"{T}gx,gx,gy", {"columns": ("gx", "gy", "gz")}, r"one column 'gx', got 2.*\[1, 2\]"),
         (axes("g#"), {"columns": {1: (1, 2, 3)}, "imu": 2}, "of IMUs 1, not of IMU 2"),
         (axes("g# (rad/s)"), {"preamble": "in deg/s"}, "header says rad/s, but lines above.*deg/s"),
         (f"{T}gx (deg/s),gy (rad/s),gz (deg/s)", {}, "header says deg/s, but the header says rad"),
-        (axes("g#"), {"preamble": "# gyro_range = 250.0 dps"}, "expected a unit of the rates"),
         ("k,dx (rad),dy (rad),dz (rad)", {"increments": True}, "the step .* is not known; give ti"),
         (axes("g# (deg/s)"), {"increments": True, "units": "deg"}, "but that is no angle turned"),
     ],
@@ -81,7 +83,7 @@ def test_what_is_not_said_is_asked_for(header, options, words, read):
     [
         (f"{T}yaw (dps),pitch (dps),roll (dps)", BY_NUMBER, "but by their names 'roll .dps.', 'pi"),
         *[
-            (f"{T}{names}", BY_NUMBER, "belong in this order")
+            (f"{T}{names}", BY_NUMBER, "belong together in this order")
             for names in ("r,q,p", "gyro3,gyro2,gyro1", "w2,w1,w0", "gyro 3,gyro 2,gyro 1")
         ],
         (axes("a#"), BY_NUMBER | {"increments": True, "units": "deg"}, "by name no angular rate"),
@@ -100,7 +102,6 @@ def test_what_is_not_said_is_asked_for(header, options, words, read):
             "says 'Gyro sensitivity: 131', but",
         ),
         (axes("10*g# (deg/s)"), {}, "name a factor"),
-        (axes("g#_x10 (deg/s)"), {}, "name a factor"),
     ],
 )
 def test_contradictions_are_refused_unless_the_options_are_trusted(
@@ -157,10 +158,17 @@ def test_of_a_scale_with_two_readings_the_one_taken_is_said(dps, taken, read, de
     assert taken in details(log, "scale")[0]
 
 
-def test_of_sensors_side_by_side_names_of_two_are_not_mixed(read):
+def test_names_of_two_sensors_are_not_mixed_and_each_imu_has_its_own(read):
     header = f"{T}icm_gx,icm_gy,icm_gz,asm_gx,asm_gy,asm_gz"
     with pytest.raises(InputError, match="columns of the options.*'icm_gx', 'icm_gy', 'icm_gz'"):
         read(header, S, X, X + 1, columns=("icm_gx", "icm_gy", "asm_gz"), **DEG)
+    log = read(header, S, X, X + 1, columns={1: (1, 2, 3), 2: (4, 5, 6)}, imu=2, **DEG)
+    np.testing.assert_array_equal(log.samples, X + 1)
+
+
+@pytest.mark.parametrize("name", ["calibrated_gyro_# (dps)", "uncalibrated_gyro_# (dps)"])
+def test_rates_that_are_free_of_their_bias_are_said(name, read):
+    assert ("left of a bias" in str(read(axes(name), S, X).findings)) == name.startswith("cal")
 
 
 @pytest.mark.parametrize("name", ["tilt_#", "jerk_#", "field_#", "#"])
@@ -173,11 +181,6 @@ def test_rates_by_units_alone_are_said_and_never_a_quaternion(name, read, detail
     with pytest.raises(InputError, match="by name of a quaternion; give columns.*trust: options"):
         read(header, S, X, S, **BY_NUMBER)
     assert not read(f"{axes(f'{name} (dps)')},{name.replace('#', 'w')}", S, X, S).findings
-
-
-@pytest.mark.parametrize("name", ["calibrated_gyro_# (dps)", "uncalibrated_gyro_# (dps)"])
-def test_rates_that_are_free_of_their_bias_are_said(name, read):
-    assert ("left of a bias" in str(read(axes(name), S, X).findings)) == name.startswith("cal")
 
 
 @pytest.mark.parametrize(
@@ -226,6 +229,7 @@ def test_accelerations_are_kept_in_g(unit, factor, read, details):
         ({"time_units": -1}, "greater than 0"),
         ({"acceleration_units": "s"}, "expected a unit of acceleration"),
         ({"trust": "header"}, "options"),
+        ({"format": "dot"}, "'auto', 'general', 'movella_dot',"),
     ],
 )
 def test_options_that_make_no_sense_are_refused_before_anything_is_read(options, words):

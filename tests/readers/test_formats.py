@@ -70,7 +70,6 @@ def test_each_logger_is_told_by_its_header_and_read_in_deg_per_s(
         ({"preamble": "# rad/s"}, "lines above the header say rad/s, but the format has deg/s"),
         ({"format": "openlog_artemis"}, "artemis has a column 'gX', got 'PacketCounter'"),
         ({"format": "general"}, "expected a unit of the rates"),
-        ({"format": "dot"}, "expected format auto, movella_dot, .*, general, got 'dot'"),
     ],
 )
 def test_a_format_that_is_contradicted_or_wrong_is_refused(options, words, read):

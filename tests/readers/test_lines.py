@@ -58,7 +58,7 @@ def test_groups_may_be_missing_and_unreadable(table):
         row=r"^gyro (?P<gx>\d),(?P<gy>\w+)(?:,(?P<gz>\d))?$",
     )
     assert np.isnan(np.transpose(log.columns)).nonzero()[0].tolist() == [1, 2]
-    assert [finding.check for finding in log.findings] == ["row", "unreadable cells"]
+    assert [finding.check for finding in log.findings] == ["row", "unreadable rows"]
     assert "row 2 (line 4)" in log.findings[1].detail
 
 

@@ -14,6 +14,8 @@ S = np.arange(N) / 100
 RATES = "gx (deg/s),gy (deg/s),gz (deg/s)"
 STEPS = np.random.default_rng(0).normal(10, 0.5, N)
 STEPS *= 10 / STEPS[1:].mean()
+DATES = pd.Timestamp("2024-03-01").to_datetime64() + (S * 1e9).astype("m8[ns]")
+K = {"time_column": "k"}
 
 
 @pytest.mark.parametrize(
@@ -27,15 +29,18 @@ STEPS *= 10 / STEPS[1:].mean()
         ("T (degC),t [s]", [S * 0 + 25, S], {}),
         ("delta_time (s),time (s)", [STEPS / 1e3, S], {}),
         ("time,seconds_elapsed", [1.7e18 + S * 1e9, S], {"time_units": "ns"}),
-        ("stamp", [pd.Timestamp("2024-03-01").to_datetime64() + (S * 1e9).astype("m8[ns]")], {}),
-        ("k", [S], {"time_column": "k", "time_units": "s"}),
-        ("k,t (s)", [STEPS, S], {"time_is": "steps", "time_column": "k", "time_units": "ms"}),
+        ("stamp", [DATES], {}),
+        ("k", [S], K | {"time_units": "s"}),
+        ("k,t (s)", [STEPS, S], K | {"time_is": "steps", "time_units": "ms"}),
+        ("t", [S * 1e3], {"preamble": "tscale,0.001"}),
+        *[("t (s)", [S], {"preamble": text}) for text in (
+            "Sample rate: 100 Hz", "fs = 100", "// Update Rate: 0.1kHz", "rate of turn 5")],
     ],
-)
+)  # fmt: skip
 def test_the_first_column_that_holds_times_gives_the_rate(header, columns, options, read, details):
-    log = read(f"{header},{RATES}", *columns, X, rate_hz=100, **options)
+    log = read(f"{header},{RATES}", *columns, X, rate_hz=101.9, **options)
     assert log.rate_hz == pytest.approx(100, rel=1e-3)
-    assert not details(log, "timestamps")
+    assert not details(log, "timestamps") and not details(log, "sample rate")
 
 
 @pytest.mark.parametrize(
@@ -60,68 +65,32 @@ def test_what_is_not_known_of_the_time_is_one_short_finding(header, column, word
 @pytest.mark.parametrize(
     ("header", "column", "options", "words"),
     [
-        ("t (ms)", S, {"time_units": "s"}, "0.001 s, which makes 100000 Hz, but.* 1 s.* 100 Hz"),
-        (
-            "t",
-            S,
-            {"time_units": "s", "preamble": "tscale,0.001"},
-            "line above.* 0.001 s.*read in 1 s, which",
-        ),
-        ("k", S, {"time_column": "k"}, "'k' has no unit"),
-        ("k", S * 0, {"time_column": "k", "time_units": "s"}, "'k' holds"),
-        ("k", STEPS, {"time_column": "k", "time_units": "ms"}, "give time_is: steps"),
+        ("t (ms)", S, {"time_units": "s"}, "has a unit of 0.001 s, but it is read in 1 s.*trust"),
+        ("t", S, {"time_units": "s", "preamble": "tscale,0.001"}, "line above.* 0.001 s.*in 1 s"),
+        ("t (ms)", S, {}, "makes 100000 Hz,.*give time_units: s, which makes 100 Hz;.*trust"),
+        ("t (s)", S * 1e6, {}, "makes 0.0001 Hz.*time_units: us, which makes 100 Hz;.*trust"),
+        ("t (s)", S, {"preamble": "OutputRate:,120Hz"}, "state 120 Hz, 100 Hz is measured.*trust"),
+        ("t (s)", S, {"preamble": "Sampling frequency (Hz): 50.0\n"}, "state 50 Hz"),
+        ("k", S, K, "'k' has no unit"),
+        ("k", S * 0, K | {"time_units": "s"}, "'k' holds no times"),
+        ("k", STEPS, K | {"time_units": "ms"}, "give time_is: steps"),
     ],
 )
-def test_a_time_that_the_options_name_must_be_one(header, column, options, words, read):
-    with pytest.raises(InputError, match=f"{words}.*in `reader:` of the catalog entry"):
+def test_times_that_contradict_or_are_none_are_refused(header, column, options, words, read):
+    with pytest.raises(InputError, match=f"{words}.*in `reader:` of the catalog entry") as refusal:
         read(f"{header},{RATES}", column, X, **options)
+    if "trust" in words:
+        advice = re.search(r"time_units: (.?s),", str(refusal.value))
+        options = options | ({"time_units": advice[1]} if advice else {})
+        log = read(f"{header},{RATES}", column, X, trust="options", **options)
+        assert log.rate_hz == pytest.approx(100)
+        assert {finding.outcome for finding in log.findings} == {"kept"}
 
 
-@pytest.mark.parametrize(
-    ("preamble", "outcome"),
-    [
-        ("Sample rate: 100 Hz", ()),
-        ("fs = 100", ()),
-        ("// Update Rate: 0.1kHz", ()),
-        ("rate of turn 5", ()),
-        ("OutputRate:,120Hz", ("rejected",)),
-        ("Sampling frequency (Hz): 50.0\n", ("rejected",)),
-    ],
-)
-def test_a_rate_above_the_header_is_compared_with_the_measured_one(preamble, outcome, read):
-    log = read(f"time (s),{RATES}", S, X, preamble=preamble)
-    assert tuple(f.outcome for f in log.findings if f.check == "stated rate") == outcome
-    trusted = read(f"time (s),{RATES}", S, X, preamble=preamble, trust="options")
-    assert {finding.outcome for finding in trusted.findings} <= {"kept"}
-
-
-@pytest.mark.parametrize(
-    ("rate_hz", "advice"),
-    [
-        (200, "expected 200 Hz within 2 %, got 100 Hz; check the file's time"),
-        (1e5, "it is off by 10^-3: check time_units"),
-        (1e-4, "it is off by 10^6: check time_units"),
-    ],
-)
-def test_a_rate_beyond_the_tolerance_is_rejected_with_advice(rate_hz, advice, read):
-    (finding,) = read(f"time (s),{RATES}", S, X, rate_hz=rate_hz).findings
-    assert finding.outcome == "rejected" and advice in finding.detail
-    assert not read(f"time (s),{RATES}", S, X, rate_hz=101.9).findings
-
-
-@pytest.mark.parametrize(
-    ("header", "column", "words"),
-    [
-        ("t (ms)", S, "makes 100000 Hz,.*give time_units: s, which makes 100 Hz, and trust"),
-        ("t (s)", S * 1e6, "makes 0.0001 Hz.*time_units: us, which makes 100 Hz"),
-    ],
-)
-def test_a_rate_at_which_no_gyroscope_is_read_says_what_to_type(header, column, words, read):
-    (finding,) = read(f"{header},{RATES}", column, X).findings
-    assert finding.outcome == "rejected" and re.search(words, finding.detail)
-    unit = re.search("time_units: (.?s),", finding.detail)[1]
-    log = read(f"{header},{RATES}", column, X, time_units=unit, trust="options")
-    assert log.rate_hz == pytest.approx(100)
+def test_a_rate_beyond_the_tolerance_is_rejected_with_advice(read):
+    (finding,) = read(f"time (s),{RATES}", S, X, rate_hz=200).findings
+    assert finding.outcome == "rejected"
+    assert finding.detail.startswith("expected 200 Hz within 2 %, got 100 Hz; check time_units")
 
 
 def test_rows_that_are_left_out_take_time_but_have_no_number(read, details):

@@ -98,8 +98,11 @@ class Parser:
 
     def _start(self, lines: Sequence[str]) -> int:
         """Tell columns, units and rate from the first lines; returns how many are a header."""
-        from gyro_pipeline.readers.beside import acceleration_of, temperature_of  # noqa: PLC0415
-        from gyro_pipeline.readers.columns import rate_columns  # noqa: PLC0415
+        from gyro_pipeline.readers.columns import (  # noqa: PLC0415
+            acceleration_of,
+            rate_columns,
+            temperature_of,
+        )
         from gyro_pipeline.readers.file import File  # noqa: PLC0415
         from gyro_pipeline.readers.scales import scale_of  # noqa: PLC0415
         from gyro_pipeline.readers.table import Table  # noqa: PLC0415

@@ -73,7 +73,6 @@ class FileLogs(LogSource):
             self._options = ReaderOptions.model_validate(reader or {})
         except ValidationError as error:
             raise InputError(f"{where}: {error}") from error
-        readers.check_format(self._options.format, where)
         columns = self._options.columns
         self._side_by_side = list(columns) if isinstance(columns, Mapping) else []
         if self._side_by_side and "imu" in self._regex.groupindex:

@@ -1,12 +1,14 @@
-"""A logger's file in, a recording in deg/s out.
+"""A logger's file in, a recording in deg/s out: :func:`log_of` is the flow.
 
-A file is a table (``table``). Names, units, format and options say which of its columns are the
-rates (``columns``, ``scales``) and what stands beside them (``beside``); some of its rows are
-samples (``rows``); their time is told by content (``stamps``, ``times``, ``clock``), and their
-values must be a gyroscope's (``counts``).
+A file is a table (``table``, made by ``text``, ``lines``, ``stored``, ``vehicles``). Names, units,
+format and options say which of its columns are the rates (``columns``) and in which unit
+(``scales``). Some of its rows are samples (``rows``), their time is told by content (``stamps``,
+``times``), and their values must be a gyroscope's (``counts``). Whatever contradicts each other is
+collected, then refused at once (``File.settle``) unless the options are trusted: so ends a file in
+which devices take turns. Where samples are missing (``clock``) is a row in ``Log.gap_rows``, and
+quality control keeps the longest stretch between two of them: so ends a file with a gap.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,17 +16,16 @@ from numpy.typing import NDArray
 
 from gyro_pipeline.logs import Log
 from gyro_pipeline.parameters import ReaderOptions
-from gyro_pipeline.readers.beside import acceleration_of, read_beside, temperature_of
-from gyro_pipeline.readers.columns import rate_columns
+from gyro_pipeline.readers.columns import Beside, acceleration_of, rate_columns, temperature_of
 from gyro_pipeline.readers.counts import contradict_values, signed
 from gyro_pipeline.readers.file import File
-from gyro_pipeline.readers.formats import FORMATS, check_format
+from gyro_pipeline.readers.formats import FORMATS
 from gyro_pipeline.readers.rows import contradict_turns, sample_rows
 from gyro_pipeline.readers.scales import scale_of
-from gyro_pipeline.readers.stamps import compare_rates, counted, timing_of
+from gyro_pipeline.readers.stamps import compare_rates, counted_gaps, timing_of
 from gyro_pipeline.readers.table import Table, read_table
 
-__all__ = ["FORMATS", "Table", "check_format", "log_of", "read_log"]
+__all__ = ["FORMATS", "Table", "log_of", "read_log"]
 
 Floats = NDArray[np.float64]
 
@@ -63,40 +64,31 @@ def log_of(
     file = File(table, options)
     columns = rate_columns(file, imu)
     scale, are_counts = scale_of(file, columns)
-    raw = _stacked(file, columns)
+    temperature, acceleration = temperature_of(file), acceleration_of(file, columns)
+    numbers = [table.numbers(number) for number in columns]
+    if len({*map(len, numbers)}) > 1:
+        lengths = [len(column) for column in numbers]
+        raise file.refusal(f"expected columns of one length, got {lengths}; correct columns")
+    raw = np.array(numbers).T
     keep = sample_rows(file, raw)
     timing = timing_of(file, keep)
     raw = raw if keep.all() else raw[keep]
     rates = _in_dps(file, raw, scale, timing.rate_hz or expected_rate_hz)
-    if options.increments and timing.rate_hz and not keep.all():
-        text = f"divided by {1 / timing.rate_hz:.6g} s, the step between the rows that are left"
-        file.note("increments", f"angles are {text}, {keep.sum()} of {len(keep)}")
-    temperature, acceleration = temperature_of(file), acceleration_of(file, columns)
     contradict_values(file, raw, rates, are_counts)
-    contradict_turns(file, {*columns, *temperature[0], *acceleration[0]}, keep, rates)
+    contradict_turns(file, {*columns, *temperature[0], *acceleration[0]}, keep)
+    compare_rates(file, timing.rate_hz, expected_rate_hz, keep)
     file.settle()
-    gaps = counted(file, keep)
-    compared = compare_rates(file, timing.rate_hz, expected_rate_hz, keep)
-    celsius = read_beside(file, temperature, keep)
+    gap_rows = np.union1d(timing.gap_rows, counted_gaps(file, keep)).astype(np.intp)
+    celsius = _beside(file, temperature, keep)
     return Log(
         samples=rates,
         rate_hz=timing.rate_hz,
-        gap_rows=np.union1d(timing.gap_rows, gaps.gap_rows).astype(np.intp),
+        gap_rows=gap_rows,
         temperature_c=None if celsius is None else celsius[:, 0],
-        acceleration_g=read_beside(file, acceleration, keep),
+        acceleration_g=_beside(file, acceleration, keep),
         rows=None if keep.all() else np.flatnonzero(keep),
-        findings=(*table.findings, *file.findings, *timing.findings, *gaps.findings, *compared),
+        findings=(*table.findings, *file.findings),
     )
-
-
-def _stacked(file: File, columns: Sequence[int]) -> Floats:
-    """Numbers (n, 3) of the file."""
-    values = [file.table.numbers(number) for number in columns]
-    if len({*map(len, values)}) > 1:
-        lengths = [len(column) for column in values]
-        names = file.listed(columns)
-        raise file.refusal(f"expected columns of one length, got {lengths} of {names}; correct it")
-    return np.array(values).T
 
 
 def _in_dps(file: File, raw: Floats, scale: float, rate_hz: float | None) -> Floats:
@@ -111,4 +103,18 @@ def _in_dps(file: File, raw: Floats, scale: float, rate_hz: float | None) -> Flo
     if rate_hz is None:
         text = "increments: true: the step between samples is not known; give time_column"
         raise file.refusal(text)
+    file.note("increments", f"angles are divided by {1 / rate_hz:.6g} s, the step between samples")
     return raw * scale * rate_hz
+
+
+def _beside(file: File, beside: Beside, keep: NDArray[np.bool_]) -> Floats | None:
+    """Values (n, k) in °C or g beside the rates, if there are any; no reason to refuse."""
+    numbers, unit = beside
+    columns = [file.table.columns[number] for number in numbers]
+    if not columns or any(c.dtype.kind != "f" or len(c) != len(keep) for c in columns):
+        return None
+    values = np.array(columns).T
+    values *= unit.factor
+    values += unit.offset
+    values = values if keep.all() else values[keep]
+    return values if np.isfinite(values).any() else None

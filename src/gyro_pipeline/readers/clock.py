@@ -70,7 +70,6 @@ def from_stamps(stamps: Floats, unit_s: float | None, numbers: Rows | None = Non
     findings += [
         *_at("gaps", numbers[gaps], missing, REPAIRED, "before"),
         *_at("timestamps", numbers[rows[~first]], text),
-        *_jitter(np.diff(even)[(np.diff(rows[last]) == 1) & (losses[1:] == 0)], len(even)),
         *_change(even, rows[last]),
     ]
     return Timing(unit_s and 1 / (step * unit_s), np.union1d(gaps, rows[back]), (*findings,))
@@ -138,13 +137,6 @@ def _resolution(stamps: Floats, step: np.floating) -> float:
     return max(units[errors <= 4 * np.spacing(np.abs(stamps).max()), 0], default=0.0)
 
 
-def _jitter(steps: Floats, count: int, most: float = 0.1) -> tuple[Finding, ...]:
-    """Whether steps between samples, if most of a count are left, scatter by more than a share."""
-    scatter = np.std(steps) / np.mean(steps) if len(steps) > count / 2 else 0.0
-    text = f"steps scatter by {scatter:.0%} of their mean"
-    return (Finding("jitter", KEPT, text),) if scatter > most else ()
-
-
 def _change(times: Floats, rows: Rows, least: float = 0.02) -> tuple[Finding, ...]:
     """Whether the step changes along times without gaps: between the means of five parts.
 
@@ -208,18 +200,10 @@ def from_counter(counts: Floats, bits: int) -> Timing:
     Returns:
         Rows at which it does not go on by one are gaps; there is no rate.
     """
-    rows, strays = _without_strays(counts)
-    jumps = np.diff(counts[rows] - rows)
-    changes = np.flatnonzero(jumps)
-    wraps = np.mod(jumps[changes], 2.0**bits) == 0
-    wraps, skips = rows[1:][changes[wraps]], rows[1:][changes[~wraps]]
-    far = "a number is far from those beside it, and ignored"
-    findings = (
-        *_at("packet counter", strays, far),
-        *_at("wrap-around", wraps, f"the {bits}-bit packet counter starts anew"),
-        *_at("packet counter", skips, "the packet counter does not go on by one", REPAIRED),
-    )
-    return Timing(gap_rows=skips, findings=findings)
+    rows, _ = _without_strays(counts)
+    skips = rows[1:][np.mod(np.diff(counts[rows] - rows), 2.0**bits) != 0]
+    text = "the packet counter does not go on by one"
+    return Timing(gap_rows=skips, findings=(*_at("packet counter", skips, text, REPAIRED),))
 
 
 def _at(check: str, rows: Rows, text: str, outcome: str = KEPT, place: str = "at") -> list[Finding]:

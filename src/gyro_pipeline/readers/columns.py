@@ -1,4 +1,4 @@
-"""Which columns of a table are the rates.
+"""Which columns of a table are the rates, and which stand beside them.
 
 A column is a rate only if it says so: by a name and a unit, or by the user's word. What a name, a
 header, the lines above it, a format and the options say of the same thing must agree. Where two of
@@ -14,28 +14,32 @@ from gyro_pipeline.parameters import Column
 from gyro_pipeline.readers.file import File
 from gyro_pipeline.readers.formats import find_all
 from gyro_pipeline.readers.names import (
+    ACCELERATION,
     ATTITUDE,
     INDEX,
     RATE,
     Header,
     is_quaternion,
-    numbered,
     triples,
 )
 from gyro_pipeline.readers.scales import RATE_UNITS
+from gyro_pipeline.units import Unit, read_unit
 
 Columns = Sequence[int]
 
+Beside = tuple[Columns, Unit]
+"""Numbers of columns, none where they are not known, and their unit."""
+
 _NOTES = {
-    "motionRotationRate": "{} is what is left of a bias: Core Motion removes it (Apple, "
-    "CMDeviceMotion.rotationRate); gyroRotation columns are free of that",
-    "gyroADC": "{} is what is left of a bias: Betaflight takes off the mean at power-on",
-    "unbiased|debias|bias_?(free|corrected|removed)|(?<!un)calibrated(?=[_ ]|$)": "{} is what is "
-    "left of a bias: by its name, it is taken off",
-    "alpha|beta|gamma": "{}: a browser's alpha is taken for the rate about z, beta x, gamma y "
+    "motionRotationRate|gyroADC|unbiased|debias|bias_?(free|corrected|removed)|"
+    "(?<!un)calibrated(?=[_ ]|$)": "{!r} is by its name what is left of a bias that was taken off: "
+    "Core Motion does so (CMDeviceMotion.rotationRate), and Betaflight at power-on",
+    "alpha|beta|gamma": "{!r}: a browser's alpha is taken for the rate about z, beta x, gamma y "
     "(W3C, 2016); some browsers number them from x",
 }
 """What the name of a rate says beside."""
+
+_TEMPERATURE = re.compile(r"(?i)(temp|temperature)([_ ]?c|[_ ](gyro|imu|sensor|board|chip|cpu))?$")
 
 
 def rate_columns(file: File, imu: int | None = None) -> Columns:
@@ -57,37 +61,30 @@ def rate_columns(file: File, imu: int | None = None) -> Columns:
     rates = _by_options(file, columns) if columns else _by_name(file)
     for words, text in _NOTES.items():
         if re.search(words, file.table.names[rates[0]], re.IGNORECASE):
-            file.note("rates", text.format(repr(file.table.names[rates[0]])))
+            file.note("rates", text.format(file.table.names[rates[0]]))
     return rates
 
 
 def _by_options(file: File, columns: Sequence[Column]) -> Columns:
-    """The columns of the options, compared with what their names say of quantity, axes, samples."""
-    rates = [file.find(column) for column in columns]
+    """The columns of the options, compared with what their names say of axes, samples, quantity."""
+    rates, headers = [file.find(column) for column in columns], file.headers
     if len(set(rates)) < len(AXES):
         raise file.refusal(f"expected three columns of rates, got {list(columns)}; correct columns")
-    headers, contradict = file.headers, file.contradictions.append
-    overlapping = [t for t in (*triples(headers), *numbered(headers)) if {*t} & {*rates}]
+    named = f"columns of the options are {file.listed(rates)}, but"
+    overlapping = [triple for triple in triples(headers) if {*triple} & {*rates}]
     same = [triple for triple in overlapping if {*triple} == {*rates}]
     if overlapping and tuple(rates) not in same:
-        together = "in this order" if same else "together"
-        contradict(
-            f"columns of the options are {file.listed(rates)}, but by their names "
-            f"{file.listed((same or overlapping)[0])} belong {together}; give these, or no columns"
-        )
+        belong = f"{file.listed((same or overlapping)[0])} belong together in this order"
+        file.contradict(f"{named} by their names {belong}; give these, or no columns")
     arrays = [INDEX.sub("", header.name) for header in headers]
     samples = min(arrays.count(arrays[number]) for number in rates)
     if samples > 1 and len({arrays[number] for number in rates}) == len(AXES):
-        contradict(
-            f"a row holds {samples} samples, {file.listed(rates)} and so on, of which the options "
-            "name one; write a row for each sample"
-        )
+        file.contradict(f"{named} a row holds {samples} samples; write a row for each sample")
     others = [number for number in rates if not _may_be_rate(file, headers[number])]
     if others or is_quaternion(headers, rates):
-        contradict(
-            f"columns of the options name {file.listed(others or rates)}, by name "
-            f"{'no angular rate' if others else 'of a quaternion'}; give columns of angular rates"
-        )
+        kind = "no angular rate" if others else "of a quaternion"
+        text = f"{file.listed(others or rates)} is by name {kind}; give columns of angular rates"
+        file.contradict(f"{named} {text}")
     return rates
 
 
@@ -103,14 +100,12 @@ def _by_name(file: File) -> Columns:
         return find_all(file.table, *file.form.rates.split())
     measured = "angle" if file.options.increments else "rate"
     certain, possible = list[Columns](), list[Columns]()
-    with_axes = triples(file.headers)
-    for triple in with_axes + numbered(file.headers):
+    for triple in triples(file.headers):
         header = file.headers[triple[0]]
-        if header.quantity in ("", RATE):
-            if header.quantity == RATE or header.measures(measured):
-                certain.append(triple)
-            elif triple in with_axes:
-                possible.append(triple)
+        if header.quantity == RATE or (header.quantity == "" and header.measures(measured)):
+            certain.append(triple)
+        elif header.quantity == "" and not header.name[-1:].isdigit():
+            possible.append(triple)
     if not any(file.table.names) and len(file.table.names) == len(AXES):
         possible.append((0, 1, 2))
     if len(certain) == 1:
@@ -143,3 +138,47 @@ def _refusal_of(file: File, candidates: Sequence[Columns]) -> InputError:
         "expected three columns of angular rate about x, y, z that say so by name or unit, got "
         f"{file.table.listed()}; give columns, such as [gx, gy, gz], and units"
     )
+
+
+def temperature_of(file: File) -> Beside:
+    """The column of the options, or the only one that is named so, or has such a unit."""
+    celsius, headers = Unit("temperature"), file.headers
+    named = [n for n, header in enumerate(headers) if _TEMPERATURE.search(header.name)]
+    measured = [n for n, header in enumerate(headers) if header.measures("temperature")]
+    measured = [n for n in measured if n in named or headers[n].unit_text != "K"]  # gain [K]
+    numbers = measured or [n for n in named if not headers[n].unit_text]
+    if file.options.temperature_column is not None:
+        numbers = [file.find(file.options.temperature_column)]
+    if len(numbers) != 1:
+        if numbers:
+            text = f"none of {file.listed(numbers)} is kept; name one by temperature_column"
+            file.note("temperature", text)
+        return (), celsius
+    unit = headers[numbers[0]].unit
+    if unit and unit.quantity == "temperature":
+        return numbers, unit
+    if file.options.temperature_column is None:
+        text = f"{file.listed(numbers)} has no unit and is taken for degrees Celsius"
+        file.note("temperature", text)
+    return numbers, celsius
+
+
+def acceleration_of(file: File, rates: Columns) -> Beside:
+    """The columns of the options, the format's, or the only three that are named so."""
+    options, form = file.options, file.form
+    numbers = [file.find(column) for column in options.acceleration_columns or ()]
+    units = options.acceleration_units
+    if form and not numbers:
+        numbers = find_all(file.table, *form.acceleration.split())
+        units = units or form.acceleration_units
+    if not numbers:
+        named = [t for t in triples(file.headers) if file.headers[t[0]].quantity == ACCELERATION]
+        numbers = list(named[0]) if len(named) == 1 else []
+    if len(numbers) != len(AXES) or {*numbers} & {*rates}:
+        return (), Unit(ACCELERATION)
+    unit = read_unit(units or file.headers[numbers[0]].unit_text)
+    if unit and unit.quantity == ACCELERATION:
+        return numbers, unit
+    text = f"{file.listed(numbers)} have no unit and are not kept; give acceleration_units"
+    file.note("acceleration", text)
+    return (), Unit(ACCELERATION)

@@ -24,14 +24,14 @@ def contradict_values(file: File, raw: Floats, rates: Floats, are_counts: bool) 
         rates: (n, 3), deg/s.
         are_counts: Whether the file's numbers are known to be counts.
     """
-    options, text = file.options, ""
-    if _are_whole(raw[:100]):
-        explained = options.signed_bits or options.offset is not None
+    has_offset, text, start = file.options.offset is not None, "", _finite(raw[:100])
+    if (start == np.rint(start)).sum() > 0.9 * start.size:  # noqa: PLR2004 - whole numbers
+        explained = file.options.signed_bits or has_offset
         text = "" if explained else wrapped(raw)
         text = text or ("" if are_counts else lost_decimal_points(raw))
-    text = text or ("" if options.offset is not None else implausible_level(rates))
+    text = text or ("" if has_offset else implausible_level(rates))
     if text:
-        file.contradictions.append(text)
+        file.contradict(text)
 
 
 def wrapped(values: Floats, bits: Sequence[int] = (*range(12, 25), 32), compact: float = 8) -> str:
@@ -102,9 +102,3 @@ def implausible_level(rates: Floats, most_dps: float = 100.0) -> str:
 
 def _finite(values: Floats) -> Floats:
     return values[np.isfinite(values).all(axis=1)]
-
-
-def _are_whole(values: Floats) -> bool:
-    """Whether nearly all of some values (n, 3) are whole numbers."""
-    values = _finite(values)
-    return len(values) > 0 and bool((values == np.rint(values)).mean() > 0.9)  # noqa: PLR2004

@@ -28,9 +28,13 @@ class File:
         """Names of columns, for a message."""
         return ", ".join(repr(self.table.names[n] or f"column {n}") for n in numbers)
 
-    def note(self, check: str, text: str) -> None:
+    def note(self, check: str, text: str, outcome: str = KEPT) -> None:
         """Something to say, whatever comes of it."""
-        self.findings.append(Finding(check, KEPT, text))
+        self.findings.append(Finding(check, outcome, text))
+
+    def contradict(self, text: str) -> None:
+        """Something that can be read in two ways, of which only the options can say the right."""
+        self.contradictions.append(text)
 
     def refusal(self, text: str) -> InputError:
         """An error that says where, and in which file to type what it asks for."""
@@ -57,19 +61,12 @@ class File:
             InputError: There is no such column, or more than one.
         """
         names = self.table.names
-        if isinstance(column, int):
-            alike = [column] if column < len(names) else []
-        else:
-            exact = [number for number, name in enumerate(names) if name == column]
-            alike = exact or [n for n, header in enumerate(self.headers) if header.name == column]
-        if len(alike) > 1:
-            raise self.refusal(
-                f"expected one column {column!r}, got {len(alike)}, numbers {alike} (from 0): two "
-                "sensors in one file? Give numbers in place of the name"
-            )
-        if not alike:
-            raise self.refusal(
-                f"expected a column {column!r}{' (from 0)' * isinstance(column, int)}, got "
-                f"{len(names)} columns, {self.table.listed()}; correct it"
-            )
-        return alike[0]
+        alike = [number for number, name in enumerate(names) if column in (number, name)]
+        alike = alike or [n for n, header in enumerate(self.headers) if header.name == column]
+        if len(alike) == 1:
+            return alike[0]
+        raise self.refusal(
+            f"expected one column {column!r}, got {len(alike)}, numbers {alike} (from 0), in "
+            f"{len(names)} columns, {self.table.listed()}; correct it, or, of two sensors in one "
+            "file, give numbers in place of names"
+        )

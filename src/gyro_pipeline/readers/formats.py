@@ -11,8 +11,6 @@ from functools import lru_cache
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.readers.table import IN_READER, Table
 
-AUTO, GENERAL = "auto", "general"
-
 
 @dataclass(frozen=True)
 class Format:
@@ -37,23 +35,7 @@ class Format:
     acceleration_units: str = "m/s^2"
     mark: str = ""
     times: tuple[tuple[str, float], ...] = ()
-    counter: tuple[str, int] | None = None
-
-    def claims(self, table: Table) -> bool:
-        """Whether a table has all of the rates, and the mark."""
-        text = f"{table.preamble}\n{','.join(table.names)}"
-        has_rates = all(len(find_all(table, name)) == 1 for name in self.rates.split())
-        return has_rates and bool(re.search(self.mark, text, re.MULTILINE))
-
-
-def find_all(table: Table, *names: str) -> list[int]:
-    """Numbers of the columns of these names, also within a message: ``field.accel.x``."""
-    return [number for name in names for number in _named(table.names, name)]
-
-
-@lru_cache(1 << 10)  # a folder's files have the same headers
-def _named(headers: tuple[str, ...], name: str) -> list[int]:
-    return [n for n, header in enumerate(headers) if f".{header}".endswith(f".{name}")]
+    counter: tuple[str, int] = ("", 16)
 
 
 FORMATS: dict[str, Format] = {
@@ -111,32 +93,31 @@ FORMATS: dict[str, Format] = {
 """By the name that ``format`` of the options has."""
 
 
-def check_format(name: str, where: str) -> None:
-    """Check that there is a format of this name.
+def find_all(table: Table, *names: str) -> list[int]:
+    """Numbers of the columns of these names, also within a message: ``field.accel.x``."""
+    return [number for name in names for number in _named(table.names, name)]
 
-    Raises:
-        InputError: There is none; lists those that there are.
-    """
-    names = (AUTO, *FORMATS, GENERAL)
-    if name not in names:
-        raise InputError(f"{where}: expected format {', '.join(names)}, got {name!r}")
+
+@lru_cache(1 << 10)  # a folder's files have the same headers
+def _named(headers: tuple[str, ...], name: str) -> list[int]:
+    return [n for n, header in enumerate(headers) if f".{header}".endswith(f".{name}")]
 
 
 def format_of(table: Table, name: str) -> Format | None:
-    """The format that the options name, or the first that claims the table; None of others.
+    """The format that the options name; ``auto``: the first that claims the table, or None.
 
     Raises:
-        InputError: There is no format of that name, or the table lacks its columns.
+        InputError: The table lacks columns of the format that is named.
     """
-    if name == AUTO:
-        return next((form for form in FORMATS.values() if form.claims(table)), None)
-    check_format(name, f"{table.where}: format {IN_READER}")
-    if name == GENERAL:
-        return None
-    for column in FORMATS[name].rates.split():
-        if len(find_all(table, column)) != 1:
+    text = f"{table.preamble}\n{','.join(table.names)}"
+    for key, form in FORMATS.items():
+        missing = [rate for rate in form.rates.split() if len(find_all(table, rate)) != 1]
+        if key == name and missing:
             raise InputError(
-                f"{table.where}: format {name} has a column {column!r}, got {table.listed()}; "
+                f"{table.where}: format {name} has a column {missing[0]!r}, got {table.listed()}; "
                 f"correct format {IN_READER}"
             )
-    return FORMATS[name]
+        claimed = not missing and re.search(form.mark, text, re.MULTILINE)
+        if key == name or (name == "auto" and claimed):
+            return form
+    return None

@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.logs import KEPT, Finding
-from gyro_pipeline.readers.table import IN_READER, Table, columns_of
+from gyro_pipeline.readers.table import IN_READER, Table, columns_of, unreadable
 
 _CHECKSUM = re.compile(r"\*[0-9A-Fa-f]{2}\s*$")  # of NMEA 0183
 _DATE, _CLOCK = r"\d{4}[-/.]\d\d[-/.]\d\d", r"\d{1,2}:\d\d(?::\d\d)?(?:[.:]\d+|,\d{3})?"
@@ -53,17 +53,17 @@ def read_lines(where: str, data: bytes, expression: str) -> Table:
         )
     numbers = [*matches]
     texts = [pa.array([match[name] for match in matches.values()], pa.string()) for name in names]
+    columns, damage = columns_of(names, texts)
 
     def place(row: int) -> str:
         return f"row {row} (line {numbers[row]})"
 
-    columns, findings, _ = columns_of(names, texts, place, ".")
-    skipped = [number for number in filled if number not in matches]
-    if skipped:
+    findings = [*unreadable(damage, len(matches), place)]
+    if skipped := [number for number in filled if number not in matches]:
         detail = f"{len(skipped)} of {len(filled)} lines do not match `row` and were skipped, the "
         detail += f"first is line {skipped[0]}: {filled[skipped[0]][:60]!r}"
-        findings = (Finding("row", KEPT, detail), *findings)
-    return Table(where, names, columns, "\n".join(lines[: numbers[0] - 1]), findings, place)
+        findings.insert(0, Finding("row", KEPT, detail))
+    return Table(where, names, columns, "\n".join(lines[: numbers[0] - 1]), (*findings,), place)
 
 
 def advice(lines: Sequence[str]) -> str:

@@ -1,8 +1,7 @@
 """A look through a MATLAB file of version 5 before SciPy reads it.
 
-SciPy finds the kind of data by a number in the file, which it does not check, looks for as many
-elements as the class of an array has, whether they are there or not, and makes room for as many
-values as it is said to have: one damaged byte can end the process, or fill the memory (scipy 1.17).
+SciPy does not check the numbers of types in a file, nor the sizes of its arrays: one damaged byte
+can end the process, or fill the memory (scipy 1.17).
 
 Source: MathWorks, MAT-File Format, chapter 1: a header of 128 bytes, then elements of a tag, which
 has the type and the number of bytes, and of data in whole eights. An array is an element of
@@ -14,12 +13,9 @@ import struct
 import zlib
 from collections.abc import Iterator
 
-_HEADER, _ORDERS = 128, {b"IM": "<", b"MI": ">"}
-_TAG, _EIGHT, _SHORT = 8, 8, 4  # bytes of a tag; of which data fill up whole ones; that a tag holds
-_FLAGS = 8  # bytes with the class of an array, which SciPy takes for granted
 _TYPES = {*range(1, 8), 9, *range(12, 19)}
 _INT32, _UINT32, _ARRAY, _COMPRESSED = 5, 6, 14, 15
-_CLASSES, _VALUES, _SPARSE = range(1, 19), range(4, 16), 5
+_VALUES, _SPARSE = range(4, 16), 5  # classes of arrays
 _DEEPEST = 32
 
 
@@ -30,34 +26,29 @@ def check(data: bytes) -> None:
         ValueError: It is not.
         zlib.error: What is compressed in it is damaged.
     """
-    order = _ORDERS.get(data[_HEADER - 2 : _HEADER])
-    if order is None:
-        raise ValueError("its header says no byte order")
-    for kind, inner in _elements(memoryview(data)[_HEADER:], order):
-        elements = [(kind, inner)]
-        if kind == _COMPRESSED:
-            elements = list(_elements(memoryview(zlib.decompress(inner)), order))
-        for element_type, array in elements:
+    order = {b"IM": "<", b"MI": ">"}[data[126:128]]
+    for kind, inner in _elements(memoryview(data)[128:], order):
+        compressed = kind == _COMPRESSED
+        for element_type, array in (
+            _elements(memoryview(zlib.decompress(inner)), order) if compressed else [(kind, inner)]
+        ):
             if element_type == _ARRAY:
                 _check_array(array, order, 1)
 
 
 def _check_array(data: memoryview, order: str, depth: int) -> None:
+    """See that an array has a class, a size that its data can fill, and all of its elements."""
     parts = list(_elements(data, order))
-    kinds = [kind for kind, _ in parts]
-    if kinds[:1] != [_UINT32] or len(parts[0][1]) != _FLAGS or depth > _DEEPEST:
-        raise ValueError(f"an array without a class, or {depth} deep in others")
-    (flags,) = struct.unpack_from(f"{order}I", parts[0][1])
+    types = [kind for kind, _ in parts]
+    flags = struct.unpack(f"{order}II", parts[0][1])[0] if types[:1] == [_UINT32] else 0
     kind, is_complex = flags & 0xFF, flags >> 11 & 1
-    if kind not in _CLASSES:
-        raise ValueError(f"an array of class {kind}")
     needed = 4 + 2 * (kind == _SPARSE) + is_complex  # flags, size, name; two of places; values
-    if kind in _VALUES and (len(parts) < needed or {_ARRAY, _COMPRESSED} & {*kinds}):
-        raise ValueError(f"an array of class {kind} of data of types {kinds}")
-    if kinds[1:2] in ([_INT32], [_UINT32]) and kind != _SPARSE:  # SciPy takes either
-        lengths = struct.unpack(f"{order}{len(parts[1][1]) // 4}i", parts[1][1])
-        if math.prod(lengths) > len(data) or min(lengths) < 0:
-            raise ValueError(f"an array of {lengths} in {len(data)} bytes")
+    whole = kind not in _VALUES or (len(parts) >= needed and not {_ARRAY, _COMPRESSED} & {*types})
+    size = parts[1][1] if types[1:2] in ([_INT32], [_UINT32]) and kind != _SPARSE else b""
+    lengths = struct.unpack(f"{order}{len(size) // 4}i", size) or (1,)
+    fits = math.prod(lengths) <= len(data) and min(lengths) >= 0
+    if not (0 < kind < 19 and whole and fits and depth <= _DEEPEST):  # noqa: PLR2004
+        raise ValueError(f"an array of class {kind}, {lengths}, in {len(data)} bytes")
     for kind, inner in parts:
         if kind == _ARRAY and len(inner):
             _check_array(inner, order, depth + 1)
@@ -68,10 +59,10 @@ def _elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
     at = 0
     while at < len(data):
         kind, size = struct.unpack_from(f"{order}II", data, at)
-        start, length = at + _TAG, _TAG + size
-        if kind >> 16:  # a short one, in the tag itself
-            kind, size, start, length = kind & 0xFFFF, kind >> 16, at + _TAG - _SHORT, _TAG
+        start, length = at + 8, 8 + size
+        if kind >> 16:  # a short one, of four bytes at most, in the tag itself
+            kind, size, start, length = kind & 0xFFFF, kind >> 16, at + 4, 8
         if kind not in _TYPES or start + size > min(at + length, len(data)):
             raise ValueError(f"data of type {kind} and {size} bytes")
         yield kind, data[start : start + size]
-        at += length if kind == _COMPRESSED else -(-length // _EIGHT) * _EIGHT
+        at += length if kind == _COMPRESSED else -(-length // 8) * 8

@@ -8,17 +8,19 @@ from functools import cached_property, lru_cache
 from gyro_pipeline.conventions import AXES
 from gyro_pipeline.units import Unit, read_unit
 
-OTHER, RATE, ATTITUDE = "other", "rate", "attitude"
+OTHER, RATE, ATTITUDE, ACCELERATION = "other", "rate", "attitude", "acceleration"
 
 # the first line that has a word of the name decides: gyro_bias_x, yaw_rate, ax
 _QUANTITIES = [
-    (OTHER, r"[xyz]?(acc|lin|user|grav|mag|compass|quat|orient|force|torque|pos|cov|var)\w*"),
-    (OTHER, r"d[qv]|velinc|oriinc|bias|offset|std|sigma|err(or)?|min|max"),
+    (OTHER, r"d[qv]|velinc|oriinc|bias|offset|std|norm|sigma|err(or)?|min|max"),
+    (OTHER, r"[xyz]?(lin|user|free|grav|mag|compass|quat|orient|force|torque|pos|cov|var)\w*"),
+    (ACCELERATION, r"[xyz]?acc\w*"),
     (RATE, r"[xyz]?gyr\w*|gy|omega\w*|ang\w* ?vel\w*|angular|rates?"),
     (ATTITUDE, r"roll|pitch|yaw|heading|euler|phi|theta|psi|alpha|beta|gamma"),
     (ATTITUDE, r"angles?|attitude|vel\w*|speed"),
     (RATE, r"[gw] ?[xyz]"),
-    (OTHER, r"(a|ac|m|q|f|v) ?[xyz]"),
+    (ACCELERATION, r"a ?[xyz]"),
+    (OTHER, r"(ac|m|q|f|v) ?[xyz]"),
 ]
 _AXIS_WORDS = [
     {axis: axis for axis in AXES},
@@ -48,11 +50,10 @@ class Header:
 
     @cached_property
     def quantity(self) -> str:
-        """``rate``, ``attitude``, ``other``, or an empty text, by the words of the name."""
+        """``rate``, ``attitude``, ``acceleration``, ``other``, or an empty text, by the words."""
         words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", self.name.replace("ω", "omega"))
         text = " ".join(words).lower()
-        matches = (name for name, word in _QUANTITIES if re.search(rf"\b({word})\b", text))
-        return next(matches, "")
+        return next((name for name, word in _QUANTITIES if re.search(rf"\b({word})\b", text)), "")
 
     def measures(self, *quantities: str) -> bool:
         """Whether its unit is of one of these quantities."""
@@ -68,11 +69,6 @@ class Header:
     def names_duration(self) -> bool:
         """Whether it is the name of something else that is measured in seconds."""
         return bool(_DURATION.search(self.name.lower()))
-
-    @cached_property
-    def has_unit(self) -> bool:
-        """Whether it has a unit, if an unknown one, rather than a remark in brackets."""
-        return self.unit is not None or bool(re.search(r"[/^√*\d]", self.unit_text))
 
 
 @lru_cache(64)  # the files of a folder have the same header
@@ -117,15 +113,15 @@ def _stands_without_brackets(unit: Unit, text: str, alone: bool) -> bool:
     """Whether a text without brackets is a unit rather than a word or the letter of an axis."""
     if len(text) == 1 and text not in "sSgG":
         return False
-    certain = unit.quantity in ("rate", "time", "temperature")
-    return certain or (not alone and unit.quantity != "other")
+    return not alone or unit.quantity in ("rate", "time", "temperature")
 
 
 @lru_cache(64)
 def triples(headers: tuple[Header, ...]) -> list[tuple[int, ...]]:
     """Numbers of columns (x, y, z) whose names differ in nothing but the axis.
 
-    Axes are x, y, z, a browser's alpha, beta, gamma, roll, pitch, yaw, p, q, r, or [0], [1], [2].
+    Axes are x, y, z, a browser's alpha, beta, gamma, roll, pitch, yaw, p, q, r, or numbers at the
+    end: 0, 1, 2 or 1, 2, 3, where no letters are.
     """
     groups: dict[str, dict[str, list[int]]] = {}
     for number, header in enumerate(headers):
@@ -139,17 +135,15 @@ def triples(headers: tuple[Header, ...]) -> list[tuple[int, ...]]:
     ]
 
 
-@lru_cache(64)
-def numbered(headers: tuple[Header, ...]) -> list[tuple[int, ...]]:
-    """Numbers of columns without axes that end in 1, 2, 3 or 0, 1, 2: ``w0``, ``gyro 3``."""
-    with_axes = {number for triple in triples(headers) for number in triple}
-    groups: dict[str, dict[int, int]] = {}
-    for number, header in enumerate(headers):
-        match = re.fullmatch(r"(.*\D)(\d)", header.name[:_LONGEST])
-        if match and number not in with_axes:
-            groups.setdefault(match[1], {})[int(match[2])] = number
-    complete = [group for group in groups.values() if {*group} in ({0, 1, 2}, {1, 2, 3})]
-    return [tuple(group[digit] for digit in sorted(group)) for group in complete]
+def _axes_in(name: str) -> Iterator[tuple[str, str]]:
+    """Each way in which a name names an axis: the name without it, and the axis."""
+    for kind, words in enumerate(_AXIS_WORDS):
+        for match in re.finditer("|".join(words), name.lower()):
+            yield f"{name[: match.start()]}*{kind}{name[match.end() :]}", words[match[0]]
+    if number := re.search(r"(?<=\D)(\d+)\]?$", name):
+        for first in (0, 1):
+            axes = {str(first + n): axis for n, axis in enumerate(AXES)}
+            yield f"{name[: number.start()]}[{first}…]", axes.get(number[1], number[1])
 
 
 def is_quaternion(headers: tuple[Header, ...], triple: Sequence[int]) -> bool:
@@ -158,13 +152,3 @@ def is_quaternion(headers: tuple[Header, ...], triple: Sequence[int]) -> bool:
     name = first.name.lower()
     beside = {f"{name[: x.start()]}w{name[x.end() :]}" for x in re.finditer("x", name)}
     return bool(beside & names) and not first.measures("rate")
-
-
-def _axes_in(name: str) -> Iterator[tuple[str, str]]:
-    """Each way in which a name names an axis: the name without it, and the axis."""
-    for kind, words in enumerate(_AXIS_WORDS):
-        for match in re.finditer("|".join(words), name.lower()):
-            yield f"{name[: match.start()]}*{kind}{name[match.end() :]}", words[match[0]]
-    if index := INDEX.search(name):
-        number = int(index[1])
-        yield f"{name[: index.start()]}[*]", AXES[number] if number < len(AXES) else index[1]

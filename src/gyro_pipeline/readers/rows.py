@@ -13,9 +13,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from gyro_pipeline.conventions import AXES
 from gyro_pipeline.readers.file import File
-from gyro_pipeline.readers.names import OTHER, RATE, Header, triples
+from gyro_pipeline.readers.names import RATE, Header
 
 Codes = NDArray[np.intp]
 Floats = NDArray[np.float64]
@@ -26,8 +25,9 @@ MOST_VALUES = 32
 """Of a column that says what a row is of; one of more holds measurements or counts."""
 
 _DEVICE = re.compile(
-    r"(?i)(?:^|[ _.])(?:device|dev|sensor|imu|node|serial|mac|topic)"
-    r"(?:[ _]?(?:id|no|num|number|name|index|tag|addr|address))?$"
+    r"(?i)(?:^|[ _.])(?:device|dev|sensor|imu|gyro|gyroscope|board|chip|unit|module|channel|ch|"
+    r"port|slot|mux|bus|node|source|src|serial|mac|topic|id|name|addr|address|tag|instance)"
+    r"(?:[ _]?(?:id|no|nr|num|number|name|index|tag|addr|address))?$"
 )
 _NUMBER_OR_FLAG = re.compile(r"(?i)[-+.\de]*|inf|-inf|true|false|t|f|yes|no|y|n|on|off")
 
@@ -41,32 +41,31 @@ def sample_rows(file: File, rates: Floats) -> Mask:
     keep = np.ones(len(rates), bool)
     for name, value in file.options.rows.items():
         keep &= _with_value(file, file.find(name), value, len(rates))
-    checks: dict[str, Callable[[Floats], Mask]]
-    checks = {"are blank, at a regular share": blank_at_regular_shares}
+    _leave_out(file, keep, rates, blank_at_regular_shares, "are blank, at a regular share")
     if file.options.repeats:
-        checks["repeat the one before"] = repeated
-    for text, no_samples in checks.items():
-        out = no_samples(rates if keep.all() else rates[keep])
-        if out.any():
-            file.note("rows", f"{out.sum()} of {len(out)} rows {text}: no samples, left out")
-            keep[np.flatnonzero(keep)[out]] = False
+        _leave_out(file, keep, rates, repeated, "repeat the one before")
     return keep
+
+
+def _leave_out(
+    file: File, keep: Mask, rates: Floats, no_samples: Callable[[Floats], Mask], text: str
+) -> None:
+    """Leave out rows (n,) that a check of those that are kept tells to be no samples."""
+    out = no_samples(rates if keep.all() else rates[keep])
+    if out.any():
+        file.note("rows", f"{out.sum()} of {len(out)} rows {text}: no samples, left out")
+        keep[np.flatnonzero(keep)[out]] = False
 
 
 def _with_value(file: File, number: int, value: str | float, count: int) -> Mask:
     """Rows (count,) with a value in a column."""
     codes, texts = _coded(file.table.columns[number])
     same = np.asarray(texts == _as_text(value))[codes]
+    got = f"{_as_text(value)} in {file.listed([number])}, got {_counted(codes, texts)}"
     if len(same) != count or not same.any():
-        raise file.refusal(
-            f"expected {count} rows, some with {_as_text(value)} in {file.table.names[number]!r}, "
-            f"got {_counted(codes, texts)}; correct rows"
-        )
-    if Header(_as_text(value)).quantity == OTHER:
-        file.contradictions.append(
-            f"rows of the options pick {_as_text(value)} in {file.listed([number])}, by its name "
-            f"no angular rate, of {_counted(codes, texts)}; correct rows"
-        )
+        raise file.refusal(f"expected {count} rows, some with {got}; correct rows")
+    if Header(_as_text(value)).quantity not in ("", RATE):
+        file.contradict(f"rows of the options pick, by its name no angular rate, {got}")
     return same
 
 
@@ -82,18 +81,14 @@ def blank_at_regular_shares(
         alike: Share of the runs of each that are about as long as their median; where rows are lost
             at random, lengths scatter.
     """
-    none = np.zeros(len(rates), bool)
-    if np.count_nonzero(np.isnan(rates[:, 0])) < least_share * len(rates):
-        return none
-    blank = np.isnan(rates).all(axis=1)
+    blank = np.isnan(rates[:, 0])
+    blank = blank & np.isnan(rates).all(axis=1) if blank.any() else blank
     lengths = np.diff(np.flatnonzero(np.diff(blank)))
-    if blank.mean() < least_share or len(lengths) < 2 * least_runs:
-        return none
-    for runs in (lengths[0::2], lengths[1::2]):
-        median = np.median(runs)
-        if (np.abs(runs - median) <= max(1, median / 4)).mean() < alike:
-            return none
-    return np.asarray(blank)
+    regular = np.count_nonzero(blank) >= least_share * len(rates) and len(lengths) >= 2 * least_runs
+    for runs in (lengths[0::2], lengths[1::2]) if regular else ():
+        near = np.abs(runs - np.median(runs)) <= max(1, np.median(runs) / 4)
+        regular &= near.mean() >= alike
+    return blank if regular else np.zeros_like(blank)
 
 
 def repeated(rates: Floats) -> Mask:
@@ -101,91 +96,45 @@ def repeated(rates: Floats) -> Mask:
     return np.r_[False, (rates[1:] == rates[:-1]).all(axis=1)]
 
 
-def contradict_turns(file: File, used: Collection[int], keep: Mask, rates: Floats) -> None:
+def contradict_turns(file: File, used: Collection[int], keep: Mask) -> None:
     """Columns that nobody asked for, measure nothing, and say what a row is of.
 
-    Such a column has few values, and they come and go. Texts then say what a row is; so do numbers
-    of a column that is named as a device, and those with which level or noise of the rates changes.
+    Such a column has few values: texts that come and go, or those of a column that is named as a
+    device. Of devices without such a column, quality control tells by the rates that take turns.
 
     Args:
         file: Gets the contradictions.
         used: Numbers of the columns that have been asked for.
         keep: (n,), the rows that are left.
-        rates: (m, 3), of these.
     """
-    of_axes = {number for triple in triples(file.headers) for number in triple}
     for number, (header, column) in enumerate(zip(file.headers, file.table.columns, strict=True)):
-        measures = header.has_unit or header.names_time or (number in of_axes and header.quantity)
-        if number in used or (measures and column.dtype.kind == "f") or len(column) != len(keep):
+        is_text, measures = column.dtype.kind != "f", header.unit_text or header.names_time
+        says = is_text or (_DEVICE.search(header.name) and not measures)
+        if number in used or not says or len(column) != len(keep):
             continue
         cells = column[:: len(column) // 100 + 1].tolist()
         if len({cell for cell in cells if cell == cell}) > MOST_VALUES:  # noqa: PLR0124 - not NaN
             continue
         codes, texts = _coded(column[keep])
-        if evidence := _evidence(header.name, codes, texts, rates):
-            name, value = file.table.names[number] or number, _suggested(texts, np.bincount(codes))
-            file.contradictions.append(
+        if 1 < len(texts) <= MOST_VALUES and (evidence := _evidence(header.name, codes, texts)):
+            # to pick: a rate by its word, else one without a quantity
+            ranked = [text for q in (RATE, "") for text in texts if Header(text).quantity == q]
+            pick = next((text for text in ranked if text), "…")
+            file.contradict(
                 f"{file.listed([number])} takes turns among {_counted(codes, texts)}, {evidence}, "
                 "but a recording is of one device; pick its rows, such as rows: "
-                f"{{{name}: {value}}}"
+                f"{{{file.table.names[number] or number}: {pick}}}"
             )
 
 
-def _evidence(name: str, codes: Codes, texts: Texts, rates: Floats) -> str:
+def _evidence(name: str, codes: Codes, texts: Texts) -> str:
     """What tells that the value of a row, by the codes (m,), says what it is of; or nothing."""
-    if not 1 < len(texts) <= MOST_VALUES:
-        return ""
     filled, rows = texts.astype(bool), np.bincount(codes)
     runs = np.bincount(codes[np.flatnonzero(np.diff(codes, prepend=-1))])
     words = filled & [not _NUMBER_OR_FLAG.fullmatch(text) for text in texts]
     if _DEVICE.search(name) and (filled & (rows >= len(codes) / 100)).sum() > 1:
         return "by its name devices"
-    if (words & (runs > 2)).sum() > 1:  # noqa: PLR2004
-        return "which say what a row is"
-    return _change(rates, codes)
-
-
-def _suggested(texts: Texts, rows: Codes) -> str:
-    """The value to pick: of a rate by its word, else of most rows; of no other quantity."""
-    ranks = [{RATE: 2, "": 1}.get(Header(text).quantity, 0) * bool(text) for text in texts]
-    rank, _, best = max(zip(ranks, rows.tolist(), range(len(texts)), strict=True))
-    return str(texts[best]) if rank else "…"
-
-
-def _change(rates: Floats, codes: Codes, least: float = 0.3, chance: float = 1e-12) -> str:
-    """How level or noise of rates (m, 3) change with the codes (m,) of their rows, for a message.
-
-    Each run of a code is compared with both of its neighbours, which takes off drift and the slow
-    part of flicker; how these differences scatter is the rest. A change is more than ``least`` of
-    the mean size of the noise, and of a size that comes by ``chance`` in runs that are alike.
-    """
-    finite = np.isfinite(rates).all(axis=1)
-    starts = np.flatnonzero(np.diff(codes[finite], prepend=-1))
-    if len(starts) < 3:  # noqa: PLR2004
-        return ""
-    from scipy.ndimage import uniform_filter1d  # noqa: PLC0415 - SciPy starts slowly, and few
-    from scipy.special import stdtrit  # noqa: PLC0415 - files have such a column
-
-    runs, lengths = codes[finite][starts[1:-1]], np.diff(starts, append=finite.sum())[:, None]
-    level = _without_spikes(rates[finite])
-    noise = _without_spikes(np.abs(level - uniform_filter1d(level, 51, axis=0)))
-    for quantity, values in (("rate", level), ("noise", noise)):
-        means = np.add.reduceat(values, starts) / lengths
-        differences = means[1:-1] - (means[:-2] + means[2:]) / 2
-        for code in np.flatnonzero(np.bincount(runs) > 2):  # noqa: PLR2004
-            of_code = differences[runs == code]
-            sizes, errors = np.abs(of_code.mean(axis=0)), of_code.std(axis=0) / len(of_code) ** 0.5
-            limits = -stdtrit(len(of_code) - 1, chance / 2) * errors
-            excess = sizes - np.maximum(limits, least * noise.mean(axis=0))
-            if excess.max() > 0:
-                size = f"{AXES[excess.argmax()]} changes by {sizes[excess.argmax()]:.3g} deg/s"
-                return f"with which {quantity} about {size}"
-    return ""
-
-
-def _without_spikes(values: Floats) -> Floats:
-    """Values (n, 3) within their quantiles of 1 and 99 %."""
-    return np.clip(values, *np.quantile(values, [0.01, 0.99], axis=0))
+    return "which say what a row is" if (words & (runs > 2)).sum() > 1 else ""  # noqa: PLR2004
 
 
 def _coded(column: NDArray[Any]) -> tuple[Codes, Texts]:

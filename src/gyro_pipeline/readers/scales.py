@@ -5,7 +5,7 @@ factor that the file states beside them must be that unit in one of its readings
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from math import isclose
 
 from gyro_pipeline.readers.file import File
@@ -31,9 +31,6 @@ _RANGE = re.compile(r"(?i)(?:full[ _-]?scale|range)[^\d\n]*[\d.]+")
 _FACTOR = re.compile(r"(?i)[*×]\s*\d|\d\s*[*×]|(?<![a-z])x\d+(?![a-z\d])")
 _DPS_PER_RAD = 57.29577951308232
 
-Readings = Mapping[str, float]
-"""deg/s a count, by what a stated factor may be."""
-
 Statement = tuple[str, Unit]
 """Who says what the unit is, for a message, and the unit."""
 
@@ -44,28 +41,35 @@ def scale_of(file: File, rates: Sequence[int]) -> tuple[float, bool]:
     Raises:
         InputError: Nobody says the unit, or the scale of raw counts.
     """
-    names, by_options = file.listed(rates), [*_of_options(file)]
-    by_file, by_format = [*_of_headers(file, rates), *_of_lines(file)], [*_of_format(file, rates)]
-    factors = [*_stated_factors(file, rates)]
-    to_type = "".join(f"; {where}: give {_typed(readings)}" for where, readings in factors)
-    if not (by_options or by_file or by_format):
+    names, by_options, by_format = file.listed(rates), _of_options(file), _of_format(file, rates)
+    by_file = [*_of_headers(file, rates), *_of_lines(file)]
+    statements, factors = [*by_options, *by_file, *by_format], dict(_stated_factors(file, rates))
+    to_type = "".join(f"; {where}: give {_typed(dps)}" for where, dps in factors.items())
+    if not statements:
         text = f"expected a unit of the rates, got {names}; give units: {RATE_UNITS}{to_type}"
         raise file.refusal(file.contradictions[0] if file.contradictions else text)
-    if not (by_options or by_file):
+    if statements == by_format:
         file.note("unit", f"{by_format[0][0]}; the file does not say")
-    statements = [*by_options, *by_file, *by_format]
     first, unit = statements[0]
     for other, other_unit in statements:
         if not _agree(unit, other_unit):
             text = f"{first}, but {other}, of {names}"
             if not by_options:
                 raise file.refusal(f"{text}; give units and trust: options")
-            file.contradictions.append(f"{text}; correct units")
+            file.contradict(f"{text}; correct units")
     scale, are_counts = unit.factor, unit.quantity == "count"
     if are_counts and not by_options and scale == 1:
         text = f"{names} are raw counts: give units: raw and scale_dps, deg/s a count{to_type},"
         raise file.refusal(text)
-    _compare_factors(file, rates, scale, factors)
+    for where, readings in factors.items():
+        same = [reading for reading, dps in readings.items() if isclose(dps, scale, rel_tol=1e-3)]
+        if not same:
+            file.contradict(f"{where}, but the scale is {scale:g} deg/s; give {_typed(readings)}")
+        elif len(readings) > 1:
+            file.note("scale", f"{where}, which is taken for {same[0]}")
+    if file.options.scale_dps is None and all(_FACTOR.search(file.table.names[n]) for n in rates):
+        text = f"{names} name a factor, and the scale is {scale:g} deg/s"
+        file.contradict(f"{text}; give units: raw and scale_dps, deg/s a count")
     return scale, are_counts
 
 
@@ -76,41 +80,40 @@ def _agree(first: Unit, second: Unit) -> bool:
     return first.quantity == second.quantity and alike
 
 
-def _of_options(file: File) -> Iterator[Statement]:
+def _of_options(file: File) -> list[Statement]:
     units, scale_dps = file.options.units, file.options.scale_dps
     if scale_dps is not None:
-        yield f"the options say raw, of {scale_dps:g} deg/s", Unit("count", scale_dps)
-    elif units and (unit := read_unit(units)):
-        yield f"units of the options are {units}", unit
+        return [(f"the options say raw, of {scale_dps:g} deg/s", Unit("count", scale_dps))]
+    unit = read_unit(units) if units else None
+    return [(f"units of the options are {units}", unit)] if unit else []
 
 
-def _of_format(file: File, rates: Sequence[int]) -> Iterator[Statement]:
+def _of_format(file: File, rates: Sequence[int]) -> list[Statement]:
     form = file.form
-    if form and {*rates} == {*find_all(file.table, *form.rates.split())}:
-        yield f"the format has {form.units}", read_unit(form.units) or Unit("rate")
+    unit = read_unit(form.units) if form else None
+    if not (form and unit and {*rates} == {*find_all(file.table, *form.rates.split())}):
+        return []
+    return [(f"the format has {form.units}", unit)]
 
 
 def _of_headers(file: File, rates: Sequence[int]) -> Iterator[Statement]:
-    """Units in brackets and names; a unit of anything but a rate contradicts."""
+    """Units in brackets and names; what is in brackets and is no unit of a rate contradicts."""
     headers = [file.headers[number] for number in rates]
     inner = [read_header(header.name) for header in headers if header.unit_text]
     headers += [header for header in inner if header.measures("rate")]  # gx_dps (rad/s)
     expected = ("angle",) if file.options.increments else ("rate", "count")
-    others = [h for h in headers if h.has_unit and not h.measures(*expected)]
+    others = [h for h in headers if h.unit_text and not h.measures(*expected)]
     if others:
         kind = "angle turned" if file.options.increments else "angular rate"
         angles = "give increments: true if they are angles turned since the last row"
         hint = angles if others[0].measures("angle") else "give columns of angular rates"
         names = f"{file.listed(rates)} say {others[0].unit_text!r}"
-        file.contradictions.append(f"{names}, but that is no {kind}; {hint}")
-    elif headers[0].unit_text and headers[0].unit is None:
-        text = f"the remark {headers[0].unit_text!r} in the header is no unit that is known"
-        file.note("unit", text)
+        file.contradict(f"{names}, but that is no {kind}; {hint}")
     units = {h.unit: h.unit_text for h in headers if h.unit and h not in others}
     yield from ((f"the header says {text}", unit) for unit, text in units.items())
 
 
-def _of_lines(file: File) -> Iterator[Statement]:
+def _of_lines(file: File) -> list[Statement]:
     """The only unit of angular rate in lines above the header, but for that of a range in dps."""
     words = re.findall(r"[^\s,;:=()\[\]\"'#%]+", file.table.preamble)
     units: dict[Unit, str] = {}
@@ -123,12 +126,16 @@ def _of_lines(file: File) -> Iterator[Statement]:
             if unit and unit.quantity in ("rate", "count"):
                 units.setdefault(unit, text)
                 break
-    if len(units) == 1:
-        yield from ((f"lines above the header say {text}", unit) for unit, text in units.items())
+    said = [(f"lines above the header say {text}", unit) for unit, text in units.items()]
+    return said if len(said) == 1 else []
 
 
-def _stated_factors(file: File, rates: Sequence[int]) -> Iterator[tuple[str, Readings]]:
-    """Factors on the rates that lines above the header and constant columns state, and where."""
+def _stated_factors(file: File, rates: Sequence[int]) -> Iterator[tuple[str, dict[str, float]]]:
+    """Factors on the rates that lines above the header and constant columns state.
+
+    Yields:
+        Where each is, and deg/s a count by what the factor may be.
+    """
     above = [line[:200].strip() for line in file.table.preamble.splitlines()]
     texts = {f"a line above the header says {line!r}": line for line in above}
     for number, (name, column) in enumerate(zip(file.table.names, file.table.columns, strict=True)):
@@ -147,7 +154,7 @@ def _stated_factors(file: File, rates: Sequence[int]) -> Iterator[tuple[str, Rea
                     yield where, readings
 
 
-def _readings(line: str, factor: float) -> Readings:
+def _readings(line: str, factor: float) -> dict[str, float]:
     """What a factor may be, by a unit in its line; a gyroscope's count is less than 1 deg/s."""
     factor *= 1e-3 if re.search(r"(?i)mdps|m(?:illi)?(?:deg|°)", line) else 1
     in_deg = re.search(r"(?i)dps|deg|°", line)
@@ -156,26 +163,10 @@ def _readings(line: str, factor: float) -> Readings:
     readings = {f"{unit} a count": factor * size, f"counts per {unit}": size / factor}
     if not (in_deg or in_rad):
         readings["rad/s a count"] = factor * _DPS_PER_RAD
-    return {what: dps for what, dps in readings.items() if dps < 1} or readings
+    return {reading: dps for reading, dps in readings.items() if dps < 1} or readings
 
 
-def _typed(readings: Readings) -> str:
+def _typed(readings: dict[str, float]) -> str:
     """What to type for a factor."""
-    texts = (f"{dps:.6g} if it is {what}" for what, dps in readings.items())
+    texts = (f"{dps:.6g} if it is {reading}" for reading, dps in readings.items())
     return "units: raw, scale_dps: " + ", or ".join(texts)
-
-
-def _compare_factors(
-    file: File, rates: Sequence[int], scale: float, factors: Sequence[tuple[str, Readings]]
-) -> None:
-    """Factors that are stated and are not the scale; which reading of one is taken is said."""
-    for where, readings in factors:
-        same = [what for what, dps in readings.items() if isclose(dps, scale, rel_tol=1e-3)]
-        if not same:
-            text = f"{where}, but the scale is {scale:g} deg/s; give {_typed(readings)}"
-            file.contradictions.append(text)
-        elif len(readings) > 1:
-            file.note("scale", f"{where}, which is taken for {same[0]}")
-    if file.options.scale_dps is None and all(_FACTOR.search(file.table.names[n]) for n in rates):
-        text = f"{file.listed(rates)} name a factor, and the scale is {scale:g} deg/s"
-        file.contradictions.append(f"{text}; give units: raw and scale_dps, deg/s a count")

@@ -4,17 +4,15 @@ What is not known of the time is said in one finding.
 """
 
 import re
-from dataclasses import replace
 from math import isclose
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gyro_pipeline.logs import KEPT, REJECTED, Finding
+from gyro_pipeline.logs import REJECTED
 from gyro_pipeline.readers.clock import Timing, from_counter, from_stamps
 from gyro_pipeline.readers.file import File
 from gyro_pipeline.readers.formats import find_all
-from gyro_pipeline.readers.table import IN_READER
 from gyro_pipeline.readers.times import are_steps, seconds
 from gyro_pipeline.units import Unit, read_unit
 
@@ -26,8 +24,8 @@ _STATED_RATE = re.compile(
     r"(?i)\b(?:(?:sampl\w*|output|update|data)[ _-]?(?:rate|freq\w*)|odr|fs)\b"
     r"[^\w\n]{0,20}(?:hz)?[^\w\n.]{0,20}(\d+(?:\.\d+)?)[ ]{0,3}(k?)(?:hz|\s|$|[,;\"])"
 )
-_UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _TIME_SCALE = re.compile(r"(?im)^\W*t(?:ime)?[ _]?scale\W+([\d.]+(?:e[-+]?\d+)?)\s*$")
+_UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
 def timing_of(file: File, keep: Mask) -> Timing:
@@ -37,7 +35,7 @@ def timing_of(file: File, keep: Mask) -> Timing:
         InputError: The column that the options name holds no times.
     """
     problem, stepwise = "", file.options.time_is == "steps"
-    for number, unit_s, by_name in time_columns(file):
+    for number, header_s, by_name in time_columns(file):
         values = file.table.columns[number]
         times = values if values.dtype.kind == "f" else seconds(values, None)
         if times is None or len(times) != len(keep):
@@ -50,12 +48,19 @@ def timing_of(file: File, keep: Mask) -> Timing:
         if stepwise:
             times = np.cumsum(np.nan_to_num(times))  # of all rows, also of those left out
         if _increase(times[keep], 0.0 if by_name else 0.95):
-            return _measured(file, number, unit_s, times[keep], np.flatnonzero(keep))
+            unit_s = _unit_s(file, number, header_s)
+            timing = from_stamps(times[keep], unit_s, np.flatnonzero(keep))
+            file.findings += timing.findings
+            _contradict_rate(file, number, timing.rate_hz, unit_s)
+            return timing
     if file.options.time_column is not None:
         problem = problem or f"{file.options.time_column!r} holds no times that can be read"
         raise file.refusal(f"{problem}, or correct time_column")
-    problem = problem or "no column of times: rate and gaps are unseen; give time_column"
-    return Timing(findings=(Finding("timestamps", KEPT, problem),))
+    file.note(
+        "timestamps",
+        problem or "no column of times: rate and gaps are unseen; give time_column",
+    )
+    return Timing()
 
 
 def _increase(times: Floats, share: float) -> bool:
@@ -93,84 +98,69 @@ def stated_unit_s(file: File) -> float | None:
     return (read_unit(units) or Unit("time")).factor if isinstance(units, str) else units
 
 
-def _measured(
-    file: File, number: int, header_s: float | None, times: Floats, numbers: Rows
-) -> Timing:
-    """Rate and gaps by times (n,) of the rows with these numbers.
-
-    Options, header and a line above it may state the unit; what differs from it contradicts.
-    """
+def _unit_s(file: File, number: int, header_s: float | None) -> float | None:
+    """Seconds in a unit of a time column; options, header and a line above it may state it."""
     if file.table.columns[number].dtype.kind != "f":
-        return from_stamps(times, 1.0, numbers)
-    name, unit_s = file.listed([number]), stated_unit_s(file) or header_s
-    match = _TIME_SCALE.search(file.table.preamble)
-    line_s = float(match[1]) if match else 1.0
-    timing = from_stamps(times, unit_s, numbers)
+        return 1.0
+    name, match = file.listed([number]), _TIME_SCALE.search(file.table.preamble)
+    line_s = float(match[1]) if match else None
+    unit_s = stated_unit_s(file) or header_s or line_s
+    for where, stated_s in {
+        f"{name} has": header_s,
+        "a line above the header says": line_s,
+    }.items():
+        if unit_s and stated_s and not isclose(stated_s, unit_s):
+            text = f"a unit of {stated_s:g} s, but it is read in {unit_s:g} s; correct time_units"
+            file.contradict(f"{where} {text}")
     if not unit_s:
         text = f"{name} has no unit: the rate is not measured; give time_units"
-        text += f": {line_s:g}, as a line above the header says" if match else ""
         if file.options.time_column is not None:
             raise file.refusal(text)
-        return replace(timing, findings=(*timing.findings, Finding("timestamps", KEPT, text)))
-    hz = timing.rate_hz
-    stated = {f"{name} has": header_s, "a line above the header says": line_s if match else None}
-    for where, stated_s in stated.items():
-        if hz and stated_s and not isclose(stated_s, unit_s):
-            file.contradictions.append(
-                f"{where} a unit of {stated_s:g} s, which makes {hz * unit_s / stated_s:.6g} Hz, "
-                f"but it is read in {unit_s:g} s, which makes {hz:.6g} Hz; correct time_units"
-            )
-    return replace(timing, findings=(*timing.findings, *_implausible(file, name, hz, unit_s)))
+        file.note("timestamps", text)
+    return unit_s
 
 
-def _implausible(
-    file: File, name: str, hz: float | None, unit_s: float, slow: float = 0.1, fast: float = 2e4
-) -> tuple[Finding, ...]:
+def _contradict_rate(
+    file: File, number: int, hz: float | None, unit_s: float | None,
+    slow: float = 0.1, fast: float = 2e4,
+) -> None:  # fmt: skip
     """A rate at which no gyroscope is read, and the units that make an ordinary one."""
-    if hz is None or slow <= hz <= fast:
-        return ()
-    rates = {unit: hz * unit_s / s for unit, s in _UNITS_S.items() if 1 <= hz * unit_s / s < fast}
-    units = ", or ".join(f"time_units: {u}, which makes {r:.6g} Hz" for u, r in rates.items())
-    text = f"{name}, in units of {unit_s:g} s, makes {hz:.6g} Hz, at which no gyroscope is read; "
-    text += f"give {units or 'time_units'}, and trust: options {IN_READER}"
-    return (Finding("sample rate", KEPT if file.options.trust else REJECTED, text),)
+    if hz and unit_s and not slow <= hz <= fast:
+        rates = {u: hz * unit_s / s for u, s in _UNITS_S.items() if 1 <= hz * unit_s / s < fast}
+        units = [f"time_units: {unit}, which makes {rate:.6g} Hz" for unit, rate in rates.items()]
+        file.contradict(
+            f"{file.listed([number])}, in units of {unit_s:g} s, makes {hz:.6g} Hz, at which no "
+            f"gyroscope is read; give {', or '.join(units) or 'time_units'}"
+        )
 
 
-def counted(file: File, keep: Mask) -> Timing:
+def counted_gaps(file: File, keep: Mask) -> Rows:
     """Gaps by the packet counter of the options or the format; it counts the rows of the file."""
-    name, bits = file.form.counter if file.form and file.form.counter else ("", 16)
+    name, bits = file.form.counter if file.form else ("", 16)
     numbers = find_all(file.table, name) if name else []
     if file.options.counter_column is not None:
         numbers = [file.find(file.options.counter_column)]
     if not numbers or len(file.table.columns[numbers[0]]) != len(keep):
-        return Timing()
+        return np.empty(0, np.intp)
     if not keep.all():
-        text = "rows are left out, so the packet counter is not used"
-        return Timing(findings=(Finding("packet counter", KEPT, text),))
-    return from_counter(file.table.numbers(numbers[0]), file.options.counter_bits or bits)
+        file.note("packet counter", "rows are left out, so the packet counter is not used")
+        return np.empty(0, np.intp)
+    gaps = from_counter(file.table.numbers(numbers[0]), file.options.counter_bits or bits)
+    file.findings += gaps.findings
+    return gaps.gap_rows
 
 
-def compare_rates(
-    file: File, rate_hz: float | None, expected_hz: float | None, keep: Mask
-) -> tuple[Finding, ...]:
+def compare_rates(file: File, rate_hz: float | None, expected_hz: float | None, keep: Mask) -> None:
     """Rates that differ by more than the tolerance: measured, expected, stated above the header."""
-    findings, tolerance = [], file.options.rate_tolerance_pct / 100
+    tolerance = file.options.rate_tolerance_pct / 100
     if rate_hz and expected_hz and abs(rate_hz / expected_hz - 1) > tolerance:
-        text = f"expected {expected_hz:g} Hz within {100 * tolerance:g} %, got {rate_hz:.6g} Hz; "
-        powers = [n for n in (-6, -3, 3, 6) if abs(rate_hz / expected_hz / 10.0**n - 1) < tolerance]
-        text += (
-            f"it is off by 10^{powers[0]}: check time_units"
-            if powers
-            else ("check the file's time, and samples and recording_s of the sensor")
-        )
-        findings.append(Finding("sample rate", REJECTED, text))
+        got = f"{expected_hz:g} Hz within {100 * tolerance:g} %, got {rate_hz:.6g} Hz"
+        advice = "check time_units, and the sensor's rate_hz, or samples and recording_s"
+        file.note("sample rate", f"expected {got}; {advice}", REJECTED)
     # it is stated of the file's rows, not of those that are left of them
     match = _STATED_RATE.search(file.table.preamble) if keep.all() else None
     stated_hz = float(match[1]) * (1e3 if match[2] else 1) if match else None
-    hz, how = (rate_hz, "measured") if rate_hz else (expected_hz, "expected")
+    hz, source = (rate_hz, "measured") if rate_hz else (expected_hz, "expected")
     if stated_hz and hz and abs(hz / stated_hz - 1) > tolerance:
-        text = f"lines above the header state {stated_hz:g} Hz, {hz:.6g} Hz is {how}; give "
-        text += f"time_units, or, if it is right, trust: options {IN_READER}"
-        outcome = KEPT if file.options.trust else REJECTED
-        findings.append(Finding("stated rate", outcome, text))
-    return (*findings,)
+        text = f"lines above the header state {stated_hz:g} Hz, {hz:.6g} Hz is {source}"
+        file.contradict(f"{text}; give time_units")

@@ -20,18 +20,17 @@ from gyro_pipeline.readers.table import Reader, Table, column
 
 
 def read_parquet(path: Path, _: ReaderOptions) -> Table:
-    """Read columns; units are in the attributes of the fields."""
+    """Read columns."""
     import pyarrow as pa  # noqa: PLC0415
     import pyarrow.parquet as pq  # noqa: PLC0415
 
     with pq.ParquetFile(path) as file:
         table = file.read(use_threads=False)
-    names = tuple(_with_unit(field.name, field.metadata or {}) for field in table.schema)
     plain = [
         values.cast(values.type.value_type) if pa.types.is_dictionary(values.type) else values
         for values in table.columns
     ]
-    return Table(str(path), names, tuple(column(values.to_numpy()) for values in plain))
+    return Table(str(path), tuple(table.column_names), tuple(column(v.to_numpy()) for v in plain))
 
 
 def read_npy(path: Path, _: ReaderOptions) -> Table:
@@ -74,7 +73,7 @@ def read_hdf5(path: Path, _: ReaderOptions) -> Table:
 
     def add(name: str, data: Any) -> None:
         if isinstance(data, h5py.Dataset) and not name.startswith("#"):
-            arrays[_with_unit(name.replace("/", "."), data.attrs)] = np.asarray(data[()])
+            arrays[name.replace("/", ".")] = np.asarray(data[()])
 
     with h5py.File(path) as file:
         file.visititems(add)
@@ -109,7 +108,7 @@ def _of_arrays(path: Path, stored: Mapping[str, Any]) -> Table:
         rows = rows.T if len(rows) < len(rows.T) else rows
         labels = AXES if len(rows.T) == len(AXES) else map(str, range(len(rows.T)))
         for label, values in zip(labels, rows.T, strict=True):
-            columns[_inside(name, label)] = column(values)
+            columns[f"{name}.{label}".strip(".")] = column(values)
     if not any(values.dtype == np.float64 for values in columns.values()):
         shown = ", ".join(f"{a.dtype} {a.shape} {name}".rstrip() for name, a in arrays.items())
         raise InputError(
@@ -126,21 +125,4 @@ def _arrays_in(stored: Any, name: str) -> Iterator[tuple[str, NDArray[Any]]]:
     elif isinstance(stored, np.ndarray | Mapping):
         labels = stored if isinstance(stored, Mapping) else stored.dtype.names
         for label in labels:
-            yield from _arrays_in(stored[label], _inside(name, str(label)))
-
-
-def _inside(name: str, label: str) -> str:
-    stem, bracket, unit = name.partition(" [")
-    return f"{stem}.{label}{bracket}{unit}" if name else label
-
-
-def _with_unit(name: str, attributes: Mapping[Any, Any]) -> str:
-    """A name, and the unit that attributes of its column give, in brackets."""
-    texts = {_text(key).lower(): value for key, value in attributes.items()}
-    units = np.atleast_1d(texts.get("unit", texts.get("units", ""))).tolist()
-    shown = ", ".join(sorted({_text(unit) for unit in units} - {""}))
-    return f"{name} [{shown}]" if shown else name
-
-
-def _text(value: Any) -> str:
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+            yield from _arrays_in(stored[label], f"{name}.{label}".strip("."))

@@ -5,7 +5,7 @@ A file is a table, or the option ``row`` makes it one. What a file is, its first
 
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +31,7 @@ class Table:
 
     Attributes:
         where: Path of the file, for messages, and what may be wrong with its names.
-        names: The header, with units in brackets where a row or an attribute of units gives them;
+        names: The header, with units in brackets where a row of units gives them;
             an empty string for each column that it says nothing of.
         columns: Each (n,): float64, with NaN where a value is missing or cannot be read; objects,
             str or None, of a column of texts; or datetime64[ns] or timedelta64[ns]. The columns of
@@ -63,17 +63,17 @@ class Table:
         values = self.columns[column]
         if values.dtype == np.float64:
             return values
-        name = repr(self.names[column] or f"column {column}")
+        expected = f"{self.where}: expected numbers in {self.names[column] or column!r}"
         if values.dtype != object:
-            raise InputError(f"{self.where}: expected numbers in {name}, got {values.dtype}")
+            raise InputError(f"{expected}, got {values.dtype}")
         texts = {row: text for row, text in enumerate(values) if text is not None}
         # where commas are decimal, a point is what makes a text of a number
         bad = {n: text for n, text in texts.items() if not re.match(_NUMBER, text)} or texts
         row, text = next(iter(bad.items()))
         raise InputError(
-            f"{self.where}: expected numbers in {name}, without thousands separators, got "
-            f"{text[:40]!r} in {self.place(row)}, {len(bad)} of {len(values)} rows are like it; "
-            f"export the file anew, or give other columns, or `row:` {IN_READER}"
+            f"{expected}, without thousands separators, got {text[:40]!r} in {self.place(row)}, "
+            f"{len(bad)} of {len(values)} rows are like it; export the file anew, or give other "
+            f"columns, or `row:` {IN_READER}"
         )
 
 
@@ -88,19 +88,23 @@ def column(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def columns_of(
-    names: Sequence[str], texts: Sequence[Any], place: Callable[[int], str], decimal_point: str
-) -> tuple[tuple[NDArray[Any], ...], tuple[Finding, ...], set[int]]:
-    """Columns of Arrow strings or numbers; what is unreadable in those of numbers; and its rows."""
-    cells = [_of_texts(column, decimal_point) for column in texts]
-    findings = []
-    for number, (name, (values, bad)) in enumerate(zip(names, cells, strict=True)):
-        if bad:
-            first = [f"{text[:40]!r} in {place(row)}" for row, text in [*bad.items()][:3]]
-            detail = f"{len(bad)} of {len(values)} cells of {name or f'column {number}'!r} are no "
-            detail += f"numbers and are NaN: {', '.join(first)}{', …' * (len(bad) > len(first))}"
-            findings.append(Finding("unreadable cells", KEPT, detail))
-    rows = {row for _, bad in cells for row in bad}
-    return tuple(values for values, _ in cells), tuple(findings), rows
+    names: Sequence[str], texts: Sequence[Any], decimal_point: str = "."
+) -> tuple[tuple[NDArray[Any], ...], dict[int, str]]:
+    """Columns of Arrow strings or numbers; and what is no number in those of numbers, by row."""
+    columns, damage = [], dict[int, str]()
+    for number, (name, cells) in enumerate(zip(names, texts, strict=True)):
+        values, unread = _of_texts(cells, decimal_point)
+        columns.append(values)
+        damage |= {n: f"{text[:40]!r} in {name or number!r}" for n, text in unread.items()}
+    return tuple(columns), damage
+
+
+def unreadable(damage: dict[int, str], rows: int, place: Callable[[int], str]) -> Iterator[Finding]:
+    """Say which of the rows cannot be read, wholly or in a cell, if any."""
+    if damage:
+        first = "; ".join(f"{place(row)}: {text}" for row, text in sorted(damage.items())[:3])
+        detail = f"{len(damage)} of {rows} rows cannot be read and are NaN, or a cell of them: "
+        yield Finding("unreadable rows", KEPT, detail + first + ", …" * (len(damage) > 3))  # noqa: PLR2004
 
 
 def _of_texts(texts: Any, decimal_point: str = ".") -> tuple[NDArray[Any], dict[int, str]]:
@@ -134,15 +138,14 @@ def few(bad: int, rows: int, least: int = 3, share: float = 0.01) -> bool:
 Reader = Callable[[Path, ReaderOptions], Table]
 
 _ADVICE = {
-    (b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd", b"7z\xbc\xaf", b"Rar!", b"\x1f\x8b"): (
-        "an archive; unpack it"
+    **dict.fromkeys(
+        (b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd", b"7z\xbc\xaf", b"Rar!", b"\x1f\x8b"),
+        "an archive; unpack it",
     ),
-    (b"\xd0\xcf\x11\xe0",): "an Excel workbook; save it as CSV",
-    (b"<!DOCTYPE", b"<html"): "a web page; download the file itself",
-    (b"version https://git-lfs",): "a git LFS pointer; fetch the file by `git lfs pull`",
-    (b"RDX", b"RDA"): (
-        "data of R; save its table in R by `write.csv(TABLE, 'log.csv', row.names = FALSE)`"
-    ),
+    b"\xd0\xcf\x11\xe0": "an Excel workbook; save it as CSV",
+    **dict.fromkeys((b"<!DOCTYPE", b"<html"), "a web page; download the file itself"),
+    b"version https://git-lfs": "a git LFS pointer; fetch the file by `git lfs pull`",
+    b"RDX": "data of R; save its table in R by `write.csv(TABLE, 'log.csv', row.names = FALSE)`",
 }
 
 
@@ -166,10 +169,8 @@ def read_table(path: Path, options: ReaderOptions) -> Table:
     except InputError:
         raise
     except ImportError as error:
-        raise InputError(
-            f"{path}: expected the library {error.name}, which is not installed; type "
-            "pip install -e '.[logs]'"
-        ) from error
+        message = f"expected the library {error.name}, which is not installed; type"
+        raise InputError(f"{path}: {message} pip install -e '.[logs]'") from error
     except Exception as error:  # each library has its own ways to fail at damaged bytes
         raise InputError(
             f"{path}: is damaged, cut or of an unknown version ({type(error).__name__}: "

@@ -18,12 +18,11 @@ import pyarrow as pa
 import pyarrow.csv
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.logs import REPAIRED, Finding
 from gyro_pipeline.parameters import ReaderOptions
 from gyro_pipeline.readers.lines import advice, read_lines
-from gyro_pipeline.readers.table import IN_READER, Table, columns_of, few
+from gyro_pipeline.readers.table import IN_READER, Table, columns_of, few, unreadable
 
-DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab", " ": "blanks"}
+DELIMITERS = ",;\t "  # a blank: runs of them
 
 _HEAD = 1 << 14  # bytes that tell the layout
 _SAMPLE = 50  # rows of the head that tell decimal commas and columns of texts
@@ -50,14 +49,10 @@ class _Rows:
     texts: list[bool]  # whether a column is not of numbers alone in the head
 
     @cached_property  # needed only where rows are damaged
-    def numbered(self) -> list[tuple[int, bytes]]:
+    def numbered(self) -> list[tuple[int, str]]:
         """Numbers of lines from 1, and lines, without blank ones."""
         lines = enumerate(bytes(self.body).splitlines(), self.above + 1)
-        return [(number, line) for number, line in lines if line.strip()]
-
-    def line(self, row: int) -> str:
-        """The text of a row."""
-        return self.numbered[row][1].decode("utf-8", "replace")
+        return [(n, line.decode("utf-8", "replace")) for n, line in lines if line.strip()]
 
     def place(self, row: int) -> str:
         """Where a row is, for messages."""
@@ -65,16 +60,15 @@ class _Rows:
 
     def repaired(self) -> tuple[bytes, dict[int, str]]:
         """The body with empty rows for those of another number of fields, and what is wrong."""
-        width, lines, sign = len(self.names), [line for _, line in self.numbered], self.delimiter
-        fields = [line.count(sign.encode()) + 1 for line in lines]
-        if self.quoted:
-            fields = [len(_split(self.line(n), sign, strict=True)) for n in range(len(lines))]
-        odd = {row: count for row, count in enumerate(fields) if count != width}
-        for row in odd:
-            lines[row] = sign.encode() * (width - 1)
-        problem = f"expected {width} fields, got"
-        problems = {row: f"{problem} {count or 'damaged quotes'}" for row, count in odd.items()}
-        return b"\n".join(lines).decode("utf-8", "replace").encode(), problems
+        width, lines, problems = len(self.names), [line for _, line in self.numbered], {}
+        for row, line in enumerate(lines):
+            fields = line.count(self.delimiter) + 1
+            if self.quoted:
+                fields = len(_split(line, self.delimiter, strict=True))
+            if fields != width:
+                problems[row] = f"expected {width} fields, got {fields or 'damaged quotes'}"
+                lines[row] = self.delimiter * (width - 1)
+        return "\n".join(lines).encode(), problems
 
 
 def read_text(path: Path, options: ReaderOptions) -> Table:
@@ -92,10 +86,12 @@ def read_text(path: Path, options: ReaderOptions) -> Table:
     except pa.ArrowInvalid:
         body, odd = rows.repaired()
         arrays = _parsed(body, rows, None)
-    columns, findings, damaged = columns_of(rows.names, arrays, rows.place, rows.decimal_point)
-    _refuse_headers(rows, sorted(damaged | {*odd}))
-    findings += _damage(rows, odd)
-    return Table(where, rows.names, columns, rows.preamble, findings, rows.place)
+    columns, damage = columns_of(rows.names, arrays, rows.decimal_point)
+    if damage or odd:
+        damage |= odd
+        _refuse_damage(rows, damage, odd)
+    findings = unreadable(damage, len(columns[0]), rows.place)
+    return Table(where, rows.names, columns, rows.preamble, (*findings,), rows.place)
 
 
 def _parsed(body: memoryview | bytes, rows: _Rows, number: pa.DataType | None) -> list[Any]:
@@ -123,33 +119,28 @@ def _parsed(body: memoryview | bytes, rows: _Rows, number: pa.DataType | None) -
     return list(table.columns)
 
 
-def _refuse_headers(rows: _Rows, damaged: list[int]) -> None:
-    """Refuse a second header among damaged rows; a message that has delimiters in it is none."""
-    for row in damaged[:100]:
-        fields = _split(rows.line(row), rows.delimiter)
+def _refuse_damage(rows: _Rows, damage: dict[int, str], odd: dict[int, str]) -> None:
+    """Refuse a second header among damaged rows, and odd rows that are more than a few.
+
+    A message that happens to have delimiters in it is no header.
+    """
+    lines = [line for _, line in rows.numbered]
+    for row in sorted(damage)[:100]:
+        fields = _split(lines[row], rows.delimiter)
         same = len(fields) == len(rows.names) or _filled(fields) == _filled([*rows.names])
         if same and not _is_row(fields):
             raise InputError(
                 f"{rows.where}: expected numbers, got a second header in {rows.place(row)}, "
-                f"{rows.line(row)[:80]!r}: two recordings in one file? Split it"
+                f"{lines[row][:80]!r}: two recordings in one file? Split it"
             )
-
-
-def _damage(rows: _Rows, odd: dict[int, str]) -> tuple[Finding, ...]:
-    """Say that a few rows have another number of fields, or refuse more."""
-    if not odd:
-        return ()
-    count = len(rows.numbered)
-    shown = "; ".join(f"{rows.place(row)}: {problem}" for row, problem in [*odd.items()][:3])
-    if few(len(odd), count) and len(odd) < count - 1:
-        detail = f"{len(odd)} of {count} rows cannot be read and are NaN: {shown}"
-        return (Finding("unreadable rows", REPAIRED, detail),)
-    raise InputError(
-        f"{rows.where}: expected rows of {len(rows.names)} columns, separated by "
-        f"{_spelt(rows.delimiter)}, got {len(odd)} of {count} that are not: {shown}; correct or "
-        "export the file anew, or, if other lines stand between the rows, "
-        f"{advice([rows.line(row) for row in range(min(count, 200))])}"
-    )
+    if not few(len(odd), len(lines)) or len(odd) >= len(lines) - 1:
+        shown = "; ".join(f"{rows.place(row)}: {problem}" for row, problem in [*odd.items()][:3])
+        raise InputError(
+            f"{rows.where}: expected rows of {len(rows.names)} columns, separated by "
+            f"{rows.delimiter!r}, got {len(odd)} of {len(lines)} that are not: {shown}; correct "
+            "or export the file anew, or, if other lines stand between the rows, "
+            f"{advice(lines[:200])}"
+        )
 
 
 def _decoded(path: Path, encoding: str | None) -> tuple[str, bytes]:
@@ -187,15 +178,14 @@ def _rows(where: str, text: bytes, delimiter: str | None) -> _Rows:
     whole = head.splitlines(keepends=True)
     decoded = enumerate(line.decode("utf-8", "replace").strip("\r\n") for line in whole)
     numbered = {number: line for number, line in decoded if line.strip()}
-    lines = [*numbered.values()]
-    delimiters = [delimiter] if delimiter else [*DELIMITERS]
+    lines, delimiters = [*numbered.values()], delimiter or DELIMITERS
     there = [sign for sign in delimiters if sign.encode() in head]
     starts = {sign: start for sign in there if (start := _first_row(lines, sign))}
     if not starts:
         number, line = next(iter(numbered.items()), (0, ""))
         raise InputError(
             f"{where}: expected two rows or more of three numbers or more, separated by "
-            f"{' or '.join(map(_spelt, delimiters))}, got none in the "
+            f"{' or '.join(map(repr, delimiters))}, got none in the "
             f"first {len(lines)} lines; line {number + 1} begins {line[:60]!r}; {advice(lines)}"
         )
     delimiter = max(starts, key=lambda sign: (sign != " ", starts[sign][-1]))
@@ -221,10 +211,6 @@ def _rows(where: str, text: bytes, delimiter: str | None) -> _Rows:
     )
 
 
-def _spelt(delimiter: str) -> str:
-    return DELIMITERS.get(delimiter, repr(delimiter))
-
-
 def _split(line: str, delimiter: str, strict: bool = False) -> Row:
     """Fields without quotes and outer blanks; none if strict and quotes are damaged."""
     if delimiter == " ":
@@ -248,14 +234,15 @@ def _are_numbers(*fields: str) -> bool:
     return True
 
 
+def _figures(fields: Row) -> int:
+    """How many are numbers, times or dates."""
+    return sum(field[:1] in "+-.0123456789" or _are_numbers(field) for field in fields if field)
+
+
 def _is_row(fields: Row) -> bool:
     """Whether three or half of the fields are numbers, times or dates; else they are names."""
-    filled = [field for field in fields if field]
-    return sum(map(_is_figure, filled)) >= min(_LEAST, max(1, len(filled) / 2))
-
-
-def _is_figure(field: str) -> bool:
-    return field[0] in "+-.0123456789" or _are_numbers(field)
+    filled = len(fields) - fields.count("")
+    return _figures(fields) >= min(_LEAST, max(1, filled / 2))
 
 
 def _first_row(lines: list[str], delimiter: str) -> tuple[int, int, int] | None:
@@ -264,9 +251,9 @@ def _first_row(lines: list[str], delimiter: str) -> tuple[int, int, int] | None:
     for line in lines:
         may_be = delimiter in line and not line.lstrip().startswith(_NO_ROW)
         fields = _split(line, delimiter) if may_be else []
-        # words between blanks are a sentence
-        is_row = all(map(_is_figure, fields)) if delimiter == " " else _is_row(fields)
-        is_row = is_row and len(fields) >= _LEAST
+        is_row = len(fields) >= _LEAST and _is_row(fields)
+        if delimiter == " ":  # words between blanks are a sentence
+            is_row = is_row and _figures(fields) == len(fields)
         shapes.append((len(fields), sum(map(_are_numbers, fields))) if is_row else (0, 0))
         width, numbers = shapes[-1][0], max(shapes[-2][1], shapes[-1][1])
         if width == shapes[-2][0] and numbers >= _LEAST:
@@ -346,8 +333,8 @@ def _joined(upper: Row, lower: Row) -> Row:
 
 def _decimal_point(where: str, fields: Row) -> str:
     """A comma where numbers have one that cannot separate thousands."""
-    pattern = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
-    commas = [field for field in fields if "," in field and pattern.fullmatch(field)]
+    commas = [field for field in fields if "," in field]
+    commas = [field for field in commas if re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", field)]
     if commas and all(re.fullmatch(r"[+-]?[1-9]\d*,\d{3}", field) for field in commas):
         raise InputError(
             f"{where}: expected decimal points, or decimal commas, got a comma before three digits "

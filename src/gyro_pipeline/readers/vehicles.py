@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
 from gyro_pipeline.conventions import AXES, InputError
 from gyro_pipeline.logs import KEPT, Finding
 from gyro_pipeline.parameters import ReaderOptions
 from gyro_pipeline.readers.table import IN_READER, Reader, Table
 
-Columns = dict[str, NDArray]
 Stream = tuple[str, int | None]
 """A topic, and the instance of it in formats that number devices."""
 
@@ -63,31 +62,14 @@ def read_ardupilot(path: Path, options: ReaderOptions) -> Table:
         init_arrays_fast = DFReader_binary.init_arrays  # what the fast one prints cannot be caught
 
     log = Log(str(path))
-    streams: dict[Stream, Columns] = {}
-    for name, number in log.name_to_id.items():
-        if re.fullmatch(r"(IMU|GYR)\d?", name) and len(log.offsets[number]):
-            rows = _messages(log, number)
-            instances = rows.get("I", np.zeros(len(rows["GyrX"])))
-            for instance in np.unique(instances):
-                here = instances == instance
-                streams[name, int(instance)] = {key: rows[key][here] for key in rows}
+    streams: dict[Stream, list[dict[str, Any]]] = {}
+    names = [name for name in log.name_to_id if re.fullmatch(r"(IMU|GYR)\d?", name)]
+    while names and (message := log.recv_match(type=names)):
+        fields = message.to_dict()
+        streams.setdefault((message.get_type(), fields.get("I", 0)), []).append(fields)
     text = "the autopilot has taken off the bias that it measured at its start (INS_GYR…OFFS)"
-    rows = streams[_pick(path, options, streams)]
+    rows = pd.DataFrame(streams[_pick(path, options, streams)])
     return _table(path, rows, [Finding("corrected rates", KEPT, text)])
-
-
-def _messages(log: Any, number: int) -> Columns:
-    """The numeric fields of all whole messages of a type, (n,) each, by their names."""
-    message = log.formats[number]
-    codes = re.findall(r"\d*\w", message.msg_struct)
-    kinds = [f"<{code}" if code.isalpha() else f"S{code[:-1]}" for code in codes]
-    row = np.dtype(list(zip(message.columns, kinds, strict=True)))
-    starts = np.asarray(log.offsets[number], np.intp) + 3  # behind two bytes and the type's number
-    starts = starts[starts + row.itemsize <= log.data_len]
-    data = np.frombuffer(log.data_map, np.uint8)[starts[:, None] + np.arange(row.itemsize)]
-    scales = dict(zip(message.columns, message.msg_mults, strict=True))
-    rows = data.view(row)[:, 0]
-    return {key: rows[key] * (scales[key] or 1) for key in scales if row[key].kind != "S"}
 
 
 def read_ros(path: Path, options: ReaderOptions) -> Table:
@@ -123,7 +105,8 @@ READERS: dict[bytes, Reader] = {
 """By the first bytes of a file."""
 
 
-def _table(path: Path, rows: Columns, findings: list[Finding]) -> Table:
+def _table(path: Path, rows: Any, findings: list[Finding]) -> Table:
+    """The table of the fields that a mapping has, each (n,)."""
     columns = {
         name: np.asarray(rows[field], np.float64)
         for name, fields in NAMES.items()
@@ -139,21 +122,19 @@ def _pick(path: Path, options: ReaderOptions, streams: Iterable[Stream]) -> Stre
     Raises:
         InputError: There is none, or more than one; names them all.
     """
-    allowed = [
-        (topic, instance)
-        for topic, instance in streams
-        if options.topic in (None, topic) and options.instance in (None, instance)
-    ]
+    topic, instance, allowed, listed = options.topic, options.instance, [], []
+    for name, number in streams:
+        listed.append(
+            f"topic: {name}" + (f" with instance: {number}" if number is not None else "")
+        )
+        if topic in (None, name) and instance in (None, number):
+            allowed.append((name, number))
     if len(allowed) == 1:
         return allowed[0]
-    listed = ", ".join(
-        f"topic: {topic}" + ("" if instance is None else f" with instance: {instance}")
-        for topic, instance in streams
-    )
     if not listed:
         raise InputError(f"{path}: expected messages with angular rates, got none")
-    got = "" if allowed else f", got topic: {options.topic}, instance: {options.instance}"
+    got = "" if allowed else f", got topic: {topic}, instance: {instance}"
     raise InputError(
-        f"{path}: expected one device's angular rates{got}; the log has {listed}; give these "
-        f"{IN_READER}"
+        f"{path}: expected one device's angular rates{got}; the log has {', '.join(listed)}; give "
+        f"these {IN_READER}"
     )
