@@ -181,3 +181,21 @@ def test_the_key_of_a_file_changes_with_it_its_options_and_the_readers(tmp_path,
     others = [keys(sensors=slow), keys(reader={"rate_tolerance_pct": 5})]
     monkeypatch.setattr("gyro_pipeline.datasets.file_logs.code_hash", lambda _: "another")
     assert len({entry["1.csv"] for entry in (before, touched, *others, keys())}) == 5
+
+
+def test_odd_names_are_shown_escaped_and_what_is_no_file_is_rejected(
+    tmp_path, caplog, read_logs, parameters
+):
+    caplog.set_level(logging.INFO, "gyro_pipeline")
+    names = [b"1_\xff.csv", "2_ü<b>=x\n.csv".encode(), b"3_.csv"]
+    put(tmp_path, *map(os.fsdecode, names[:2]))
+    os.mkfifo(tmp_path / "3_.csv")
+    logs = file_logs(tmp_path, "{imu}_*.csv").load()
+    shown = ["1_\\udcff.csv", "2_ü<b>=x\\n.csv", "3_.csv"]
+    assert [entry.where for entry in logs.entries] == shown
+    quality = parameters("base").quality.model_copy(update={"needed_pct": 1e-3})
+    with pytest.raises(InputError, match="0 of 3 recordings") as refused:
+        read_logs(logs, quality, tmp_path)
+    told = caplog.text + str(refused.value)
+    told.encode()  # there is no half of a character in it
+    assert "3_.csv: file: expected a file, got a pipe" in told

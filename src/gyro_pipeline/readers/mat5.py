@@ -12,7 +12,7 @@ elements, the first of which are its class and its size. A compressed element ho
 import math
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 _HEADER, _ORDERS = 128, {b"IM": "<", b"MI": ">"}
 _TAG, _EIGHT, _SHORT = 8, 8, 4  # bytes of a tag; of which data fill up whole ones; that a tag holds
@@ -23,8 +23,12 @@ _CLASSES, _VALUES, _SPARSE = range(1, 19), range(4, 16), 5
 _DEEPEST = 32
 
 
-def check(data: bytes) -> None:
+def check(data: bytes, check_claim: Callable[[int], None]) -> None:
     """See that a file is made of whole elements of known types, and arrays of no more than it has.
+
+    Args:
+        data: Of the file.
+        check_claim: Raises an error where so many bytes are too many to unpack.
 
     Raises:
         ValueError: It is not.
@@ -33,10 +37,15 @@ def check(data: bytes) -> None:
     order = _ORDERS.get(data[_HEADER - 2 : _HEADER])
     if order is None:
         raise ValueError("its header says no byte order")
+    size = 0
     for kind, inner in _elements(memoryview(data)[_HEADER:], order):
         elements = [(kind, inner)]
         if kind == _COMPRESSED:
-            elements = list(_elements(memoryview(zlib.decompress(inner)), order))
+            unpacking = zlib.decompressobj()
+            size += sum(struct.unpack(f"{order}II", unpacking.decompress(inner, _TAG))[1:]) + _TAG
+            check_claim(size)
+            unpacked = zlib.decompressobj().decompress(inner, size)
+            elements = list(_elements(memoryview(unpacked), order))
         for element_type, array in elements:
             if element_type == _ARRAY:
                 _check_array(array, order, 1)
