@@ -156,3 +156,17 @@ class Recording:
     def place(self) -> tuple[int, int]:
         """IMU and recording."""
         return self.imu, self.recording
+
+
+def with_recordings(recordings: "xr.Dataset") -> "xr.Dataset":
+    """Leave out IMUs of which no recording can be used, and recordings of which no IMU's can.
+
+    Args:
+        recordings: With ``samples`` (imu, recording), how many samples each recording has.
+    """
+    there = recordings["samples"].load() > 0
+    for dimension, other in (("imu", "recording"), ("recording", "imu")):
+        used = there.any(other).to_numpy()
+        if not used.all():  # an index of single places makes reading slow
+            recordings = recordings.isel({dimension: np.flatnonzero(used)})
+    return recordings

@@ -13,7 +13,7 @@ from gyro_pipeline.quality.rest import Array, Mask
 
 def cut_zero_rows(recording: Recording) -> None:
     """Cut rows of zeros at the ends, which loggers write before the first sample."""
-    rows = runs(recording.rates.any(axis=0))
+    rows = runs(np.any(recording.rates, axis=0))
     zeros = np.ones_like(recording.masked)
     if rows.size:
         zeros[rows[0, 0] : rows[-1, 1]] = False
@@ -58,7 +58,7 @@ def mask_dropouts(recording: Recording) -> None:
         shares = (zeros.sum(axis=1) - rows + 1) / (zeros.shape[1] - rows + 1)
         chance = rows * np.log(10 * zeros.shape[1] * np.prod(shares) / rows)
         if chance < np.log(recording.quality.false_alarm):
-            dropouts = ~recording.rates.any(axis=0) & ~recording.masked
+            dropouts = ~(np.any(recording.rates, axis=0) | recording.masked)
             recording.mask("dropouts", dropouts, "zero on all axes, ")
 
 

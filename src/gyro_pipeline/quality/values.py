@@ -5,6 +5,7 @@ from statistics import NormalDist
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import AXES, MDPS
 from gyro_pipeline.logs import KEPT, REJECTED
@@ -104,7 +105,7 @@ def check_levels(recording: Recording, least: float = 3) -> None:
 
 def frequent_values(
     recording: Recording, axis: int, least: float = 1.5, most: int = 3
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, NDArray[np.integer], Array]:
     """Values, their counts, and how many times as often as their neighbours they come; 0: chance.
 
     The neighbours' counts give the one between by a cubic through their logarithms, which is exact
@@ -115,7 +116,7 @@ def frequent_values(
     # in the log's own type: of float32 this is faster
     ordered = np.sort(recording.used[axis].astype(recording.log.samples.dtype))
     if not np.any(ordered[7:] == ordered[:-7]):  # fewer never are beyond chance
-        return np.zeros(0), np.zeros(0), np.zeros(0)
+        return np.zeros(0), np.zeros(0, np.intp), np.zeros(0)
     values, counts = np.unique(ordered, return_counts=True)
     if values.size < 3:  # noqa: PLR2004 - of two values alone, nothing is a tail
         return values, counts, np.zeros(values.size)
@@ -138,8 +139,8 @@ def frequent_values(
 def check_turns(recording: Recording) -> None:
     """Rows of several levels, as of several devices: in turn, or in any order if far apart."""
     widths = np.maximum(0.4 * np.sqrt(recording.squares), recording.steps)
-    jumps = list(map(jump_apart, recording.changes, widths))
-    jumps = np.maximum(jumps, jumps_in_turn(recording))
+    apart = [jump_apart(*axis) for axis in zip(recording.changes, widths, strict=True)]
+    jumps = np.maximum(apart, jumps_in_turn(recording))
     if jumps.any():
         detail = f"axis {AXES[jumps.argmax()]} jumps by {jumps.max():.2g} deg/s from row to row; "
         detail += "several sensors in one file? Split it by device, or log a column that names the "
