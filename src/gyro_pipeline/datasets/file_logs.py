@@ -159,19 +159,18 @@ class FileLogs(LogSource):
         if "recording" not in self._regex.groupindex and "*" in self._pattern:
             following = defaultdict[int, Iterator[int]](partial(count, 1))
             recordings = [next(following[imu]) for imu in imus]
-            numbered = zip(matches, recordings, strict=True)
             self._say(
                 "recordings of each IMU are numbered in the order of the files' names: "
-                + _first([f"{name} is {number}" for name, number in numbered])
+                + _first([f"{name} is {n}" for name, n in zip(matches, recordings, strict=True)])
             )
         places = dict[tuple[int, int], str]()
-        for name, imu, recording in zip(matches, imus, recordings, strict=True):
-            other = places.setdefault((imu, recording), name)
+        for name, *place in zip(matches, imus, recordings, strict=True):
+            other = places.setdefault((place[0], place[1]), name)
             if other != name:
                 raise InputError(
                     f"{self._sensor}: {_printable(f'{other} and {name}')} are both recording "
-                    f"{recording} of IMU {imu} by the pattern {self._pattern}; remove one of them, "
-                    "or correct the pattern in the catalog"
+                    f"{place[1]} of IMU {place[0]} by the pattern {self._pattern}; remove one of "
+                    "them, or correct the pattern in the catalog"
                 )
         return places
 
