@@ -158,6 +158,11 @@ class Recording:
         return self.imu, self.recording
 
 
+def printable(text: str) -> str:
+    """A text that any terminal and file can show: bytes that are no UTF-8 and controls escaped."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
 def with_recordings(recordings: "xr.Dataset") -> "xr.Dataset":
     """Leave out IMUs of which no recording can be used, and recordings of which no IMU's can.
 

@@ -41,7 +41,7 @@ def numbers(logs):
         ("{imu}_*.csv", {"1_b2.csv": (1, 1), "1_b10.csv": (1, 2), "2_a.csv": (2, 1)}),
         ("*/log*.csv", {"1/log2.csv": (1, 1), "1/log10.csv": (1, 2), "2/log1.csv": (1, 3)}),
         ("D{imu:name}.csv", {"D2A.csv": (1, 1), "D10.csv": (2, 1), "DAF.csv": (3, 1)}),
-        ("{recording:name}/{imu}.csv", {"mo/1.csv": (1, 1), "mo/2.csv": (2, 1), "tu/2.csv": (2, 2)}),
+        ("{recording:name}/{imu}.csv", {"mo/1.csv": (1, 1), "mo/2.csv": (2, 1), "tu/2.csv": (2, 2)}),  # noqa: E501
     ],
 )  # fmt: skip
 def test_the_pattern_gives_imu_and_recording(tmp_path, pattern, expected):

@@ -16,7 +16,7 @@ from gyro_pipeline import readers
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.log_source import LogSource
 from gyro_pipeline.fingerprints import code_hash, fingerprint
-from gyro_pipeline.logs import Log, LogEntry, Logs
+from gyro_pipeline.logs import LogEntry, Logs, printable
 from gyro_pipeline.parameters import ReaderOptions
 
 _LOG = logging.getLogger(__name__)
@@ -127,8 +127,8 @@ class FileLogs(LogSource):
         state = path.stat() if path.exists() else path.lstat()  # a broken link is rejected as read
         columns_of = {"imu": imu} if self._side_by_side else {}
         return LogEntry(
-            *(imu, recording, _printable(name)),
-            read=partial(_read, path, self._options, self.entry.rate_hz, **columns_of),
+            *(imu, recording, printable(name)),
+            read=partial(readers.read_log, path, self._options, self.entry.rate_hz, **columns_of),
             size=state.st_size,
             key=fingerprint([str(path), state.st_size, state.st_mtime_ns, columns_of, settings]),
         )
@@ -168,7 +168,7 @@ class FileLogs(LogSource):
             other = places.setdefault((place[0], place[1]), name)
             if other != name:
                 raise InputError(
-                    f"{self._sensor}: {_printable(f'{other} and {name}')} are both recording "
+                    f"{self._sensor}: {printable(f'{other} and {name}')} are both recording "
                     f"{place[1]} of IMU {place[0]} by the pattern {self._pattern}; remove one of "
                     "them, or correct the pattern in the catalog"
                 )
@@ -190,19 +190,6 @@ class FileLogs(LogSource):
                 f"0; write {{{part}:name}} to have them numbered in their order"
             )
         return [int(text) for text in texts]
-
-
-def _read(path: Path, *args: Any, **options: Any) -> Log:
-    """Read a file, naming it in errors as its entry does."""
-    try:
-        return readers.read_log(path, *args, **options)
-    except InputError as error:
-        raise InputError(str(error).replace(str(path), _printable(str(path)))) from error
-
-
-def _printable(name: str) -> str:
-    """A name that any terminal and file can show: bytes that are no UTF-8 and controls escaped."""
-    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in name)
 
 
 def _files(folder: Path) -> Iterator[Path]:
@@ -232,4 +219,4 @@ def _natural(path: str) -> str:
 
 
 def _first(names: Sequence[str], most: int = 5) -> str:
-    return ", ".join(map(_printable, names[:most])) + (", …" if len(names) > most else "")
+    return ", ".join(map(printable, names[:most])) + (", …" if len(names) > most else "")
