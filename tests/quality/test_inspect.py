@@ -91,6 +91,11 @@ def blanked(x):
     return x
 
 
+def zeroed(x):
+    x[700] = 0
+    return x
+
+
 def near_zero(cut):
     return lambda x: cut(x - BIAS + [0.04, -0.02, 0.01])
 
@@ -142,6 +147,7 @@ FEW, SOME = RANDOM.random(ROWS) < 0.02, RANDOM.random(ROWS) < 0.1
         (swaying(1, 80), {"motion": REJECTED}, ["axis z"]),
         (lambda x: np.minimum(x, BIAS + 2 * SIGMA), {"saturation": REJECTED}, ["cut off at 0.8 "]),
         (blanked, {"dropouts": REPAIRED}, ["zero on all axes, row"]),
+        (near_zero(zeroed), {"dropouts": REPAIRED}, ["zero on all axes, row 700, masked"]),
         (dead(0.03), {"dead band": REJECTED}, ["axis x, ± 0.03 deg/s"]),
         (dead(0.12), {"zero rows": KEPT, "dead band": REJECTED}, ["axis x, ± 0.12 deg/s"]),
         (cut_to(0.0175), {"dead band": REJECTED}, ["axis y, counts cut to zero?"]),
