@@ -156,3 +156,22 @@ class Recording:
     def place(self) -> tuple[int, int]:
         """IMU and recording."""
         return self.imu, self.recording
+
+
+def printable(text: str) -> str:
+    """A text that any terminal and file can show: bytes that are no UTF-8 and controls escaped."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+def with_recordings(recordings: "xr.Dataset") -> "xr.Dataset":
+    """Leave out IMUs of which no recording can be used, and recordings of which no IMU's can.
+
+    Args:
+        recordings: With ``samples`` (imu, recording), how many samples each recording has.
+    """
+    there = recordings["samples"].load() > 0
+    for dimension, other in (("imu", "recording"), ("recording", "imu")):
+        used = there.any(other).to_numpy()
+        if not used.all():  # an index of single places makes reading slow
+            recordings = recordings.isel({dimension: np.flatnonzero(used)})
+    return recordings

@@ -208,6 +208,9 @@ class ReaderOptions(Parameter):
     )
     topic: str | None = Field(None, description="of a flight log or a bag, that with the rates")
     instance: int | None = Field(None, ge=0, description="of several sensors in such a log, from 0")
+    largest_mb: float = Field(
+        1000.0, gt=0, description="of the values of a binary file, unpacked, at 8 bytes each"
+    )
     rate_tolerance_pct: float = Field(
         2.0, gt=0, description="that a measured sample rate may differ from the expected one"
     )

@@ -10,7 +10,7 @@ from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.array_logs import LAYOUT, ArrayLogs
 
 SENSORS = {"memsense": {"imus": 2, "samples": 13000, "recording_s": 52}}
-TRAIN_TEST = {"train": "train.npy", "test": "test.npy"}
+TRAIN_TEST = {"test": "test.npy", "train": "train.npy"}
 
 
 def array_logs(folder, files=None, **options):
@@ -24,10 +24,11 @@ def made(recordings, gyroscopes, samples, seed=0):
 
 def check(logs, *arrays):
     """All of these recordings are read, numbered on from array to array."""
-    expected = dict[tuple[int, int], np.ndarray]()
-    for number, recording in enumerate(chain(*arrays), 1):
-        for imu in range(1, len(recording) // 3 + 1):
-            expected[imu, number] = recording[3 * imu - 3 : 3 * imu].T
+    expected = {
+        (imu, number): recording[3 * imu - 3 : 3 * imu].T
+        for number, recording in enumerate(chain(*arrays), 1)
+        for imu in range(1, len(recording) // 3 + 1)
+    }
     read = {(entry.imu, entry.recording): entry.read().samples for entry in logs.load().entries}
     assert list(read) == sorted(expected)
     for place, samples in read.items():
@@ -49,7 +50,8 @@ def test_any_axis_order_gives_the_same_recordings(tmp_path, order):
 
 
 def test_a_recording_says_where_it_is_and_can_be_read_by_another_process(tmp_path):
-    np.save(tmp_path / "all.npy", array := made(5, 6, 200))
+    array = np.asfortranarray(np.arange(5 * 6 * 200, dtype=np.int16).reshape(5, 6, 200))
+    np.save(tmp_path / "all.npy", array)
     logs = array_logs(tmp_path).load()
     told = (logs.sensor, logs.source, logs.simulated, logs.rate_hz, logs.drawn)
     assert told == ("memsense", "array", False, 250, None)
@@ -65,18 +67,16 @@ def test_a_recording_says_where_it_is_and_can_be_read_by_another_process(tmp_pat
 def test_train_and_test_are_numbered_on_and_an_imu_may_lack_recordings(tmp_path):
     train, test = made(7, 6, 200), made(2, 3, 201, seed=1)
     np.save(tmp_path / "train.npy", train)
+    assert not array_logs(tmp_path, TRAIN_TEST).exists()
+    message = refusal(array_logs(tmp_path, TRAIN_TEST))
+    assert f"memsense test.npy: no such file in {tmp_path}" in message
     np.save(tmp_path / "test.npy", test)
-    source = array_logs(tmp_path, {"test": "test.npy", "train": "train.npy"})
+    source = array_logs(tmp_path, TRAIN_TEST)
+    assert source.exists()
     check(source, train, test)
     entries = source.load().entries
     assert all(entry.split == ("test" if entry.recording > 7 else "train") for entry in entries)
     assert len({entry.key for entry in entries}) == len(entries)
-
-
-def test_integers_and_fortran_order_are_read(tmp_path):
-    array = np.asfortranarray(np.arange(5 * 3 * 60, dtype=np.int16).reshape(5, 3, 60))
-    np.save(tmp_path / "all.npy", array)
-    check(array_logs(tmp_path), array)
 
 
 def test_an_ambiguous_shape_is_settled_by_the_other_file_or_axes_order(tmp_path):
@@ -88,11 +88,8 @@ def test_an_ambiguous_shape_is_settled_by_the_other_file_or_axes_order(tmp_path)
     check(array_logs(tmp_path, {"all": "train.npy"}, axes_order=order), train.transpose(1, 0, 2))
     np.save(tmp_path / "test.npy", test := made(2, 6, 200))
     check(array_logs(tmp_path, TRAIN_TEST), train, test)
-
-
-def test_axes_order_reads_shapes_that_do_not_look_like_logs(tmp_path):
-    np.save(tmp_path / "all.npy", array := made(50, 3, 60))
-    check(array_logs(tmp_path, axes_order=LAYOUT), array)
+    np.save(tmp_path / "all.npy", unusual := made(50, 3, 60))
+    check(array_logs(tmp_path, axes_order=LAYOUT), unusual)
 
 
 @pytest.mark.parametrize(
@@ -100,7 +97,6 @@ def test_axes_order_reads_shapes_that_do_not_look_like_logs(tmp_path):
     [
         ((50, 3, 60), None, "none"),
         ((5, 3, 200), ["sample", "gyroscope", "recording"], "[recording, gyroscope, sample]"),
-        ((5, 3, 200), ["recording", "sample", "gyroscope"], "[recording, gyroscope, sample]"),
         ((5, 4, 200), LAYOUT, "none"),
     ],
 )
@@ -115,11 +111,9 @@ def test_an_order_that_the_shape_contradicts_is_refused(tmp_path, shape, order, 
 
 @pytest.mark.parametrize(
     ("shape", "dtype"),
-    [
-        *(((5, 3, 200), dtype) for dtype in ("complex64", "bool", "U3", "m8[s]", [("x", "f4")])),
-        *(((2, 600), "f8"), ((0, 3, 200), "f8")),
-    ],
-)
+    [((5, 3, 200), "complex64"), ((5, 3, 200), "U3"), ((5, 3, 200), [("x", "f4")]),
+     ((2, 600), "f8"), ((0, 3, 200), "f8")],
+)  # fmt: skip
 def test_what_is_no_array_of_rates_is_refused(tmp_path, shape, dtype):
     np.save(tmp_path / "all.npy", np.zeros(shape, dtype))
     assert refusal(array_logs(tmp_path)) == (
@@ -128,41 +122,21 @@ def test_what_is_no_array_of_rates_is_refused(tmp_path, shape, dtype):
     )
 
 
-def test_a_missing_file_is_refused_by_name(tmp_path):
-    logs = array_logs(tmp_path, TRAIN_TEST)
-    np.save(tmp_path / "train.npy", made(5, 6, 200))
-    assert not logs.exists()
-    assert f"memsense test.npy: no such file in {tmp_path}" in refusal(logs)
-    np.save(tmp_path / "test.npy", made(2, 3, 200))
-    assert logs.exists()
-
-
-def test_pickles_are_refused_without_being_loaded(tmp_path):
-    (tmp_path / "all.npy").write_bytes(f"cos\nmkdir\n(V{tmp_path / 'sprung'}\ntR.".encode())
-    assert "pickled objects, which are never loaded" in refusal(array_logs(tmp_path))
-    assert not (tmp_path / "sprung").exists()
-    pickle.loads((tmp_path / "all.npy").read_bytes())
-    assert (tmp_path / "sprung").exists()
-
-
-DAMAGED = {
-    "empty": lambda whole: b"",
-    "truncated header": lambda whole: whole[:40],
-    "truncated samples": lambda whole: whole[:-1],
-    "text": lambda whole: b"time,w_x,w_y,w_z\n" * 10,
-    "negative shape": lambda whole: whole.replace(b"(5, 3, 200)", b"(5,3,-200)"),
-    "unbalanced header": lambda whole: whole.replace(b"(5, 3, 200)", b"(5, 3, 200}"),
-}
-
-
-@pytest.mark.parametrize("damage", DAMAGED.values(), ids=DAMAGED)
-def test_damaged_files_are_refused_by_name(tmp_path, damage):
+def test_damaged_files_and_pickles_are_refused_by_name_and_nothing_is_unpickled(tmp_path):
     file = tmp_path / "all.npy"
     np.save(file, made(5, 3, 200))
-    file.write_bytes(damage(file.read_bytes()))
-    message = refusal(array_logs(tmp_path))
-    assert message.startswith("memsense all.npy: expected a plain numeric .npy file")
-    assert message.endswith(f"replace or delete {file}")
+    whole, shape = file.read_bytes(), b"(5, 3, 200)"
+    trap = f"cos\nmkdir\n(V{tmp_path / 'sprung'}\ntR.".encode()
+    damaged = [b"", whole[:40], whole[:-1], b"time,w_x,w_y,w_z\n" * 10, trap]
+    damaged += [whole.replace(shape, b"(5,3,-200)"), whole.replace(shape, b"(5, 3, 200}")]
+    for content in damaged:
+        file.write_bytes(content)
+        message = refusal(array_logs(tmp_path))
+        assert message.startswith("memsense all.npy: expected a plain numeric .npy file")
+        assert message.endswith(
+            f"pickled objects, which are never loaded; replace or delete {file}"
+        )
+    assert not (tmp_path / "sprung").exists()
 
 
 @pytest.mark.parametrize(
@@ -170,7 +144,6 @@ def test_damaged_files_are_refused_by_name(tmp_path, damage):
     [
         ({"sensor": "memsens"}, "unknown sensor 'memsens'; conf/base/globals.yml knows memsense"),
         ({"sensors": {"memsense": SENSORS["memsense"] | {"imus": 0}}}, "imus"),
-        ({"sensors": {"memsense": SENSORS["memsense"] | {"imu": 1}}}, "imu"),
         ({"files": {"train": "a.npy"}}, "expected a train and a test file"),
         ({"files": {"train": "a.npy", "test": "a.npy"}}, "which are not the same one"),
         ({"axes_order": ["recording", "sample"]}, "expected recording, gyroscope, sample"),

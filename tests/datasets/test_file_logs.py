@@ -30,31 +30,20 @@ def numbers(logs):
     return {entry.where: (entry.imu, entry.recording) for entry in logs.load().entries}
 
 
-def refusal(logs):
-    with pytest.raises(DatasetError) as caught:
-        logs.load()
-    assert isinstance(caught.value.__cause__, InputError)
-    return str(caught.value.__cause__)
-
-
 @pytest.mark.parametrize(
     ("pattern", "expected"),
     [
         ("{imu}/{recording}.csv", {"1/2.csv": (1, 2), "1/10.csv": (1, 10), "3/2.csv": (3, 2)}),
         ("dot_{imu}.csv", {"dot_4.csv": (4, 1), "dot_05.csv": (5, 1)}),
-        ("run{recording}.csv", {"run7.csv": (1, 7)}),
         ("only.csv", {"only.csv": (1, 1)}),
         ("{imu:name}.csv", {"1.csv": (1, 1), "1²2.csv": (2, 1)}),
         # in the order of their names, 2 before 10
         ("{imu}_*.csv", {"1_b2.csv": (1, 1), "1_b10.csv": (1, 2), "2_a.csv": (2, 1)}),
         ("*/log*.csv", {"1/log2.csv": (1, 1), "1/log10.csv": (1, 2), "2/log1.csv": (1, 3)}),
         ("D{imu:name}.csv", {"D2A.csv": (1, 1), "D10.csv": (2, 1), "DAF.csv": (3, 1)}),
-        (
-            "{recording:name}/{imu}.csv",
-            {"mo/1.csv": (1, 1), "mo/2.csv": (2, 1), "tu/2.csv": (2, 2)},
-        ),
+        ("{recording:name}/{imu}.csv", {"mo/1.csv": (1, 1), "mo/2.csv": (2, 1), "tu/2.csv": (2, 2)}),  # noqa: E501
     ],
-)
+)  # fmt: skip
 def test_the_pattern_gives_imu_and_recording(tmp_path, pattern, expected):
     put(tmp_path, *expected, ".hidden_1.csv", "~$1.csv", "notes.txt")
     assert numbers(file_logs(tmp_path, pattern)) == expected
@@ -69,6 +58,24 @@ def test_files_behind_links_count_and_circles_end(tmp_path):
     assert numbers(logs) == {"1/1.csv": (1, 1), "1/2.csv": (1, 2), "2/1.csv": (2, 1)}
     with pytest.raises(InputError, match=r"1/2.csv: cannot be read: No such file"):
         logs.load().entries[1].read()
+
+
+def test_odd_names_are_shown_escaped_and_what_is_no_file_is_rejected(
+    tmp_path, caplog, read_logs, parameters
+):
+    caplog.set_level(logging.INFO, "gyro_pipeline")
+    names = [b"1_\xff.csv", "2_ü<b>=x\n.csv".encode(), b"3_.csv"]
+    put(tmp_path, *map(os.fsdecode, names[:2]))
+    os.mkfifo(tmp_path / "3_.csv")
+    logs = file_logs(tmp_path, "{imu}_*.csv").load()
+    shown = ["1_\\udcff.csv", "2_ü<b>=x\\n.csv", "3_.csv"]
+    assert [entry.where for entry in logs.entries] == shown
+    quality = parameters("base").quality
+    with pytest.raises(InputError, match="0 of 3 recordings") as refused:
+        read_logs(logs, quality, tmp_path)
+    told = caplog.text + str(refused.value)
+    told.encode()  # there is no half of a character in it
+    assert "3_.csv: file: expected a file, got a pipe" in told
 
 
 def test_entries_are_in_the_order_of_imu_and_recording_and_read_their_own_file(tmp_path):
@@ -124,25 +131,22 @@ def test_what_the_names_became_is_said_once(tmp_path, caplog, pattern, messages)
     [
         (["a.csv"], "dot_{imu}.csv", ["files like dot_{imu}.csv, got a.csv;", "pattern"]),
         ([f"{n}.txt" for n in range(9)], "{imu}.csv", ["got 0.txt, 1.txt, 2.txt, 3.txt, 4.txt, …"]),
-        ([], "{imu}.csv", ["got none"]),
         (["1.csv", "01.csv"], "{imu}.csv", ["01.csv and 1.csv", "recording 1 of IMU 1", "remove"]),
         (["1/2_a.csv", "1/2_b.csv"], "{imu}/{recording}_*.csv", ["1/2_a.csv and 1/2_b.csv"]),
         (["0.csv", "1.csv"], "{imu}.csv", ["numbers from 1 for {imu}", "{imu:name}"]),
         (["9" * 30 + ".csv"], "{imu}.csv", ["expected files like {imu}.csv"]),
+        (None, "{imu}.csv", ["nowhere: no such folder; put the files there"]),
     ],
 )
 def test_files_that_cannot_be_told_apart_are_refused(tmp_path, names, pattern, words):
-    put(tmp_path, *names)
-    message = refusal(file_logs(tmp_path, pattern))
-    assert message.startswith("dot")
-    for word in words:
-        assert word in message
-
-
-def test_a_missing_folder_is_refused(tmp_path):
-    logs = file_logs(tmp_path / "nowhere", "{imu}.csv")
-    assert not logs.exists()
-    assert f"dot {tmp_path / 'nowhere'}: no such folder; put the files there" in refusal(logs)
+    put(tmp_path, *(names or []))
+    logs = file_logs(tmp_path if names else tmp_path / "nowhere", pattern)
+    assert logs.exists() == bool(names)
+    with pytest.raises(DatasetError) as caught:
+        logs.load()
+    assert isinstance(caught.value.__cause__, InputError)
+    for word in ["dot", *words]:
+        assert word in str(caught.value.__cause__)
 
 
 PATTERNS = [

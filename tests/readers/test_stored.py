@@ -146,6 +146,6 @@ def test_compressed_data_of_r_are_told_by_their_name(table):
 def test_a_workspace_of_matlab_is_not_shown(monkeypatch, table):
     loaded = {"__header__": b"", "__function_workspace__": np.ones((9, 3)), "a": np.ones(1)}
     monkeypatch.setattr(scipy.io, "loadmat", lambda *args, **options: loaded)
-    monkeypatch.setattr(mat5, "check", lambda data: None)
+    monkeypatch.setattr(mat5, "check", lambda *_: None)
     with pytest.raises(InputError, match=r"got float64 \(1,\) a;"):
         table(lambda path: path.write_bytes(b"MATLAB 5.0 MAT-file"))

@@ -20,7 +20,6 @@ LAYOUT = ("recording", "gyroscope", "sample")
 _WHOLE = "all"
 """The key of a file whose recordings are not split into train and test."""
 
-
 Order = tuple[str, ...]
 Shape = tuple[int, ...]
 
@@ -75,19 +74,16 @@ class ArrayLogs(LogSource):
             InputError: As the cause of Kedro's ``DatasetError``, a file that cannot be used.
         """
         shapes = {name: self._open(name).shape for name in self._files.values()}
-        order = self._order(shapes)
-        entries, first = list[LogEntry](), 1
+        order, entries, first = self._order(shapes), list[LogEntry](), 1
         for split, name in self._files.items():
-            count = dict(zip(order, shapes[name], strict=True))
+            path, count = self._path / name, dict(zip(order, shapes[name], strict=True))
             imus, recordings = count["gyroscope"] // len(AXES), count["recording"]
-            state = (self._path / name).stat()
-            file = [str(self._path / name), state.st_size, state.st_mtime_ns, order]
+            state = path.stat()
+            file = [str(path), state.st_size, state.st_mtime_ns, order]
             entries += [
                 LogEntry(
-                    imu + 1,
-                    first + recording,
-                    f"{name} recording {recording + 1}",
-                    partial(_read, self._path / name, order, imu, recording),
+                    *(imu + 1, first + recording, f"{name} recording {recording + 1}"),
+                    partial(_read, path, order, imu, recording),
                     size=state.st_size // (imus * recordings),
                     key=fingerprint([*file, imu, recording]),
                     split=None if split == _WHOLE else split,
@@ -129,9 +125,12 @@ class ArrayLogs(LogSource):
 
     def _order(self, shapes: Mapping[str, Shape]) -> Order:
         """Tell which axis is which, by the shapes where they allow only one answer."""
-        given, plausible = self._axes_order, list(permutations(LAYOUT))
-        for shape in shapes.values():
-            plausible = [order for order in plausible if _is_plausible(order, shape)]
+        given = self._axes_order
+        plausible = [
+            order
+            for order in permutations(LAYOUT)
+            if all(_is_plausible(order, shape) for shape in shapes.values())
+        ]
         if len(plausible) == 1 and given in (None, plausible[0]):
             return plausible[0]
         if given and len(plausible) != 1 and all(_in_threes(given, s) for s in shapes.values()):

@@ -6,20 +6,23 @@ Why requests and tenacity: docs/decisions/0010-download-of-the-published-files.m
 import hashlib
 import logging
 import os
+import time
 from functools import partial
+from io import FileIO
 from pathlib import Path
 
 import requests
 from filelock import FileLock
-from requests.exceptions import ChunkedEncodingError, ConnectionError, Timeout
+from requests.exceptions import ConnectionError, Timeout
 from tenacity import (
-    RetryCallState,
+    before_sleep_log,
     retry,
-    retry_if_exception_type,
+    retry_if_exception,
     stop_after_attempt,
     wait_exponential,
 )
 from tqdm import tqdm
+from urllib3.exceptions import HTTPError
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.atomic import in_the_way
@@ -27,16 +30,13 @@ from gyro_pipeline.datasets.atomic import in_the_way
 _LOG = logging.getLogger(__name__)
 
 _TIMEOUT_S = 30
-"""The longest silence of a server."""
-
+"""The longest silence of a server, and how long it may be slower than the least speed."""
+_LEAST_SPEED = 1e4
+"""Bytes a second, on average since the answer began."""
+_LARGEST = 10**9
+"""Bytes of a file; the published ones have up to 10^8."""
 _PIECE = 1 << 16
-"""Bytes that are written, and shown as progress, at a time; an interruption loses fewer."""
-
-_OK, _PART, _NO_SUCH_PART, _TOO_MANY_REQUESTS, _SERVER_ERRORS = 200, 206, 416, 429, 500
-
-
-class _Passing(requests.RequestException):
-    """An answer of a server that may be another one a moment later."""
+"""Bytes that are read at a time, at most; what was read is kept after an interruption."""
 
 
 def ensure(url: str, path: Path, blob: str) -> None:
@@ -56,11 +56,14 @@ def ensure(url: str, path: Path, blob: str) -> None:
     if not path.exists():
         try:
             _fetch(url, path, blob)
-        except requests.RequestException as error:  # also an OSError
+        except (requests.RequestException, HTTPError) as error:  # the first is an OSError as well
             raise InputError(_no_answer(url, path, error)) from error
         except OSError as error:
             raise InputError(in_the_way(path, error)) from error
-    found = _blob_id_of(path)
+    try:
+        found = blob_id(path)
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}; move it away") from error
     if found != blob:
         raise InputError(
             f"{path} is not the published file: expected git blob id {blob}, got {found}. It is "
@@ -81,11 +84,9 @@ def blob_id(path: Path) -> str:
         return hashlib.file_digest(file, start).hexdigest()
 
 
-def _blob_id_of(path: Path) -> str:
-    try:
-        return blob_id(path)
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}; move it away") from error
+def _part_of(path: Path) -> Path:
+    """Where a file is until it is whole."""
+    return path.with_name(f".{path.name}.part")
 
 
 def _fetch(url: str, path: Path, blob: str) -> None:
@@ -96,9 +97,8 @@ def _fetch(url: str, path: Path, blob: str) -> None:
         if path.exists():  # another process was first
             return
         _append_rest(url, part)
-        found = blob_id(part)
+        found, size = blob_id(part), part.stat().st_size
         if found != blob:
-            size = part.stat().st_size
             part.unlink()
             raise InputError(
                 f"{url}: expected the file of git blob id {blob}, got {found}, {size} bytes; "
@@ -108,28 +108,19 @@ def _fetch(url: str, path: Path, blob: str) -> None:
         os.replace(part, path)
 
 
-def _part_of(path: Path) -> Path:
-    """Where a file is until it is whole."""
-    return path.with_name(f".{path.name}.part")
-
-
-def _say(state: RetryCallState) -> None:
-    error = state.outcome.exception() if state.outcome else None
-    wait_s = state.next_action.sleep if state.next_action else 0
-    _LOG.warning("%s; trying again in %.0f s", _reason(error), wait_s)
-
-
-def _reason(error: BaseException | None) -> object:
-    """What went wrong, without the address and the count of tries that urllib3 wraps it in."""
-    inner = error.args[0] if error is not None and error.args else error
-    return getattr(inner, "reason", error)
+def _may_pass(error: BaseException) -> bool:
+    """Whether another try may help."""
+    answer = getattr(error, "response", None)
+    if answer is not None:
+        return bool(answer.status_code in {416, 429} or answer.status_code >= 500)  # noqa: PLR2004
+    return isinstance(error, ConnectionError | Timeout | HTTPError)
 
 
 @retry(
-    retry=retry_if_exception_type((ConnectionError, Timeout, ChunkedEncodingError, _Passing)),
+    retry=retry_if_exception(_may_pass),
     stop=stop_after_attempt(5),
     wait=wait_exponential(max=30),
-    before_sleep=_say,
+    before_sleep=before_sleep_log(_LOG, logging.WARNING),
     reraise=True,
 )
 def _append_rest(url: str, part: Path) -> None:
@@ -143,42 +134,35 @@ def _append_rest(url: str, part: Path) -> None:
     # compressed, the bytes of a part would not be those of the file
     headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={have}-"} if have else {})
     with requests.get(url, headers=headers, stream=True, timeout=_TIMEOUT_S) as answer:
-        _check_status(answer, part)
-        have = have if answer.status_code == _PART else 0
-        rest = answer.headers.get("Content-Length")
+        if answer.status_code == 416:  # noqa: PLR2004 - it is no longer than what is there
+            part.unlink()
+        answer.raise_for_status()
+        have = have if answer.status_code == 206 else 0  # noqa: PLR2004 - a part
         _LOG.info("fetching %s%s", url, f", from byte {have} on" if have else "")
-        with (
-            part.open("ab" if have else "wb") as file,
-            tqdm(
-                desc=part.stem.removeprefix("."),
-                initial=have,
-                total=None if rest is None else have + int(rest),
-                unit="B",
-                unit_scale=True,
-                disable=None,  # shown on a terminal only
-            ) as bar,
-        ):
-            for piece in answer.iter_content(_PIECE):
-                bar.update(file.write(piece))
+        with part.open("ab" if have else "wb", buffering=0) as file:
+            _write_body(answer, file, have)
 
 
-def _check_status(answer: requests.Response, part: Path) -> None:
-    code = answer.status_code
-    if code in (_OK, _PART):
-        return
-    said = f"the server answered {code} {answer.reason}"
-    if code == _NO_SUCH_PART:  # as long as the file or longer, so not the beginning of it
-        part.unlink()
-    if code in (_NO_SUCH_PART, _TOO_MANY_REQUESTS) or code >= _SERVER_ERRORS:
-        raise _Passing(said)
-    raise requests.HTTPError(said)
+def _write_body(answer: requests.Response, file: FileIO, have: int) -> None:
+    """Write an answer as it comes, whatever its size is said to be."""
+    rest, begun, size = answer.headers.get("Content-Length"), time.monotonic(), 0
+    total = None if rest is None else have + int(rest)
+    with tqdm(initial=have, total=total, unit="B", unit_scale=True, disable=None) as bar:
+        while piece := answer.raw.read1(_PIECE):  # what has come, however little
+            size += file.write(piece)
+            bar.update(len(piece))
+            if have + size > _LARGEST:
+                file.truncate(0)
+                raise requests.RequestException(f"more than {_LARGEST / 1e6:g} MB came")
+            if time.monotonic() - begun > _TIMEOUT_S + size / _LEAST_SPEED:
+                raise Timeout(f"fewer than {_LEAST_SPEED / 1e3:g} kB a second came")
 
 
-def _no_answer(url: str, path: Path, error: requests.RequestException) -> str:
-    part = _part_of(path)
+def _no_answer(url: str, path: Path, error: Exception) -> str:
+    part, reason = _part_of(path), error.args[0] if error.args else error  # urllib3's own in it
     kept = part.stat().st_size if part.exists() else 0
     return (
-        f"cannot fetch {path.name} from {url}: {_reason(error)}. "
+        f"cannot fetch {path.name} from {url}: {getattr(reason, 'reason', reason)}. "
         + (f"{kept} bytes are kept, and the next run goes on from there. " if kept else "")
         + "Check the network and published_address (conf/base/globals.yml), or put the file at "
         f"{path} by hand: it is then verified and not fetched"

@@ -3,19 +3,20 @@
 import logging
 import os
 import re
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 from pydantic import ValidationError
 
 from gyro_pipeline import readers
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.log_source import LogSource
 from gyro_pipeline.fingerprints import code_hash, fingerprint
-from gyro_pipeline.logs import LogEntry, Logs
+from gyro_pipeline.logs import LogEntry, Logs, printable
 from gyro_pipeline.parameters import ReaderOptions
 
 _LOG = logging.getLogger(__name__)
@@ -91,15 +92,12 @@ class FileLogs(LogSource):
             InputError: As the cause of Kedro's ``DatasetError``, no such folder, no file that
                 matches, or two files of one recording.
         """
-        table = self._numbered(self._matching())
-        settings = [
-            self._options.model_dump(mode="json"),
-            self.entry.rate_hz,
-            code_hash("gyro_pipeline.readers"),
-        ]
+        rate_hz, reader = self.entry.rate_hz, code_hash("gyro_pipeline.readers")
+        settings = [self._options.model_dump(mode="json"), rate_hz, reader]
+        places = self._places(self._matching())
         entries = [
             self._entry(name, imu, recording, settings)
-            for name, own, recording in table.itertuples(name=None)
+            for (own, recording), name in places.items()
             for imu in self._side_by_side or [own]
         ]
         imus = len({entry.imu for entry in entries})
@@ -107,7 +105,7 @@ class FileLogs(LogSource):
             stated = f"globals.yml says imus: {self.entry.imus}"
             self._say(f"files of {imus} IMUs, where {stated}", logging.WARNING)
         entries.sort(key=lambda entry: (entry.imu, entry.recording))
-        return Logs(self._sensor, self._source, False, self.entry.rate_hz, entries)
+        return Logs(self._sensor, self._source, False, rate_hz, entries)
 
     def _exists(self) -> bool:
         return self._path.is_dir()
@@ -128,7 +126,7 @@ class FileLogs(LogSource):
         state = path.stat() if path.exists() else path.lstat()  # a broken link is rejected as read
         columns_of = {"imu": imu} if self._side_by_side else {}
         return LogEntry(
-            *(imu, recording, name),
+            *(imu, recording, printable(name)),
             read=partial(readers.read_log, path, self._options, self.entry.rate_hz, **columns_of),
             size=state.st_size,
             key=fingerprint([str(path), state.st_size, state.st_mtime_ns, columns_of, settings]),
@@ -154,27 +152,31 @@ class FileLogs(LogSource):
             self._say(f"{len(others)} files are not like {self._pattern}: {_first(others)}")
         return matches
 
-    def _numbered(self, matches: Matches) -> pd.DataFrame:
-        """Columns ``imu`` and ``recording``, by the files' paths."""
-        parts = {part: self._numbers(part, matches) for part in self._regex.groupindex}
-        table = pd.DataFrame({"imu": 1, "recording": 1} | parts, index=list(matches))
-        if "recording" not in parts and "*" in self._pattern:
-            table["recording"] += table.groupby("imu").cumcount()
+    def _places(self, matches: Matches) -> dict[tuple[int, int], str]:
+        """The file of each IMU and recording."""
+        imus, recordings = (self._numbers(part, matches) for part in ("imu", "recording"))
+        if "recording" not in self._regex.groupindex and "*" in self._pattern:
+            following = defaultdict[int, Iterator[int]](partial(count, 1))
+            recordings = [next(following[imu]) for imu in imus]
             self._say(
                 "recordings of each IMU are numbered in the order of the files' names: "
-                + _first([f"{name} is {number}" for name, number in table.recording.items()])
+                + _first([f"{name} is {n}" for name, n in zip(matches, recordings, strict=True)])
             )
-        alike = table[table.duplicated(keep=False)].sort_values(["imu", "recording"])
-        if len(alike):
-            raise InputError(
-                f"{self._sensor}: {alike.index[0]} and {alike.index[1]} are both recording "
-                f"{alike.recording.iloc[0]} of IMU {alike.imu.iloc[0]} by the pattern "
-                f"{self._pattern}; remove one of them, or correct the pattern in the catalog"
-            )
-        return table
+        places = dict[tuple[int, int], str]()
+        for name, *place in zip(matches, imus, recordings, strict=True):
+            other = places.setdefault((place[0], place[1]), name)
+            if other != name:
+                raise InputError(
+                    f"{self._sensor}: {printable(f'{other} and {name}')} are both recording "
+                    f"{place[1]} of IMU {place[0]} by the pattern {self._pattern}; remove one of "
+                    "them, or correct the pattern in the catalog"
+                )
+        return places
 
     def _numbers(self, part: str, matches: Matches) -> list[int]:
-        """The number that one part of each path says, or that its name gets."""
+        """The number that one part of each path says, or that its name gets; 1 without the part."""
+        if part not in self._regex.groupindex:
+            return [1] * len(matches)
         texts = [match[part] for match in matches.values()]  # of numbers without leading zeros
         if f"{{{part}:name}}" in self._pattern:
             numbers = {text: number for number, text in enumerate(dict.fromkeys(texts), 1)}
@@ -215,5 +217,5 @@ def _natural(path: str) -> str:
     return re.sub(r"\d+", lambda number: number[0].zfill(18), path)
 
 
-def _first(names: Sequence[str], count: int = 5) -> str:
-    return ", ".join(names[:count]) + (", …" if len(names) > count else "")
+def _first(names: Sequence[str], most: int = 5) -> str:
+    return ", ".join(map(printable, names[:most])) + (", …" if len(names) > most else "")

@@ -10,7 +10,6 @@ from pydantic import Field, ValidationError
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.array_logs import ArrayLogs
 from gyro_pipeline.datasets.download import ensure
-from gyro_pipeline.datasets.log_source import LogSource
 from gyro_pipeline.logs import Logs
 from gyro_pipeline.parameters import Parameter
 
@@ -24,22 +23,16 @@ class PublishedFile(Parameter):
     remote: str = Field(min_length=1, description="its path below the base address")
     blob: str = Field(pattern="^[0-9a-f]{40}$", description="git blob id of its content")
 
-    @property
-    def name(self) -> str:
-        """Its name in the local folder."""
-        return PurePosixPath(self.remote).name
 
-
-class PublishedLogs(LogSource):
+class PublishedLogs(ArrayLogs):
     """Array files that are fetched once, verified at every load, and read as any such files.
 
     Args:
-        sensor, sensors, source, metadata: As :class:`~.log_source.LogSource` takes them.
+        sensor, sensors, source, axes_order, metadata: As :class:`~.array_logs.ArrayLogs` has them.
         address: Base address, to which the files' paths are relative.
         path: Local folder of the files. Those already there are verified, not fetched.
         files: ``remote`` (path below the address) and ``blob`` (git blob id) of each:
             ``{"train": …, "test": …}``, or ``{"all": …}``.
-        axes_order: As :class:`~.array_logs.ArrayLogs` takes it.
 
     Raises:
         InputError: An unknown sensor, or an entry that is not as described here.
@@ -56,34 +49,26 @@ class PublishedLogs(LogSource):
         axes_order: Sequence[str] | None = None,
         metadata: dict[str, Any] | None = None,
     ) -> None:
-        super().__init__(sensor, sensors, source, path, metadata)
-        self._files = {split: _published(sensor, split, files[split]) for split in files}
-        names = {split: file.name for split, file in self._files.items()}
-        self._arrays = ArrayLogs(sensor, sensors, source, path, names, axes_order)
+        self._published = {split: _published(sensor, split, files[split]) for split in files}
+        names = {split: PurePosixPath(file.remote).name for split, file in self._published.items()}
+        super().__init__(sensor, sensors, source, path, names, axes_order, metadata)
         self._address = address.rstrip("/")
 
     def load(self) -> Logs:
-        """Fetch what is not there, verify all of it, and read it.
-
-        Returns:
-            What :meth:`ArrayLogs.load` returns.
+        """Fetch what is not there, verify all of it, and list the recordings.
 
         Raises:
             InputError: As the cause of Kedro's ``DatasetError``, a file that cannot be fetched, is
                 another one than was published, or cannot be used.
         """
-        for file in self._files.values():
-            url = f"{self._address}/{file.remote}"
-            ensure(url, self._path / file.name, file.blob)
+        for split, file in self._published.items():
+            ensure(f"{self._address}/{file.remote}", self._path / self._files[split], file.blob)
         _LOG.info("published %s files verified: %s", self._sensor, self._path)
-        return self._arrays.load()
-
-    def _exists(self) -> bool:
-        return self._arrays.exists()
+        return super().load()
 
     def _describe(self) -> dict[str, Any]:
-        files = {split: file.model_dump() for split, file in self._files.items()}
-        return self._arrays._describe() | {"address": self._address, "files": files}
+        files = {split: file.model_dump() for split, file in self._published.items()}
+        return super()._describe() | {"address": self._address, "files": files}
 
 
 def _published(sensor: str, split: str, file: Mapping[str, str]) -> PublishedFile:

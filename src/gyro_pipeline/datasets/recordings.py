@@ -18,7 +18,7 @@ from kedro.io import AbstractDataset
 from gyro_pipeline.conventions import AXES, InputError, Missing
 from gyro_pipeline.datasets.atomic import replacing
 from gyro_pipeline.fingerprints import data_hash
-from gyro_pipeline.logs import Finding, Listing, Recording
+from gyro_pipeline.logs import Finding, Listing, Recording, with_recordings
 
 _ENGINE: Final = "h5netcdf"
 
@@ -204,8 +204,8 @@ def open_recordings(path: Path) -> xr.Dataset:
     """Open a file that :class:`Recordings` wrote.
 
     Returns:
-        Its content, with the values still in the file. IMUs of which no recording can be used, and
-        recordings of which no IMU's can, are left out.
+        Its content, as :func:`~gyro_pipeline.logs.with_recordings` leaves it, with the values still
+        in the file.
 
     Raises:
         InputError: A damaged file.
@@ -222,14 +222,7 @@ def open_recordings(path: Path) -> xr.Dataset:
     # netCDF gives NumPy numbers, which JSON does not take
     plain = {key: v.item() if isinstance(v, np.generic) else v for key, v in lazy.attrs.items()}
     recordings = lazy.assign_attrs(plain)
-    if "samples" not in recordings:
-        return recordings
-    there = recordings["samples"].load() > 0
-    for dimension, other in (("imu", "recording"), ("recording", "imu")):
-        used = there.any(other).to_numpy()
-        if not used.all():  # an index of single places makes reading slow
-            recordings = recordings.isel({dimension: np.flatnonzero(used)})
-    return recordings
+    return with_recordings(recordings) if "samples" in recordings else recordings
 
 
 def _begin(path: Path, places: Collection[tuple[int, int]]) -> None:

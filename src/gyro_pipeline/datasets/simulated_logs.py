@@ -1,7 +1,6 @@
 """The stand-in for sensors whose logs are not at hand."""
 
 import hashlib
-import json
 import logging
 import zlib
 from collections.abc import Mapping
@@ -16,8 +15,8 @@ from pydantic import ValidationError
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 from gyro_pipeline.datasets.array_logs import LAYOUT, ArrayLogs
 from gyro_pipeline.datasets.atomic import replacing
-from gyro_pipeline.datasets.log_source import LogSource
 from gyro_pipeline.datasets.recordings import Recordings, open_recordings
+from gyro_pipeline.fingerprints import fingerprint
 from gyro_pipeline.logs import Logs
 from gyro_pipeline.parameters import Sensor, SimulatedSensor
 from gyro_pipeline.physics.noise import simulate_noise, warm_up
@@ -25,7 +24,7 @@ from gyro_pipeline.physics.noise import simulate_noise, warm_up
 _LOG = logging.getLogger(__name__)
 
 
-class SimulatedLogs(LogSource):
+class SimulatedLogs(ArrayLogs):
     """Writes simulated logs once, in the published layout, and reads them as any such files.
 
     Each gyroscope has a unit bias, uniform in plus or minus ``unit_bias_dps``; each power-on adds
@@ -49,10 +48,9 @@ class SimulatedLogs(LogSource):
         seed: int,
         metadata: dict[str, Any] | None = None,
     ) -> None:
-        super().__init__(sensor, sensors, source, path, metadata)
-        self._stand_in = _to_simulate(sensor, self.entry)
         files = {split: f"{sensor}_{split}.npy" for split in ("train", "test")}
-        self._arrays = ArrayLogs(sensor, sensors, source, path, files, axes_order=LAYOUT)
+        super().__init__(sensor, sensors, source, path, files, LAYOUT, metadata)
+        self._stand_in = _to_simulate(sensor, self.entry)
         self._seed = seed
         self._train, self._test = (self._path / name for name in files.values())
         self._truth = self._path / f"{sensor}_truth.nc"
@@ -72,9 +70,9 @@ class SimulatedLogs(LogSource):
             InputError: As the cause of Kedro's ``DatasetError``, files that cannot be written, or
                 that were damaged since.
         """
-        found = self._settings_on_disk()
-        if found != self._settings():
-            why = "" if found is None else " anew, since their settings have changed"
+        earlier = self._settings_on_disk()
+        if earlier != self._settings():
+            why = "" if earlier is None else " anew, since their settings have changed"
             _LOG.info("writing simulated %s logs%s: %s", self._sensor, why, self._path)
             self._write()
         truth = open_recordings(self._truth).load()
@@ -84,23 +82,17 @@ class SimulatedLogs(LogSource):
                 f"since it was written, so {self._truth} is not its truth; delete that file and "
                 "run again. Logs of your own belong to another source"
             )
-        return replace(self._arrays.load(), simulated=True, drawn=truth.drop_attrs())
+        return replace(super().load(), simulated=True, drawn=truth.drop_attrs())
 
     def _exists(self) -> bool:
-        return self._truth.is_file() and self._arrays.exists()
+        return self._truth.is_file() and super()._exists()
 
     def _describe(self) -> dict[str, Any]:
         return super()._describe() | {"seed": self._seed}
 
     def _settings(self) -> str:
-        """All that the files depend on."""
-        # without what was left at its default: files of versions that did not know it stay valid
-        entry = self._stand_in.model_dump(mode="json", exclude={"rate_hz"})  # the counts give it
-        known = self._stand_in.simulated.model_dump(mode="json")
-        for added, default in (("random_walk_mdps_per_rts", 0.0), ("warm_up", None)):
-            if known[added] == default:
-                del entry["simulated"][added]
-        return json.dumps({**entry, "seed": self._seed}, sort_keys=True)
+        """A hash of all that the files depend on."""
+        return fingerprint([self._stand_in.model_dump(mode="json"), self._seed])
 
     def _settings_on_disk(self) -> str | None:
         """What the files were written with; None where they are not complete."""
@@ -108,9 +100,7 @@ class SimulatedLogs(LogSource):
             return None
         try:
             with open_recordings(self._truth) as truth:
-                settings = truth.attrs.get("settings")
-                # older versions marked the files in another way
-                return settings if "files_hash" in truth.attrs else None
+                return truth.attrs.get("settings")
         except InputError:  # damaged: as good as not written
             return None
 
@@ -128,11 +118,9 @@ class SimulatedLogs(LogSource):
 
     def _files_hash(self) -> str:
         """Of the arrays' bytes."""
-        digests = []
-        for path in (self._train, self._test):
-            with path.open("rb") as file:
-                digests.append(hashlib.file_digest(file, "sha256").hexdigest())
-        return " ".join(digests)
+        files = [path.open("rb") for path in (self._train, self._test)]
+        with files[0], files[1]:
+            return " ".join(hashlib.file_digest(file, "sha256").hexdigest() for file in files)
 
 
 def _to_simulate(sensor: str, entry: Sensor) -> SimulatedSensor:
@@ -163,34 +151,27 @@ def draw_biases(generator: np.random.Generator, entry: SimulatedSensor) -> xr.Da
         :meth:`SimulatedLogs.load` describes them.
     """
     model = entry.simulated
-    spread = np.array(model.turn_on_spread_mdps) * MDPS
-    limit = model.unit_bias_dps
+    spread, limit = np.array(model.turn_on_spread_mdps) * MDPS, model.unit_bias_dps
     unit_bias = generator.uniform(-limit, limit, (entry.imus, len(AXES)))
     turn_on = generator.normal(0, spread, (entry.imus, entry.recordings, len(AXES)))
-    drawn: dict[str, Any] = {}
+    power_ons = "imu", "recording", "axis"
+    drawn: dict[str, Any] = {
+        "true_bias": (power_ons, unit_bias[:, None] + turn_on),
+        "true_unit_bias": (("imu", "axis"), unit_bias),
+        "true_turn_on_spread": ("axis", spread),
+        "true_noise": ("axis", np.array(model.noise_mdps_rts) * MDPS),
+        "true_flicker": model.flicker_mdps * MDPS,
+        "true_random_walk": model.random_walk_mdps_per_rts * MDPS,
+    }
     if model.warm_up is not None:
         figures = model.warm_up.amplitude_mdps * MDPS, model.warm_up.spread_mdps * MDPS
-        amplitude = generator.normal(*figures, turn_on.shape)
+        drawn["true_amplitude"] = power_ons, generator.normal(*figures, turn_on.shape)
         constants_s = generator.uniform(*model.warm_up.time_constant_s, turn_on.shape)
-        drawn["true_amplitude"] = (("imu", "recording", "axis"), amplitude)
-        drawn["true_time_constant"] = (("imu", "recording", "axis"), constants_s)
+        drawn["true_time_constant"] = power_ons, constants_s
         drawn["true_amplitude_mean"], drawn["true_amplitude_spread"] = figures
-    return xr.Dataset(
-        {
-            "true_bias": (("imu", "recording", "axis"), unit_bias[:, None] + turn_on),
-            "true_unit_bias": (("imu", "axis"), unit_bias),
-            "true_turn_on_spread": ("axis", spread),
-            "true_noise": ("axis", np.array(model.noise_mdps_rts) * MDPS),
-            "true_flicker": model.flicker_mdps * MDPS,
-            "true_random_walk": model.random_walk_mdps_per_rts * MDPS,
-            **drawn,
-        },
-        coords={
-            "imu": np.arange(1, entry.imus + 1),
-            "recording": np.arange(1, entry.recordings + 1),
-            "axis": list(AXES),
-        },
-    )
+    counts = {"imu": entry.imus, "recording": entry.recordings}
+    numbers = {name: np.arange(1, count + 1) for name, count in counts.items()}
+    return xr.Dataset(drawn, numbers | {"axis": list(AXES)})
 
 
 def write_logs(
@@ -209,10 +190,13 @@ def write_logs(
         train: File for the first ``entry.train_recordings`` recordings.
         test: File for the other recordings.
     """
-    cut = entry.train_recordings
-    train_array = _new_array(train, cut, entry)
-    test_array = _new_array(test, entry.recordings - cut, entry)
-    model = entry.simulated
+    cut, model = entry.train_recordings, entry.simulated
+    arrays = [
+        np.lib.format.open_memmap(
+            path, "w+", np.float32, (count, entry.imus * len(AXES), entry.samples)
+        )
+        for path, count in ((train, cut), (test, entry.recordings - cut))
+    ]
     for gyroscope in range(entry.imus * len(AXES)):
         imu, axis = divmod(gyroscope, len(AXES))
         noise = simulate_noise(
@@ -226,16 +210,9 @@ def write_logs(
         )
         rates = truth.true_bias.to_numpy()[imu, :, axis, None] + noise
         if model.warm_up is not None:
-            one = truth.isel(imu=imu, axis=axis)
-            drawn = one.true_amplitude.to_numpy(), one.true_time_constant.to_numpy()
+            amplitude, constant_s = truth.true_amplitude, truth.true_time_constant
+            drawn = amplitude.to_numpy()[imu, :, axis], constant_s.to_numpy()[imu, :, axis]
             rates += warm_up(*drawn, entry.samples, entry.rate_hz)
-        train_array[:, gyroscope], test_array[:, gyroscope] = rates[:cut], rates[cut:]
-    train_array.flush()
-    test_array.flush()
-
-
-def _new_array(
-    path: Path, recordings: int, entry: SimulatedSensor
-) -> np.memmap[Any, np.dtype[Any]]:
-    shape = (recordings, entry.imus * len(AXES), entry.samples)
-    return np.lib.format.open_memmap(path, mode="w+", dtype=np.float32, shape=shape)
+        arrays[0][:, gyroscope], arrays[1][:, gyroscope] = rates[:cut], rates[cut:]
+    for array in arrays:
+        array.flush()

@@ -8,7 +8,7 @@ import numpy as np
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.fingerprints import data_hash
-from gyro_pipeline.logs import REJECTED, Finding, Log, LogEntry, Recording
+from gyro_pipeline.logs import REJECTED, Finding, Log, LogEntry, Recording, printable
 from gyro_pipeline.parameters import Quality
 from gyro_pipeline.quality import inspect
 
@@ -62,7 +62,7 @@ def judge(job: Inspection, report: Callable[[float], None]) -> Recording:
         log = job.entry.read()
     except InputError as error:
         key = "" if _of_the_system(error.__cause__) else job.key
-        recording = job.recording(Finding("file", REJECTED, str(error)), key=key)
+        recording = job.recording(Finding("file", REJECTED, printable(str(error))), key=key)
     else:
         recording = _judged(log, job)
     report(job.work)

@@ -1,12 +1,16 @@
 """Recordings of a length each, one by one, and cut to one length."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyro_pipeline.conventions import AXES
 from gyro_pipeline.fingerprints import fingerprint
+from gyro_pipeline.logs import with_recordings
+from gyro_pipeline.physics.bias import recording_mean, sample_sigma
 
 
 def tested_imu(recordings: xr.Dataset) -> int:
@@ -50,11 +54,29 @@ def cut(recordings: xr.Dataset, length: int) -> xr.Dataset:
     return with_recordings(part.assign_attrs(data_hash=changed))
 
 
-def with_recordings(recordings: xr.Dataset) -> xr.Dataset:
-    """Leave out IMUs that have no recording, and recordings that no IMU has."""
-    there = recordings["samples"].load() > 0
-    for dimension, other in (("imu", "recording"), ("recording", "imu")):
-        used = there.any(other).to_numpy()
-        if not used.all():  # an index of single places makes reading slow
-            recordings = recordings.isel({dimension: np.flatnonzero(used)})
-    return recordings
+def bias_rows(
+    recordings: xr.Dataset,
+    more: Callable[[int, NDArray[np.floating]], Mapping[str, NDArray[np.float64]]] | None = None,
+) -> pd.DataFrame:
+    """The mean of each recording, the ground truth of the paper.
+
+    Args:
+        recordings: Angular rates, deg/s.
+        more: Further columns, from an IMU's number and the samples (axis, n) of a recording.
+
+    Returns:
+        A row per recording that is there and axis: ``sensor, imu, recording, axis``, ``bias_dps``
+        and ``sample_sigma_dps``.
+    """
+    tables = [
+        pd.DataFrame(
+            {
+                **{"sensor": recordings.attrs["sensor"], "imu": imu, "recording": number},
+                **{"axis": list(AXES), "bias_dps": recording_mean(samples)},
+                "sample_sigma_dps": sample_sigma(samples),
+                **(more(imu, samples) if more else {}),
+            }
+        )
+        for imu, number, samples in one_by_one(recordings)
+    ]
+    return pd.concat(tables, ignore_index=True)

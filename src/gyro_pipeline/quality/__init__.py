@@ -1,38 +1,15 @@
 """Quality control of one recording: was it at rest, and which of its rows hold a measurement?
 
-A recording goes through the steps of :func:`inspect` until one rejects it. What is brief is masked
-and does not end the recording; a gap in time does. Limits know how many samples they compare.
+A recording goes through steps until one rejects it; each of them says what it looks for. What
+is brief is masked and does not end the recording; a gap in time does. Limits know how many samples
+they compare. Motion rejects all of a recording: rates alone do not tell which part was at rest, and
+after a turn the Earth's rate falls differently on the axes.
 
-| finding | when | how it ends |
-|---|---|---|
-| zero rows | the first or last rows are zero on all axes | cut, kept |
-| non-finite values | not a number, infinite, or absurdly large | masked, repaired |
-| stuck values | an axis holds a value for longer than chance allows | masked, repaired |
-| dropouts | rows elsewhere are zero on all axes, beyond chance | masked, repaired |
-| gaps | the clock misses samples: the longest stretch without is kept | repaired |
-| too short | too few seconds, or too small a share of the stretch, can be used | rejected |
-| equal axes | two axes have the same values | rejected |
-| dead band | zero, amid others, comes far more often than its neighbours | rejected |
-| repeated rows | rows repeat the one before, beyond chance | above 20 % rejected, else kept |
-| repeated values | an axis repeats its values beyond chance | rejected |
-| coarse quantisation | the step is above the noise | above `largest_step` rejected, else kept |
-| bias taken off | a level goes to zero on all axes | rejected |
-| start | a shock of the first rows, as of what settles faster than a bias | cut, repaired |
-| shocks, spikes | a burst beyond the noise with a block about; one or two rows | masked, repaired |
-| saturation, frequent value | a value comes far more often than its neighbours | rejected |
-| mixed rows | rows jump between levels, as those of several devices do | rejected |
-| noise level, little noise | more noise, or less, than a MEMS gyroscope has | rejected, kept |
-| motion | the mean or the noise changes; a burst is too long, a drift too large | rejected |
-| warm-up, drift | the level moves and settles, or does not | kept |
-
-Motion rejects all of a recording: rates alone do not tell which part was at rest, and after a turn
-the Earth's rate falls differently on the axes. A rotation as steady as a bias cannot be seen.
-
-Not told are steps of 0.1 deg/s up and down every few seconds, and sways of 0.05 deg/s or, of any
-size, of a period of one or two blocks. Neither are several devices in random order that are less
-than about 8 sigma apart, nor those in turn where rows slip and they are less than about 4 sigma
-apart. More than 16 devices in turn may be missed; a steady vibration at a half, a third or a
-quarter of the sample rate is taken for devices.
+Not told are a rotation as steady as a bias, steps of 0.1 deg/s up and down every few seconds, and
+sways of 0.05 deg/s or, of any size, of a period of one or two blocks. Neither are several devices
+in random order that are less than about 8 sigma apart, nor those in turn where rows slip and they
+are less than about 4 sigma apart. More than 16 devices in turn may be missed; a steady vibration at
+a half, a third or a quarter of the sample rate is taken for devices.
 """
 
 from dataclasses import dataclass
@@ -76,29 +53,14 @@ def inspect(log: Log, rate_hz: float, quality: "Quality") -> Inspected:
     from gyro_pipeline.quality.recording import Recording  # noqa: PLC0415
 
     if log.samples.shape[1:] != (len(AXES),):
-        expected = f"expected samples of {len(AXES)} axes, (n, {len(AXES)})"
-        raise InputError(f"{expected}, got shape {log.samples.shape}")
+        raise InputError(f"expected samples of 3 axes, (n, 3), got shape {log.samples.shape}")
     recording = Recording(log, rate_hz, quality)
     for step in (
-        masks.cut_zero_rows,
-        masks.mask_non_finite,
-        masks.mask_stuck,
-        masks.mask_dropouts,
-        masks.keep_longest_stretch,
-        masks.require_length,
-        values.check_dead_band,
-        values.check_equal_axes,
-        values.check_repeats,
-        values.check_held_axes,
-        values.check_steps,
-        motion.check_bias,
-        masks.mask_bursts,
-        masks.require_length,
-        values.check_levels,
-        values.check_turns,
-        values.check_noise,
-        motion.check_rest,
-        motion.report_drift,
+        *(masks.cut_zero_rows, masks.mask_non_finite, masks.mask_stuck, values.check_equal_axes),
+        *(masks.mask_dropouts, masks.keep_longest_stretch, masks.require_length),
+        *(values.check_dead_band, values.check_repeats, values.check_held_axes, values.check_steps),
+        *(motion.check_bias, masks.mask_bursts, masks.require_length, values.check_levels),
+        *(values.check_turns, values.check_noise, motion.check_rest, motion.report_drift),
     ):
         step(recording)
         if recording.rejected:

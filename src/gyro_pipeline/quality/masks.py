@@ -9,27 +9,26 @@ from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED
 from gyro_pipeline.parameters import LEAST_BLOCKS
 from gyro_pipeline.quality.recording import Recording, median, runs
 from gyro_pipeline.quality.rest import Array, Mask
-from gyro_pipeline.quality.values import zero_excess
 
 
 def cut_zero_rows(recording: Recording) -> None:
-    """Rows of zeros at the ends, which loggers write before the first sample."""
-    rows = runs((recording.rates != 0).any(axis=0))
+    """Cut rows of zeros at the ends, which loggers write before the first sample."""
+    rows = runs(np.any(recording.rates, axis=0))
     zeros = np.ones_like(recording.masked)
     if rows.size:
         zeros[rows[0, 0] : rows[-1, 1]] = False
-    recording.mask("zero rows", zeros, "", KEPT)
+    recording.mask("zero rows", zeros, outcome=KEPT)
 
 
 def mask_non_finite(recording: Recording, largest: float = 1e12) -> None:
-    """No numbers, and garbage bytes read as a number whose square may overflow."""
+    """Mask no numbers, and garbage bytes read as a number whose square may overflow."""
     rates = recording.rates
     if not (rates.size and -largest < rates.min() <= rates.max() < largest):  # NaN fails as well
         _mask_samples(recording, "non-finite values", ~(np.abs(rates) < largest))
 
 
 def mask_stuck(recording: Recording, least_s: float = 0.1) -> None:
-    """Runs of equal values of an axis, for ``least_s`` and longer than chance allows.
+    """Mask runs of equal values of an axis, for ``least_s`` and longer than chance allows.
 
     Where a sample equals the one before with probability p, n samples hold a run of more than k
     with a probability of at most n p^k. p is the axis's own, from its samples outside the longest
@@ -48,7 +47,7 @@ def mask_stuck(recording: Recording, least_s: float = 0.1) -> None:
 
 
 def mask_dropouts(recording: Recording) -> None:
-    """Rows of zeros anywhere, ten times those of chance, where zero comes too often on all axes.
+    """Mask rows that are zero on all axes, where they come ten times as often as by chance.
 
     By chance axes are zero independently, as often as in rows that are not zero on all of them. At
     least c rows where m are expected have a probability of at most (e m / c)^c.
@@ -56,12 +55,10 @@ def mask_dropouts(recording: Recording) -> None:
     zeros = recording.used == 0
     rows = np.count_nonzero(zeros.all(axis=0))
     if rows:
-        others = zeros.shape[1] - rows + 1
-        shares = (zeros.sum(axis=1) - rows + 1) / others
+        shares = (zeros.sum(axis=1) - rows + 1) / (zeros.shape[1] - rows + 1)
         chance = rows * np.log(10 * zeros.shape[1] * np.prod(shares) / rows)
-        too_often = (zero_excess(recording, axis) > 0 for axis in range(len(AXES)))
-        if chance < np.log(recording.quality.false_alarm) and all(too_often):
-            dropouts = ~recording.rates.any(axis=0) & ~recording.masked
+        if chance < np.log(recording.quality.false_alarm):
+            dropouts = ~(np.any(recording.rates, axis=0) | recording.masked)
             recording.mask("dropouts", dropouts, "zero on all axes, ")
 
 
@@ -77,9 +74,8 @@ def keep_longest_stretch(recording: Recording) -> None:
     edges = np.unique([0, *recording.log.gap_rows, recording.masked.size])
     if edges.size > 2:  # noqa: PLR2004 - more than one stretch
         used = np.add.reduceat(~recording.masked, edges[:-1], dtype=np.intp)
-        start, stop = edges[used.argmax() :][:2]
         others = np.ones_like(recording.masked)
-        others[start:stop] = False
+        others[slice(*edges[used.argmax() :][:2])] = False
         detail = f"the longest stretch, of {edges[-1]} rows, is {recording.where(~others)}"
         recording.add("gaps", REPAIRED, detail)
         recording.leave_out(others)
@@ -91,8 +87,8 @@ def require_length(recording: Recording) -> None:
     q, rate_hz, rows = recording.quality, recording.rate_hz, recording.masked.size
     used = rows - np.count_nonzero(recording.masked)
     least = max(q.least_s * rate_hz, LEAST_BLOCKS * recording.size)
-    enough = used >= max(least, q.least_share * rows)
-    if not enough or np.count_nonzero(recording.occupied) < LEAST_BLOCKS:
+    few_blocks = np.count_nonzero(recording.occupied) < LEAST_BLOCKS
+    if few_blocks or used < max(least, q.least_share * rows):
         detail = (
             f"{used} of {len(recording.log.samples)} rows can be used, {used / rate_hz:.4g} s; "
             f"expected at least {least / rate_hz:.4g} s (quality.least_s) and {q.least_share:.0%} "
@@ -106,20 +102,17 @@ def mask_bursts(recording: Recording, few: int = 3) -> None:
 
     A shock of the first rows is a start. What lasts longer than a shock may is a motion.
     """
-    bursts = runs(beyond_noise(recording))
-    if not bursts.size:
-        return
+    size, level = recording.size, median(recording.blocks.means)[:, None]
     spikes, shocks, start, motion = np.zeros((4, recording.masked.size), bool)
-    for first, last in bursts:
+    for first, last in runs(beyond_noise(recording)):
         if last - first < few:
             spikes[first:last] = True
         else:
-            shocks[max(first - recording.size, 0) : last + recording.size] = True
-    longest = recording.quality.shock_s * recording.rate_hz + 2 * recording.size
+            shocks[max(first - size, 0) : last + size] = True
+    longest = recording.quality.shock_s * recording.rate_hz + 2 * size
     for first, last in runs(shocks):
         kind = motion if last - first >= longest else shocks if first else start
         shocks[first:last], kind[first:last] = False, True
-    level = median(recording.blocks.means)[:, None]
     kinds = {"motion": motion, "start": start, "shocks": shocks, "spikes": spikes}
     for check, chosen in kinds.items():
         rows = chosen & ~recording.masked

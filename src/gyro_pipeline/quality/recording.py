@@ -45,14 +45,9 @@ class Recording:
         return self.rates.compress(~self.masked, axis=1) if self.masked.any() else self.rates
 
     @cached_property
-    def ordered(self) -> Array:
-        """(axis, unmasked row), deg/s, from the smallest to the largest, in the log's own type."""
-        return np.sort(self.used.astype(self.log.samples.dtype), axis=1)  # float32 is faster
-
-    @cached_property
     def changes(self) -> Array:
         """(axis, unmasked row), deg/s, from each to the next."""
-        return np.diff(self.used, axis=1)
+        return self.used[:, 1:] - self.used[:, :-1]
 
     @cached_property
     def squares(self) -> Array:
@@ -62,12 +57,12 @@ class Recording:
     @cached_property
     def repeats(self) -> Array:
         """(axis,), share of the rows that repeat the one before."""
-        return np.sum(self.changes == 0, axis=1) / self.changes.shape[1]
+        return 1 - np.count_nonzero(self.changes, axis=1) / self.changes.shape[1]
 
     @cached_property
     def steps(self) -> Array:
         """(axis,), deg/s, in which values are written; 0 where they are well below the noise."""
-        steps = np.zeros(len(self.repeats))
+        steps = np.zeros(len(self.rates))
         # white noise repeats a tenth of its samples at a step of 0.36 sigma
         for axis in np.flatnonzero(self.repeats > 0.1):  # noqa: PLR2004
             sizes = np.abs(self.changes[axis])
@@ -86,28 +81,26 @@ class Recording:
     @cached_property
     def occupied(self) -> NDArray[np.integer]:
         """(block,), unmasked rows of each block; 0 where that is less than three quarters."""
-        size, count = self.size, self.masked.size // self.size
-        used = size - self.masked[: count * size].reshape(count, size).sum(axis=1)
-        return np.where(used >= 0.75 * size, used, 0)
+        count = self.masked.size // self.size
+        used = self.size - self.masked[: count * self.size].reshape(count, self.size).sum(axis=1)
+        return np.where(used >= 0.75 * self.size, used, 0)
 
     @cached_property
     def blocks(self) -> Blocks:
         """Averages of the occupied blocks of filled rows."""
         size, chosen = self.size, np.flatnonzero(self.occupied)
         samples = self.filled[:, : self.occupied.size * size].reshape(len(self.rates), -1, size)
+        samples = samples if chosen.size == self.occupied.size else samples[:, chosen]
         means = samples.mean(axis=-1)
         apart = samples - means[..., None]
-        squares = np.einsum("abs,abs->ab", apart, apart)
+        variances = np.einsum("abs,abs->ab", apart, apart) / (self.occupied[chosen] - 1)
         # distances, as squares would let frequent spikes hide themselves
         distances = np.abs(apart, out=apart).mean(axis=-1)
-        means, squares, distances = (x[:, chosen] for x in (means, squares, distances))
-        median_of_unit = np.sqrt(2 / np.pi * (1 - 1 / size)) * (1 - 1 / (7 * size))
-        sigma = median(distances) / median_of_unit
+        sigma = median(distances) / np.sqrt(2 / np.pi * (1 - 1 / size)) / (1 - 1 / (7 * size))
         noise = median(np.abs(np.diff(means, axis=1))) / (0.6745 * np.sqrt(2))
-        noise = np.maximum(noise, sigma / np.sqrt(size))
-        return Blocks(chosen * size, means, squares / (self.occupied[chosen] - 1), sigma, noise)
+        return Blocks(chosen * size, means, variances, sigma, np.maximum(noise, sigma / size**0.5))
 
-    def mask(self, check: str, rows: Mask, detail: str, outcome: str = REPAIRED) -> None:
+    def mask(self, check: str, rows: Mask, detail: str = "", outcome: str = REPAIRED) -> None:
         """Mask rows, and say so, if there are any."""
         if rows.any():
             self.leave_out(rows)

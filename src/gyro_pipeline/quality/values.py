@@ -1,6 +1,5 @@
 """Values that no gyroscope at rest gives, each told by a function of its own."""
 
-from collections.abc import Sequence
 from itertools import combinations
 from statistics import NormalDist
 
@@ -19,7 +18,8 @@ READER = "in `reader:` of the catalog entry in catalog.yml"
 def check_equal_axes(recording: Recording) -> None:
     """Two axes of the same values: one column of the file was read twice."""
     for first, second in combinations(range(len(AXES)), 2):
-        if np.array_equal(recording.used[first], recording.used[second]):
+        used = recording.used
+        if used.size and np.array_equal(used[first], used[second]):
             detail = f"axes {AXES[first]} and {AXES[second]} have the same values"
             recording.add("equal axes", REJECTED, f"{detail}; correct `columns` {READER}")
 
@@ -66,33 +66,24 @@ def check_steps(recording: Recording) -> None:
     noise = np.sqrt(np.maximum(variances, 0))
     axis = np.argmax(steps - largest * noise)
     if steps[axis] > noise[axis]:
-        detail = (
-            f"axis {AXES[axis]} has a step of {steps[axis]:.4g} mdps and a noise of "
-            f"{noise[axis]:.4g} mdps; a mean can be trusted up to {largest:g} times the noise "
-            "(quality.largest_step)"
-        )
+        detail = f"axis {AXES[axis]} has a step of {steps[axis]:.4g} mdps and a noise of "
+        detail += f"{noise[axis]:.4g} mdps; a mean can be trusted up to {largest:g} times the noise"
         outcome = KEPT if steps[axis] <= largest * noise[axis] else REJECTED
-        recording.add("coarse quantisation", outcome, detail)
+        recording.add("coarse quantisation", outcome, f"{detail} (quality.largest_step)")
 
 
-def check_dead_band(recording: Recording) -> None:
+def check_dead_band(recording: Recording, least: int = 8) -> None:
     """Zeros amid the noise that come too often: small values, or parts of a count, were cut."""
     for axis, rates in enumerate(recording.used):
-        often = zero_excess(recording, axis)
-        if often and rates.min() < 0 < rates.max():
-            band, step = np.abs(rates[rates != 0]).min(), np.diff(np.unique(rates))
-            cut = f"± {band:.2g} deg/s" if band > 1.5 * np.median(step) else "counts cut to zero?"  # noqa: PLR2004
-            detail = f"axis {AXES[axis]}, {cut}: 0 comes {often:.2g} times as often as its "
+        if np.count_nonzero(rates == 0) < least or not rates.min() < 0 < rates.max():
+            continue
+        values, _, often = frequent_values(recording, axis)
+        if (often[values == 0] > 0).any():
+            band, step = np.abs(values[values != 0]).min(), np.median(np.diff(values))
+            cut = f"± {band:.2g} deg/s" if band > 1.5 * step else "counts cut to zero?"  # noqa: PLR2004
+            detail = f"axis {AXES[axis]}, {cut}: 0 comes {often.max():.2g} times as often as its "
             detail += "neighbours; the mean is pulled to zero; log the raw rates"
             recording.add("dead band", REJECTED, detail)
-
-
-def zero_excess(recording: Recording, axis: int, least: int = 8) -> float:
-    """How many times as often as its neighbours zero comes; 0: no more than by chance."""
-    if np.count_nonzero(recording.used[axis] == 0) < least:
-        return 0.0
-    values, _, often = frequent_values(recording, axis)
-    return float(often[values == 0].sum())
 
 
 def check_levels(recording: Recording, least: float = 3) -> None:
@@ -105,10 +96,11 @@ def check_levels(recording: Recording, least: float = 3) -> None:
         often[1:-1][often[1:-1] < least] = 0
         if often.any():
             most = often.argmax()
-            end = most in {0, values.size - 1}
-            detail = f"axis {name} {'is cut off' if end else 'is held'} at {values[most]:.4g} deg/s"
-            detail += f", {counts[most]} times; the mean is pulled there"
-            recording.add("saturation" if end else "frequent value", REJECTED, detail)
+            check, verb = "frequent value", "held"
+            if most in {0, values.size - 1}:
+                check, verb = "saturation", "cut off"
+            detail = f"axis {name} is {verb} at {values[most]:.4g} deg/s, {counts[most]} times"
+            recording.add(check, REJECTED, f"{detail}; the mean is pulled there")
 
 
 def frequent_values(
@@ -121,9 +113,10 @@ def frequent_values(
     Chance is that of runs, as of independent samples. More than ``most`` such values are a pattern,
     as of numbers rounded twice, which moves no mean.
     """
-    ordered, nothing = recording.ordered[axis], np.zeros(0)
+    # in the log's own type: of float32 this is faster
+    ordered = np.sort(recording.used[axis].astype(recording.log.samples.dtype))
     if not np.any(ordered[7:] == ordered[:-7]):  # fewer never are beyond chance
-        return nothing, nothing.astype(np.intp), nothing
+        return np.zeros(0), np.zeros(0, np.intp), np.zeros(0)
     values, counts = np.unique(ordered, return_counts=True)
     if values.size < 3:  # noqa: PLR2004 - of two values alone, nothing is a tail
         return values, counts, np.zeros(values.size)
@@ -143,11 +136,11 @@ def frequent_values(
     return values, counts, often * (np.count_nonzero(often) <= most)
 
 
-def check_turns(recording: Recording, least: float = 0.5) -> None:
+def check_turns(recording: Recording) -> None:
     """Rows of several levels, as of several devices: in turn, or in any order if far apart."""
-    jumps = turns(recording.filled, recording.squares, least)
     widths = np.maximum(0.4 * np.sqrt(recording.squares), recording.steps)
-    jumps = np.maximum(jumps, list(map(jump_apart, recording.changes, widths)))
+    apart = [jump_apart(*axis) for axis in zip(recording.changes, widths, strict=True)]
+    jumps = np.maximum(apart, jumps_in_turn(recording))
     if jumps.any():
         detail = f"axis {AXES[jumps.argmax()]} jumps by {jumps.max():.2g} deg/s from row to row; "
         detail += "several sensors in one file? Split it by device, or log a column that names the "
@@ -155,19 +148,18 @@ def check_turns(recording: Recording, least: float = 0.5) -> None:
         recording.add("mixed rows", REJECTED, detail)
 
 
-def turns(
-    rates: Array, squares: Array, least: float, periods: Sequence[int] = (60, 56, 54, 44, 52, 48)
-) -> Array:
+def jumps_in_turn(recording: Recording, least: float = 0.5) -> Array:
     """(axis,), how far rows jump that are a period, or a divisor of it, apart; 0: nowhere.
 
     The periods have 2 to 16 devices in turn as divisors. Changes that are a period apart have means
     of their own, beyond ``least`` times the noise and beyond chance. Nearly all of one frequency is
     a vibration, unless 2 to 4 rows make its period.
     """
-    (axes, rows), jumps = rates.shape, np.zeros(len(rates))
-    for period in periods if rows > 10 * max(periods) else (12,):
-        count = rows // period
-        levels = np.ones(count) @ rates[:, : count * period].reshape(axes, count, period) / count
+    rates, squares, jumps = recording.filled, recording.squares, np.zeros(len(AXES))
+    for period in (60, 56, 54, 44, 52, 48) if rates.shape[1] > 600 else (12,):  # noqa: PLR2004
+        count = rates.shape[1] // period
+        turns = rates[:, : count * period].reshape(len(AXES), count, period)
+        levels = np.ones(count) @ turns / count
         means = np.diff(levels)
         sizes = np.ptp(means, axis=1) / 2
         within = np.maximum(squares - (means**2).mean(axis=1), 0.01 * squares) / (1 - 1 / count)

@@ -11,7 +11,7 @@ elements, the first of which are its class and its size. A compressed element ho
 import math
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 _TYPES = {*range(1, 8), 9, *range(12, 19)}
 _INT32, _UINT32, _ARRAY, _COMPRESSED = 5, 6, 14, 15
@@ -19,19 +19,28 @@ _VALUES, _SPARSE = range(4, 16), 5  # classes of arrays
 _DEEPEST = 32
 
 
-def check(data: bytes) -> None:
+def check(data: bytes, check_claim: Callable[[int], None]) -> None:
     """See that a file is made of whole elements of known types, and arrays of no more than it has.
+
+    Args:
+        data: Of the file.
+        check_claim: Raises an error where so many bytes are too many to unpack.
 
     Raises:
         ValueError: It is not.
         zlib.error: What is compressed in it is damaged.
     """
     order = {b"IM": "<", b"MI": ">"}[data[126:128]]
+    size = 0
     for kind, inner in _elements(memoryview(data)[128:], order):
-        compressed = kind == _COMPRESSED
-        for element_type, array in (
-            _elements(memoryview(zlib.decompress(inner)), order) if compressed else [(kind, inner)]
-        ):
+        elements = [(kind, inner)]
+        if kind == _COMPRESSED:
+            tag = zlib.decompressobj().decompress(inner, 8)
+            size += 8 + sum(struct.unpack(f"{order}II", tag)[1:])
+            check_claim(size)
+            unpacked = zlib.decompressobj().decompress(inner, size)
+            elements = list(_elements(memoryview(unpacked), order))
+        for element_type, array in elements:
             if element_type == _ARRAY:
                 _check_array(array, order, 1)
 

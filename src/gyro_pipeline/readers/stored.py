@@ -7,6 +7,7 @@ reads a kind of files is imported with the first of them, as most files are text
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +17,28 @@ from numpy.typing import NDArray
 from gyro_pipeline.conventions import AXES, InputError
 from gyro_pipeline.parameters import ReaderOptions
 from gyro_pipeline.readers import mat5
-from gyro_pipeline.readers.table import Reader, Table, column
+from gyro_pipeline.readers.table import IN_READER, Reader, Table, column
 
 
-def read_parquet(path: Path, _: ReaderOptions) -> Table:
+def check_claim(path: Path, size: float, options: ReaderOptions) -> None:
+    """Refuse a file whose values would take more bytes of memory than the options allow.
+
+    A few bytes can claim any number of values, so this is asked before room is made for them.
+    """
+    if size > 1e6 * options.largest_mb:
+        raise InputError(
+            f"{path}: expected at most {options.largest_mb:g} MB of values, the file claims "
+            f"{size / 1e6:.4g} MB; if it is right, type a larger `largest_mb` {IN_READER}"
+        )
+
+
+def read_parquet(path: Path, options: ReaderOptions) -> Table:
     """Read columns."""
     import pyarrow as pa  # noqa: PLC0415
     import pyarrow.parquet as pq  # noqa: PLC0415
 
     with pq.ParquetFile(path) as file:
+        check_claim(path, 8.0 * file.metadata.num_rows * file.metadata.num_columns, options)
         table = file.read(use_threads=False)
     plain = [
         values.cast(values.type.value_type) if pa.types.is_dictionary(values.type) else values
@@ -33,51 +47,62 @@ def read_parquet(path: Path, _: ReaderOptions) -> Table:
     return Table(str(path), tuple(table.column_names), tuple(column(v.to_numpy()) for v in plain))
 
 
-def read_npy(path: Path, _: ReaderOptions) -> Table:
+def read_npy(path: Path, options: ReaderOptions) -> Table:
     """Read an array, of columns or of named fields."""
     # maps the file, so that a damaged header cannot ask for more memory than there is
-    return _of_arrays(path, {"": np.lib.format.open_memmap(path, mode="r")})
+    return _of_arrays(path, {"": np.lib.format.open_memmap(path, mode="r")}, options)
 
 
-def read_zip(path: Path, _: ReaderOptions) -> Table:
+def read_zip(path: Path, options: ReaderOptions) -> Table:
     """Read the named arrays of ``.npz``; those of objects are never unpickled."""
     with zipfile.ZipFile(path) as archive:
         members = archive.namelist()
+        size = sum(member.file_size for member in archive.infolist())
     if "[Content_Types].xml" in members:
         raise InputError(f"{path}: expected a recording, got an Excel workbook; save it as CSV")
     if not members or not all(name.endswith(".npy") for name in members):
         shown = ", ".join(members[:5])
         raise InputError(f"{path}: expected a recording, got a zip archive ({shown}); unpack it")
+    check_claim(path, size, options)
     arrays: dict[str, NDArray[Any]] = {}
     with np.load(path, allow_pickle=False) as stored:
         for name in stored:
             with suppress(ValueError):  # of objects; damage is a BadZipFile
                 arrays[name] = stored[name]
-    return _of_arrays(path, arrays)
+    return _of_arrays(path, arrays, options)
 
 
-def read_mat(path: Path, _: ReaderOptions) -> Table:
+def read_mat(path: Path, options: ReaderOptions) -> Table:
     """Read arrays and structures of MATLAB 5 to 7."""
     import scipy.io  # noqa: PLC0415
 
-    mat5.check(path.read_bytes())
+    mat5.check(path.read_bytes(), partial(check_claim, path, options=options))
     variables = scipy.io.loadmat(path, simplify_cells=True)
-    return _of_arrays(path, {k: v for k, v in variables.items() if not k.startswith("__")})
+    variables = {k: v for k, v in variables.items() if not k.startswith("__")}
+    return _of_arrays(path, variables, options)
 
 
-def read_hdf5(path: Path, _: ReaderOptions) -> Table:
+def read_hdf5(path: Path, options: ReaderOptions) -> Table:
     """Read HDF5, as MATLAB 7.3 writes it too; groups named ``#…`` are what its cells refer to."""
     import h5py  # noqa: PLC0415
 
-    arrays: dict[str, NDArray[Any]] = {}
+    datasets: list[Any] = []
 
     def add(name: str, data: Any) -> None:
         if isinstance(data, h5py.Dataset) and not name.startswith("#"):
-            arrays[name.replace("/", ".")] = np.asarray(data[()])
+            datasets.append(data)
 
     with h5py.File(path) as file:
         file.visititems(add)
-    return _of_arrays(path, arrays)
+        for data in datasets:
+            if data.external or data.is_virtual:
+                raise InputError(
+                    f"{path}: expected a recording, got {data.name}, whose values are in another "
+                    "file, which is not opened; copy them into this one"
+                )
+        check_claim(path, sum(8.0 * data.size for data in datasets), options)
+        arrays = {data.name[1:].replace("/", "."): np.asarray(data[()]) for data in datasets}
+    return _of_arrays(path, arrays, options)
 
 
 READERS: dict[bytes, Reader] = {
@@ -91,12 +116,13 @@ READERS: dict[bytes, Reader] = {
 """By the first bytes of a file."""
 
 
-def _of_arrays(path: Path, stored: Mapping[str, Any]) -> Table:
+def _of_arrays(path: Path, stored: Mapping[str, Any], options: ReaderOptions) -> Table:
     """Name columns: ``t`` of a vector, ``gyro.x`` of three columns, ``all.0`` of more.
 
     What is in fields of arrays or structures is named by them: ``log.gyro`` is ``gyro`` of ``log``.
     """
     arrays = dict(_arrays_in(stored, ""))
+    check_claim(path, sum(8.0 * array.size for array in arrays.values()), options)
     columns: dict[str, NDArray[Any]] = {}
     for name, array in arrays.items():
         rows = np.squeeze(array)

@@ -184,6 +184,8 @@ def _head(path: Path) -> bytes:
     try:
         if (path / "metadata.yaml").exists():
             return b"#ROSBAG"
+        if path.exists() and not (path.is_file() or path.is_dir()):  # a pipe may wait for ever
+            raise InputError(f"{path}: expected a file, got a pipe, a socket or a device")
         with path.open("rb") as file:
             head = file.read(64)
     except OSError as error:

@@ -16,8 +16,8 @@ from gyro_pipeline.physics.allan import (
     fit_noise,
     mean_variance,
 )
-from gyro_pipeline.physics.bias import recording_mean, sample_sigma, settling_time_s
-from gyro_pipeline.protocol.recordings import one_by_one
+from gyro_pipeline.physics.bias import settling_time_s
+from gyro_pipeline.protocol.recordings import bias_rows, one_by_one
 
 logger = logging.getLogger(__name__)
 
@@ -38,23 +38,15 @@ def measure_allan_variance(recordings: xr.Dataset) -> xr.Dataset:
     rate_hz = recordings.attrs["rate_hz"]
     times_s = averaging_times_s(int(recordings["samples"].max()), rate_hz)
     labels = {name: recordings[name] for name in ("imu", "recording", "axis")}
-    shape = [len(label) for label in labels.values()]
-    variance = np.full((*shape, len(times_s)), np.nan)
-    counts = np.zeros((*shape[:2], len(times_s)), np.int64)
+    shape = tuple(len(label) for label in labels.values())
+    variance = xr.DataArray(np.full((*shape, len(times_s)), np.nan), labels | {"time_s": times_s})
+    differences = xr.zeros_like(variance.isel(axis=0, drop=True), np.int64)
     for imu, number, samples in one_by_one(recordings):
-        place = (
-            labels["imu"].to_index().get_loc(imu),
-            labels["recording"].to_index().get_loc(number),
-        )
-        for axis, row in enumerate(samples):  # masked alike, so all have the same counts
-            variance[*place, axis], counts[place] = allan_variance(row, rate_hz, times_s)
-    return xr.Dataset(
-        {
-            "allan_variance": (("imu", "recording", "axis", "time_s"), variance),
-            "differences": (("imu", "recording", "time_s"), counts),
-        },
-        coords=labels | {"time_s": times_s},
-    )
+        place = {"imu": imu, "recording": number}
+        axes = [allan_variance(axis, rate_hz, times_s) for axis in samples]
+        variance.loc[place] = [values for values, _ in axes]
+        differences.loc[place] = axes[0][1]  # masked alike, so all have the same counts
+    return xr.Dataset({"allan_variance": variance, "differences": differences})
 
 
 def measure_bias(
@@ -68,29 +60,22 @@ def measure_bias(
         ground_truth: The tolerance of the settling time.
 
     Returns:
-        A row per present sensor, imu, recording and axis: ``bias_dps``; its standard error
-        N / sqrt(T), ``standard_error_dps``, where T is the time of all samples that are not masked;
-        ``sample_sigma_dps``; and ``settling_time_s``, after which the running mean stays within the
+        The rows of :func:`~gyro_pipeline.protocol.recordings.bias_rows`, and of each bias its
+        standard error N / sqrt(T), ``standard_error_dps``, where T is the time of all samples that
+        are not masked; and ``settling_time_s``, after which the running mean stays within the
         tolerance.
     """
     rate_hz, tolerance_dps = recordings.attrs["rate_hz"], ground_truth.tolerance_mdps * MDPS
-    white = {imu: figures[:, 0] for imu, (figures, _) in _noise_figures(recordings, allan).items()}
-    tables = [
-        pd.DataFrame(
-            {
-                "sensor": recordings.attrs["sensor"],
-                "imu": imu,
-                "recording": number,
-                "axis": list(AXES),
-                "bias_dps": recording_mean(samples),
-                "standard_error_dps": white[imu] / np.sqrt(_measured(samples) / rate_hz),
-                "sample_sigma_dps": sample_sigma(samples),
-                "settling_time_s": settling_time_s(samples, rate_hz, tolerance_dps),
-            }
-        )
-        for imu, number, samples in one_by_one(recordings)
-    ]
-    return pd.concat(tables, ignore_index=True)
+    noise = _noise_figures(recordings, allan)
+
+    def errors(imu: int, samples: NDArray[np.floating]) -> dict[str, NDArray[np.float64]]:
+        measured_s = np.isfinite(samples[0]).sum() / rate_hz
+        return {
+            "standard_error_dps": noise[imu][0][:, 0] / np.sqrt(measured_s),
+            "settling_time_s": settling_time_s(samples, rate_hz, tolerance_dps),
+        }
+
+    return bias_rows(recordings, errors)
 
 
 def measure_noise(recordings: xr.Dataset, allan: xr.Dataset, bias: pd.DataFrame) -> pd.DataFrame:
@@ -132,22 +117,15 @@ def _noise_figures(
     rate_hz, times_s = recordings.attrs["rate_hz"], allan.time_s.to_numpy()
     shortest_s, figures = SHORTEST_FIT_SAMPLES / rate_hz, {}
     for imu in recordings.imu.to_numpy().tolist():
-        one = allan.sel(imu=imu).transpose("recording", "axis", "time_s")
-        counts = one.differences.to_numpy()
-        durations_s = recordings["samples"].sel(imu=imu).to_numpy() / rate_hz
-        variances = mean_variance(one.allan_variance.to_numpy(), counts[:, None])
+        measured = allan.sel(imu=imu).transpose("recording", "axis", "time_s")
+        counts = measured.differences.to_numpy()
+        total_s = recordings["samples"].sel(imu=imu).to_numpy() / rate_hz @ (counts > 0)
+        variances = mean_variance(measured.allan_variance.to_numpy(), counts[:, None])
         try:
-            fitted = [
-                fit_noise(times_s, v, durations_s @ (counts > 0), shortest_s) for v in variances
-            ]
+            fits = [fit_noise(times_s, axis, total_s, shortest_s) for axis in variances]
         except InputError as error:
             figures[imu] = np.full((len(AXES), len(_FIGURES)), np.nan), str(error)
         else:
-            rows = [(axis.white, axis.instability, axis.random_walk) for axis in fitted]
+            rows = [(fit.white, fit.instability, fit.random_walk) for fit in fits]
             figures[imu] = np.array(rows), ""
     return figures
-
-
-def _measured(samples: NDArray[np.floating]) -> int:
-    """Samples of a recording (axes, n) that are not masked."""
-    return int(np.isfinite(samples[0]).sum())

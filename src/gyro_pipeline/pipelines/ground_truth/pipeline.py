@@ -1,5 +1,8 @@
 """Wiring of the ground-truth stage."""
 
+from collections.abc import Callable
+from typing import Any
+
 from kedro.pipeline import Node, Pipeline
 
 from gyro_pipeline.conventions import ALWAYS
@@ -13,49 +16,29 @@ from gyro_pipeline.pipelines.ground_truth.report import report_biases
 
 def create_report(sensor: str) -> Pipeline:
     """The biases, on the terminal."""
-    stage = f"{sensor}.ground_truth"
-    return Pipeline(
-        [
-            Node(
-                report_biases,
-                [f"{sensor}.raw_logs.recordings", f"{stage}.bias", f"{sensor}.raw_logs.quality"],
-                None,
-                name=f"report_biases_{sensor}",
-                namespace="ground_truth",
-                tags=[sensor, ALWAYS],
-            )
-        ]
-    )
+    logs = f"{sensor}.raw_logs"
+    inputs = [f"{logs}.recordings", f"{sensor}.ground_truth.bias", f"{logs}.quality"]
+    return Pipeline([_node("report_biases", report_biases, inputs, None, sensor, ALWAYS)])
 
 
 def create_pipeline(sensor: str) -> Pipeline:
     """Bias and noise of one sensor's gyroscopes."""
     recordings, stage = f"{sensor}.raw_logs.recordings", f"{sensor}.ground_truth"
+    allan, bias, noise = f"{stage}.allan", f"{stage}.bias", f"{stage}.noise"
+    settings = "params:ground_truth"
     return Pipeline(
         [
-            Node(
-                measure_allan_variance,
-                recordings,
-                f"{stage}.allan",
-                name=f"allan_{sensor}",
-                namespace="ground_truth",
-                tags=[sensor],
-            ),
-            Node(
-                measure_bias,
-                [recordings, f"{stage}.allan", "params:ground_truth"],
-                f"{stage}.bias",
-                name=f"bias_{sensor}",
-                namespace="ground_truth",
-                tags=[sensor],
-            ),
-            Node(
-                measure_noise,
-                [recordings, f"{stage}.allan", f"{stage}.bias"],
-                f"{stage}.noise",
-                name=f"noise_{sensor}",
-                namespace="ground_truth",
-                tags=[sensor],
-            ),
+            _node("allan", measure_allan_variance, [recordings], allan, sensor),
+            _node("bias", measure_bias, [recordings, allan, settings], bias, sensor),
+            _node("noise", measure_noise, [recordings, allan, bias], noise, sensor),
         ]
+    )
+
+
+def _node(
+    name: str, make: Callable[..., Any], inputs: list[str], made: str | None, *tags: str
+) -> Node:
+    """A node of the first tag's sensor."""
+    return Node(
+        make, inputs, made, name=f"{name}_{tags[0]}", namespace="ground_truth", tags=[*tags]
     )

@@ -26,9 +26,8 @@ _WORTH_PROCESSES = 10**8
 """Bytes to read; fewer are read by this process before others have started."""
 _AT_ONCE, _BYTES_AT_ONCE = 16, 16 * 10**6
 """Recordings, and bytes of them, that go to a process together, and come back so."""
-_OF_USED = ("start", "stop", "masked")
-_COLUMNS = ("imu", "recording", "where", "outcome", "rows", *_OF_USED)
-"""What the table has of each recording, and the part that rejected ones lack."""
+_OF_USED = ["start", "stop", "masked"]
+"""What the table says of recordings that are used, and lacks of others."""
 
 
 def inspect_logs(
@@ -43,14 +42,14 @@ def inspect_logs(
         execution: In how many processes.
 
     Yields:
-        What there is to read, then the recordings that were not read before, as they are done.
+        What there is to read, then the recordings that were not read before, in any order.
     """
     code = code_hash("gyro_pipeline.quality", inspection.__name__)
     judged_by = quality.model_dump(mode="json", exclude={"needed_pct"})  # which is of all together
-    settings = [judged_by, files.rate_hz, code]
     jobs = {
         (entry.imu, entry.recording): Inspection(
-            entry, files.rate_hz, quality, fingerprint([entry.key, settings])
+            *(entry, files.rate_hz, quality),
+            key=fingerprint([entry.key, [judged_by, files.rate_hz, code]]),
         )
         for entry in files.entries
     }
@@ -60,17 +59,13 @@ def inspect_logs(
     if len(missing) < len(jobs):
         before = len(jobs) - len(missing)
         logger.info("%s: %d of %d recordings were read before", files.sensor, before, len(jobs))
-    yield from _read(files.sensor, missing, execution)
-
-
-def _read(sensor: str, jobs: Sequence[Inspection], execution: Execution) -> Iterator[Recording]:
-    """Recordings in any order, read here or in several processes."""
-    sizes = [job.entry.size for job in jobs]
+    sizes = [job.entry.size for job in missing]
     if sum(sizes) < _WORTH_PROCESSES:
-        return (judge(job, lambda work: None) for job in jobs)
-    at_once = int(np.clip(_BYTES_AT_ONCE // max(sizes), 1, _AT_ONCE))
-    read = run_jobs(jobs, judge, execution, sensor, "recordings", at_once)
-    return (recording for _, recording in read)
+        yield from (judge(job, lambda work: None) for job in missing)
+    else:
+        at_once = int(np.clip(_BYTES_AT_ONCE // max(sizes), 1, _AT_ONCE))
+        read = run_jobs(missing, judge, execution, files.sensor, "recordings", at_once)
+        yield from (recording for _, recording in read)
 
 
 def quality_table(files: Logs, inspected: Sequence[Recording]) -> pd.DataFrame:
@@ -86,17 +81,16 @@ def quality_table(files: Logs, inspected: Sequence[Recording]) -> pd.DataFrame:
         before ``stop``, and how many of them are ``masked``; ``rate_hz``, measured; ``findings``,
         which count the rows of the file.
     """
-    rows = []
-    for recording in _without_copies(inspected):
-        findings = [f"{finding.check}: {finding.detail}" for finding in recording.findings]
-        row = {name: getattr(recording, name) for name in _COLUMNS}
-        if recording.outcome == REJECTED:
-            row |= dict.fromkeys(_OF_USED)
-        rate_hz = _rounded(recording.rate_hz)
-        rows.append(row | {"rate_hz": rate_hz, "findings": "; ".join(findings) or None})
-    table = pd.DataFrame(rows).rename(columns={"where": "file"})
+    columns = ["imu", "recording", "where", "outcome", "rows", *_OF_USED, "rate_hz", "findings"]
+    table = pd.DataFrame(map(vars, _without_copies(inspected)))[columns]
     table.insert(0, "sensor", files.sensor)
-    return table.astype(dict.fromkeys(_OF_USED, "Int64"))
+    table["findings"] = [
+        "; ".join(f"{finding.check}: {finding.detail}" for finding in findings) or None
+        for findings in table.findings
+    ]
+    table["rate_hz"] = table.rate_hz.map(_rounded)
+    table[_OF_USED] = table[_OF_USED].astype("Int64").mask(table.outcome == REJECTED)
+    return table.rename(columns={"where": "file"})
 
 
 def label_recordings(
@@ -141,8 +135,7 @@ def label_recordings(
         # the reader has rejected those whose rate is far from the expected one
         "rate_hz": _rounded(measured.median()) if len(measured) else files.rate_hz,
     }
-    places = set(used.index)
-    contents = [[*one.place, one.content] for one in inspected if one.place in places]
+    contents = [[*item.place, item.content] for item in inspected if item.place in used.index]
     attributes["data_hash"] = fingerprint([attributes, contents])
     labels = xr.Dataset({"samples": (("imu", "recording"), samples)}, coordinates, attributes)
     if files.drawn is not None:
@@ -160,17 +153,12 @@ def require_enough(table: pd.DataFrame, quality: Quality) -> None:
     Raises:
         InputError: Fewer than ``quality.needed_pct`` percent remain, of all or of the tested IMU.
     """
-    sensor, counts = table.sensor.iloc[0], Counter(table.outcome)
-    logger.info(
-        "%s: %d recordings, %s",
-        *(sensor, len(table)),
-        ", ".join(f"{counts[outcome]} {outcome}" for outcome in (KEPT, REPAIRED, REJECTED)),
-    )
-    rejected = table.outcome == REJECTED
-    first = table.imu.min()
+    sensor, first, counts = table.sensor.iloc[0], table.imu.min(), Counter(table.outcome)
+    ends = ", ".join(f"{counts[outcome]} {outcome}" for outcome in (KEPT, REPAIRED, REJECTED))
+    logger.info("%s: %d recordings, %s", sensor, len(table), ends)
     tested = table[table.imu == first]
     for label, listed in ((sensor, table), (f"{sensor}, the tested IMU {first}", tested)):
-        bad = listed[rejected[listed.index]]
+        bad = listed[listed.outcome == REJECTED]
         remain = len(listed) - len(bad)
         if 100 * remain < quality.needed_pct * len(listed):
             raise InputError(
@@ -178,7 +166,7 @@ def require_enough(table: pd.DataFrame, quality: Quality) -> None:
                 f"asks for {quality.needed_pct:g} %. Repair or remove the others, or lower it:\n  "
                 + "\n  ".join(reasons(bad))
             )
-    lost = sorted(set(table.imu) - set(table.imu[~rejected]))
+    lost = sorted(set(table.imu) - set(table.imu[table.outcome != REJECTED]))
     if lost:
         shown = ", ".join(map(str, lost[:NAMED])) + (", …" if len(lost) > NAMED else "")
         logger.warning("%s: no recording is left of IMU %s", sensor, shown)

@@ -1,5 +1,8 @@
 """Wiring of the raw-logs stage."""
 
+from collections.abc import Callable
+from typing import Any
+
 from kedro.pipeline import Node, Pipeline
 
 from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs, label_recordings, quality_table
@@ -7,38 +10,17 @@ from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs, label_recording
 
 def create_pipeline(sensor: str) -> Pipeline:
     """Recordings of one sensor."""
-    stage = f"{sensor}.raw_logs"
+    stage, quality, settings = f"{sensor}.raw_logs", "params:quality", "params:execution"
+    files, inspected, table = f"{stage}.files", f"{stage}.inspected", f"{stage}.quality"
+    labelled = [files, inspected, table, quality, "params:splits"]
+    nodes: list[tuple[str, Callable[..., Any], list[str], str]] = [
+        ("inspect", inspect_logs, [files, f"{stage}.earlier", quality, settings], inspected),
+        ("quality_table", quality_table, [files, inspected], table),
+        ("label", label_recordings, labelled, f"{stage}.recordings"),
+    ]
     return Pipeline(
         [
-            Node(
-                inspect_logs,
-                [f"{stage}.files", f"{stage}.earlier", "params:quality", "params:execution"],
-                f"{stage}.inspected",
-                name=f"inspect_{sensor}",
-                namespace="raw_logs",
-                tags=[sensor],
-            ),
-            Node(
-                quality_table,
-                [f"{stage}.files", f"{stage}.inspected"],
-                f"{stage}.quality",
-                name=f"quality_table_{sensor}",
-                namespace="raw_logs",
-                tags=[sensor],
-            ),
-            Node(
-                label_recordings,
-                [
-                    f"{stage}.files",
-                    f"{stage}.inspected",
-                    f"{stage}.quality",
-                    "params:quality",
-                    "params:splits",
-                ],
-                f"{stage}.recordings",
-                name=f"label_{sensor}",
-                namespace="raw_logs",
-                tags=[sensor],
-            ),
+            Node(make, inputs, made, name=f"{name}_{sensor}", namespace="raw_logs", tags=[sensor])
+            for name, make, inputs, made in nodes
         ]
     )

@@ -8,7 +8,6 @@ import pandas as pd
 import xarray as xr
 
 from gyro_pipeline.conventions import (
-    AXES,
     BY_RECORDING,
     K_FOLD,
     LEAVE_ONE_DEVICE_OUT,
@@ -21,13 +20,18 @@ from gyro_pipeline.conventions import (
 )
 from gyro_pipeline.fingerprints import data_hash
 from gyro_pipeline.parameters import Only, Splits, Study
-from gyro_pipeline.physics.bias import recording_mean, sample_sigma
 from gyro_pipeline.pipelines.windowed_splits.protocols import (
     PROTOCOLS,
     Candidates,
     check_table,
 )
-from gyro_pipeline.protocol.recordings import common_length, cut, one_by_one, tested_imu
+from gyro_pipeline.protocol.recordings import (
+    bias_rows,
+    common_length,
+    cut,
+    one_by_one,
+    tested_imu,
+)
 from gyro_pipeline.protocol.windows import describe_losses, usable_windows, window_size
 from gyro_pipeline.studies import study_rows
 
@@ -78,7 +82,7 @@ def cut_to_common_length(
     alike = cut(recordings, length)
     if (lengths != length).any():
         _log_lengths(recordings.attrs["sensor"], quality, length, rate_hz)
-        bias = _biases(alike)
+        bias = bias_rows(alike)
     else:
         logger.info("%s: all recordings are %.1f s", recordings.attrs["sensor"], length / rate_hz)
     means = bias.set_index([*_PLACE, "axis"]).bias_dps.to_xarray()
@@ -106,23 +110,6 @@ def _log_lengths(sensor: str, quality: pd.DataFrame, length: int, rate_hz: float
         *(first.imu, first.recording, first.file),
         f", and leave out {', '.join(left_out[:5])}{', …' * (len(left_out) > 5)}" * bool(left_out),  # noqa: PLR2004
     )
-
-
-def _biases(recordings: xr.Dataset) -> pd.DataFrame:
-    tables = [
-        pd.DataFrame(
-            {
-                "sensor": recordings.attrs["sensor"],
-                "imu": imu,
-                "recording": number,
-                "axis": list(AXES),
-                "bias_dps": recording_mean(samples),
-                "sample_sigma_dps": sample_sigma(samples),
-            }
-        )
-        for imu, number, samples in one_by_one(recordings)
-    ]
-    return pd.concat(tables, ignore_index=True)
 
 
 def split_windows(  # noqa: PLR0917 - a node's arguments are its datasets
