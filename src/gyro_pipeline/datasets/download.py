@@ -22,7 +22,6 @@ from tenacity import (
 from tqdm import tqdm
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.datasets.atomic import in_the_way
 
 _LOG = logging.getLogger(__name__)
 
@@ -58,8 +57,6 @@ def ensure(url: str, path: Path, blob: str) -> None:
             _fetch(url, path, blob)
         except requests.RequestException as error:  # also an OSError
             raise InputError(_no_answer(url, path, error)) from error
-        except OSError as error:
-            raise InputError(in_the_way(path, error)) from error
     found = _blob_id_of(path)
     if found != blob:
         raise InputError(

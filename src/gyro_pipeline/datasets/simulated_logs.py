@@ -3,6 +3,7 @@
 import hashlib
 import json
 import logging
+import math
 import zlib
 from collections.abc import Mapping
 from dataclasses import replace
@@ -15,7 +16,7 @@ from pydantic import ValidationError
 
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 from gyro_pipeline.datasets.array_logs import LAYOUT, ArrayLogs
-from gyro_pipeline.datasets.atomic import replacing
+from gyro_pipeline.datasets.atomic import replacing, require_room
 from gyro_pipeline.datasets.log_source import LogSource
 from gyro_pipeline.datasets.recordings import Recordings, open_recordings
 from gyro_pipeline.logs import Logs
@@ -238,4 +239,5 @@ def _new_array(
     path: Path, recordings: int, entry: SimulatedSensor
 ) -> np.memmap[Any, np.dtype[Any]]:
     shape = (recordings, entry.imus * len(AXES), entry.samples)
+    require_room(path, 4 * math.prod(shape))  # a mapped file that outgrows the disk is a crash
     return np.lib.format.open_memmap(path, mode="w+", dtype=np.float32, shape=shape)
