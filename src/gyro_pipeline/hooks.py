@@ -6,22 +6,23 @@ Every ``kedro`` command imports this file, so it imports what is large only wher
 import getpass
 import hashlib
 import logging
+import os
 import platform
 import shlex
 import subprocess
 import sys
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import chdir, contextmanager
 from importlib.metadata import version
 from pathlib import Path
-from traceback import walk_tb
-from types import NoneType, TracebackType
+from types import NoneType
 from typing import TYPE_CHECKING, Any
 
-import kedro
 from kedro.framework.hooks import hook_impl
 from kedro.framework.session import KedroSession
 
+from gyro_pipeline import boundary, run_lock
 from gyro_pipeline.conventions import InputError, Missing
 
 if TYPE_CHECKING:
@@ -34,16 +35,19 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_OTHER_ARGUMENTS = "must only contain arguments valid for the constructor"
-"""In Kedro's words: a key of a catalog entry is unknown, or lacking."""
-
+_WITHOUT_EFFECT = ("execution", "only")
+"""Settings that change how much is made, and how, but no number."""
 
 _NAMES_NODES = ("node_names", "from_nodes", "to_nodes", "from_inputs", "to_outputs", "tags")
 """Options that name nodes: these are run, whether they are up to date or not."""
 
 
 class Session(KedroSession):
-    """A session that runs what changed, and refuses ways to run which cannot end well."""
+    """A session that runs what changed, alone in its project, and from wherever it was started."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        boundary.install(self._project_path)
 
     def run(self, *arguments: Any, **options: Any) -> dict[str, Any]:
         """Run pipelines, as :meth:`kedro.framework.session.KedroSession.run` does.
@@ -51,7 +55,6 @@ class Session(KedroSession):
         Raises:
             InputError: The runner or an option is of no use here.
         """
-        sys.excepthook = _explain
         from kedro.runner import ParallelRunner, SequentialRunner  # noqa: PLC0415
 
         runner = options.get("runner")
@@ -70,11 +73,38 @@ class Session(KedroSession):
                 "--async: results are saved one by one as they are made, which Kedro cannot do in "
                 "the background; type kedro run without it"
             )
-        if type(runner) in (SequentialRunner, NoneType) and not any(map(options.get, _NAMES_NODES)):
-            from gyro_pipeline.runner import ChangedNodesRunner  # noqa: PLC0415
+        project = self._project_path
+        run_lock.check_folder(project)
+        every_node = not any(map(options.get, _NAMES_NODES))
+        interrupts = run_lock.Interrupts()
+        self._hook_manager.register(interrupts)
+        with self._in_project(), run_lock.only_run(project / "data" / "run.lock"):
+            if type(runner) in (SequentialRunner, NoneType) and every_node:
+                from gyro_pipeline.runner import ChangedNodesRunner  # noqa: PLC0415
 
-            options["runner"] = ChangedNodesRunner(self._project_path / "data" / "ended_nodes.json")
-        return super().run(*arguments, **options)
+                options["runner"] = ChangedNodesRunner(project / "data" / "ended_nodes.json")
+            try:
+                with interrupts.heard():
+                    return super().run(*arguments, **options)
+            except KeyboardInterrupt:
+                logger.error(
+                    "interrupted: what is finished is stored, and the same command goes on"
+                )
+                raise
+            finally:
+                self._hook_manager.unregister(interrupts)
+
+    @contextmanager
+    def _in_project(self) -> Iterator[None]:
+        """Paths and log settings are those of the project, wherever the command was typed."""
+        if Path.cwd() != self._project_path and "KEDRO_LOGGING_CONFIG" not in os.environ:
+            import yaml  # noqa: PLC0415
+            from kedro.framework.project import configure_logging  # noqa: PLC0415
+
+            settings = self._project_path / "conf" / "logging.yml"
+            configure_logging(yaml.safe_load(settings.read_text(encoding="utf-8")))
+        with chdir(self._project_path):
+            yield
 
 
 class Preflight:
@@ -93,7 +123,6 @@ class Preflight:
         from gyro_pipeline.parameters import Parameters  # noqa: PLC0415
 
         self._project = Path(context.project_path)
-        sys.excepthook = _explain
         given = context.config_loader["parameters"]
         try:
             self._parameters = Parameters(**given)
@@ -106,15 +135,27 @@ class Preflight:
         self, run_params: dict[str, Any], pipeline: "Pipeline", catalog: "CatalogProtocol"
     ) -> None:
         """Check what these pipelines ask for, and that every result can be written."""
-        from gyro_pipeline.datasets.atomic import check_writable  # noqa: PLC0415
+        from gyro_pipeline.datasets.atomic import check_writable, remove_leftovers  # noqa: PLC0415
+        from gyro_pipeline.datasets.stored import StoredFile  # noqa: PLC0415
+        from gyro_pipeline.datasets.tracked_runs import TrackedRuns  # noqa: PLC0415
         from gyro_pipeline.studies import DEFAULT, check_possible  # noqa: PLC0415
 
-        if self._parameters is not None:
-            check_possible(self._parameters, run_params["pipeline_names"] or [DEFAULT])
-            _check_logs_are_read(self._parameters, self._project, pipeline, catalog)
-        for name in sorted(pipeline.all_outputs()):
-            for path in _paths(catalog.get(name)):
-                check_writable(path)
+        assert self._parameters is not None
+        check_possible(self._parameters, run_params["pipeline_names"] or [DEFAULT])
+        _check_logs_are_read(self._parameters, self._project, pipeline, catalog)
+        for name in sorted(pipeline.datasets()):
+            if isinstance(dataset := catalog.get(name), TrackedRuns):
+                dataset.check_reachable()
+        outputs = {path for name in pipeline.all_outputs() for path in _paths(catalog.get(name))}
+        for path in sorted(outputs):
+            check_writable(path)
+        for folder in sorted({path.parent for path in outputs}):
+            remove_leftovers(folder)
+        settings = _settings(self._parameters)
+        _hand_over(settings, pipeline, catalog)
+        for name in sorted(pipeline.inputs()):
+            if isinstance(dataset := catalog.get(name), StoredFile):
+                dataset.check_made_with(settings)
 
     @hook_impl
     def before_node_run(self, node: "Node", inputs: dict[str, Any]) -> None:
@@ -178,8 +219,7 @@ class Provenance:
             "python": platform.python_version(),
             **{name: version(name) for name in ("torch", "numpy", "gyro-pipeline")},
             "lock_hash": _file_hash(project / "requirements.lock"),
-            "mlflow.source.git.commit": _git(project, "rev-parse", "HEAD"),
-            "git_dirty": str(bool(_git(project, "status", "--porcelain"))),
+            **_version(project),
             "mlflow.user": _user(),
             "mlflow.source.name": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
             "mlflow.source.type": "LOCAL",
@@ -189,6 +229,34 @@ class Provenance:
             if isinstance(dataset, TrackedRuns):
                 dataset.provenance |= tags
                 dataset.changed = self._changed
+
+
+def _settings(parameters: "Parameters") -> dict[str, Any]:
+    """All parameters, and each study by the name that nodes ask for it by, as JSON holds them."""
+    given = parameters.model_dump(mode="json")
+    return given | {f"studies.{name}": study for name, study in given["studies"].items()}
+
+
+def _hand_over(given: dict[str, Any], pipeline: "Pipeline", catalog: "CatalogProtocol") -> None:
+    """Tell each stored file with which settings, and from which other ones, it is made."""
+    from gyro_pipeline.datasets.stored import StoredFile  # noqa: PLC0415
+
+    passed: dict[str, tuple[dict[str, Any], list[StoredFile]]] = {}  # on in memory
+    for node in pipeline.nodes:
+        names = [name.removeprefix("params:") for name in node.inputs if name.startswith("params:")]
+        settings = {name: given[name] for name in names if name not in _WITHOUT_EFFECT}
+        sources = []
+        for name in node.inputs:
+            if isinstance(source := catalog.get(name), StoredFile):
+                sources.append(source)
+            elif name in passed:
+                settings |= passed[name][0]
+                sources += passed[name][1]
+        for name in node.outputs:
+            if isinstance(dataset := catalog.get(name), StoredFile):
+                dataset.settings, dataset.sources = settings, sources
+            else:
+                passed[name] = settings, sources
 
 
 def _changed(base: Mapping[str, Any], given: Mapping[str, Any]) -> frozenset[str]:
@@ -244,31 +312,6 @@ def _user() -> str:
         return "unknown"
 
 
-def _explain(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Print what is wrong with an input or a command, without the way Kedro took to find it."""
-    from kedro.io import DatasetError  # noqa: PLC0415
-
-    cause: BaseException | None = error
-    while cause is not None and not isinstance(cause, InputError):
-        cause = cause.__cause__
-    if cause is not None:
-        logger.error("error: %s", cause)
-    elif isinstance(error, DatasetError) and _OTHER_ARGUMENTS in str(error):
-        logger.error("error: catalog: %s", " ".join(str(error).split()))
-    elif isinstance(error, ValueError) and _is_about_the_command(trace):
-        logger.error("error: %s", " ".join(str(error).split()))
-    else:
-        sys.__excepthook__(kind, error, trace)
-
-
-def _is_about_the_command(trace: TracebackType | None) -> bool:
-    """Whether Kedro itself refused what it was asked for, before a node ran."""
-    files = [Path(frame.f_code.co_filename) for frame, _ in walk_tb(trace)]
-    kedros = Path(kedro.__file__).parent
-    in_runner = any(file.is_relative_to(kedros / "runner") for file in files)
-    return bool(files) and files[-1].is_relative_to(kedros) and not in_runner
-
-
 def _explained(error: "ValidationError") -> str:
     from gyro_pipeline.parameters import ReaderOptions  # noqa: PLC0415
 
@@ -298,12 +341,23 @@ def _file_hash(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16] if path.exists() else "no lock file"
 
 
-def _git(project: Path, *arguments: str) -> str:
-    """What git says; nothing where the project is no checkout or git is absent."""
+def _version(project: Path) -> dict[str, str]:
+    """The commit of the project, and whether files differ from it; unknown if git cannot say."""
+    tags = dict.fromkeys(("mlflow.source.git.commit", "git_dirty"), "unknown")
+    top = _git(project, "rev-parse", "--show-toplevel")
+    if top is None or Path(top).resolve() != project.resolve():  # none, or of another project
+        return tags
+    commit, changes = _git(project, "rev-parse", "HEAD"), _git(project, "status", "--porcelain")
+    if commit is None or changes is None:
+        return tags
+    return {"mlflow.source.git.commit": commit, "git_dirty": str(bool(changes))}
+
+
+def _git(project: Path, *arguments: str) -> str | None:
+    """What git says; None where the project is no checkout of this user, or git is absent."""
+    command = ["git", "-C", str(project), *arguments]
     try:
-        done = subprocess.run(
-            ["git", "-C", str(project), *arguments], capture_output=True, text=True, check=False
-        )
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
     except OSError:
-        return ""
-    return done.stdout.strip()
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None

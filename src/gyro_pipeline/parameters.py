@@ -14,6 +14,7 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    Strict,
     ValidationInfo,
     field_validator,
     model_validator,
@@ -22,18 +23,20 @@ from pydantic import (
 from gyro_pipeline.conventions import AXES, LEAVE_ONE_DEVICE_OUT, InputError
 from gyro_pipeline.units import read_unit
 
-PerAxis = tuple[float, float, float]
+Size = Annotated[float, Field(ge=0)]
+PerAxis = Annotated[tuple[Size, Size, Size], Strict(False)]
 Seconds = Annotated[float, Field(gt=0)]
 Gyroscopes = Annotated[int, Field(ge=0, multiple_of=len(AXES), description="a count of axes")]
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
 LEAST_BLOCKS = 10
 """Whose means quality control compares: the scatter of fewer is not known well enough."""
 
 
 class Parameter(BaseModel):
-    """Base of all groups: no unknown keys, no change after loading."""
+    """Base of all groups: no unknown keys, numbers that are numbers and finite, no change."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
 def _refuse_twice(name: str, values: Sequence[Any]) -> None:
@@ -46,14 +49,14 @@ class WarmUp(Parameter):
 
     amplitude_mdps: float = Field(description="its mean over power-ons, at power-on")
     spread_mdps: float = Field(ge=0, description="its standard deviation over power-ons")
-    time_constant_s: tuple[Seconds, Seconds] = Field(
+    time_constant_s: Annotated[tuple[Seconds, Seconds], Strict(False)] = Field(
         description="shortest and longest, uniform between them; one number: of all power-ons"
     )
 
     @field_validator("time_constant_s", mode="before")
     @classmethod
     def _one_number_is_both(cls, value: Any) -> Any:
-        return (value, value) if isinstance(value, int | float) else value
+        return (value, value) if type(value) in (int, float) else value
 
     @field_validator("time_constant_s")
     @classmethod
@@ -100,7 +103,6 @@ class Sensor(Parameter):
     rate_hz: float | None = Field(
         default_factory=_implied_rate,
         gt=0,
-        allow_inf_nan=False,
         description="expected sample rate; else samples / recording_s, or what timestamps say",
     )
     simulated: SimulatedNoise | None = None
@@ -138,7 +140,7 @@ class SimulatedSensor(Sensor):
 
 
 Column = Annotated[str | Annotated[int, Field(ge=0)], Field(description="a name, or from 0")]
-Triple = tuple[Column, Column, Column]
+Triple = Annotated[tuple[Column, Column, Column], Strict(False)]
 
 
 class ReaderOptions(Parameter):
@@ -165,11 +167,9 @@ class ReaderOptions(Parameter):
         None, description="of the rates: any of angle per time, or raw; of the angle, of increments"
     )
     scale_dps: float | None = Field(
-        None, gt=0, allow_inf_nan=False, description="deg/s in one count; with units: raw only"
+        None, gt=0, description="deg/s in one count; with units: raw only"
     )
-    offset: float | None = Field(
-        None, allow_inf_nan=False, description="count of a rate of 0; with units: raw only"
-    )
+    offset: float | None = Field(None, description="count of a rate of 0; with units: raw only")
     signed_bits: int | None = Field(
         None, ge=2, le=32, description="of signed counts that were written as unsigned ones"
     )
@@ -313,7 +313,7 @@ class VirtualGyros(Parameter):
     turn_on_jitter_mdps: float = Field(
         ge=0, description="0: one bias for all recordings of a virtual gyroscope, as in the paper"
     )
-    seed: int
+    seed: Seed
 
 
 class Splits(Parameter):
@@ -330,7 +330,7 @@ class Splits(Parameter):
     k_fold_below: int = Field(ge=0, description="fewer recordings than this: k-fold by recording")
     leave_one_out_up_to: int = Field(ge=0, description="so many recordings: one fold each")
     folds: int = Field(ge=2, description="of a k-fold that is not leave-one-out")
-    split_seed: int
+    split_seed: Seed
 
 
 class NetworkSizes(Parameter):
@@ -354,9 +354,9 @@ class Training(NetworkSizes):
     centring: Literal["per_device", "global"] = Field(
         description="subtract each gyroscope's own training mean, or one mean for all"
     )
-    epochs: int = Field(ge=1)
+    epochs: int = Field(ge=1, le=10**6)
     batch_size: int = Field(ge=1)
-    learning_rate: float = Field(gt=0)
+    learning_rate: float = Field(gt=0, le=1, description="of Adam, at the first epoch")
     decay: float = Field(gt=0, le=1, description="factor on the learning rate ...")
     decay_every: int = Field(ge=1, description="... after so many epochs")
     stop_below: float = Field(
@@ -367,17 +367,33 @@ class Training(NetworkSizes):
     steps: int | None = Field(
         None,
         ge=1,
+        le=10**7,
         description="of the optimiser, at least: in place of epochs, of which the number of "
         "windows then decides how many there are; null: epochs",
     )
 
+    @model_validator(mode="after")
+    def _there_is_something_to_train(self) -> Self:
+        if self.steps is None:
+            self.learning_rates(1)
+        return self
+
     def learning_rates(self, windows: int) -> np.ndarray:
-        """Learning rate of every epoch until the end, shape (epochs,), for so many windows."""
+        """Learning rate of every epoch until the end, shape (epochs,), for so many windows.
+
+        Raises:
+            InputError: The end comes before the first epoch.
+        """
         epochs = self.epochs
         if self.steps is not None:
             epochs = -(-self.steps // -(-windows // self.batch_size))
         rates = self.learning_rate * self.decay ** (np.arange(epochs) // self.decay_every)
         to_come = rates[::-1].cumsum()[::-1]
+        if to_come[0] < self.stop_below:
+            raise InputError(
+                f"stop_below: {self.stop_below:g} leaves no epoch to train, as all learning rates "
+                f"sum to {to_come[0]:.3g}; expected less"
+            )
         return rates[to_come >= self.stop_below]
 
 
@@ -395,7 +411,7 @@ class Evaluation(Parameter):
     """Intervals over test recordings."""
 
     resamples: int = Field(ge=100, description="of the clustered bootstrap")
-    bootstrap_seed: int
+    bootstrap_seed: Seed
 
 
 class Grid(Parameter):
@@ -436,7 +452,7 @@ class Study(Parameter):
         description="beside the running mean; names of gyro_pipeline.estimators, or "
         "package.module:Class",
     )
-    windows_s: list[Annotated[float, Field(gt=0)]] | None = Field(
+    windows_s: list[Seconds] | None = Field(
         None, min_length=1, description="its own; null: those of all studies"
     )
     default: bool = Field(True, description="part of `kedro run` and `--pipeline=reporting`")
@@ -531,8 +547,8 @@ class Only(Parameter):
     sensor: str | None = None
     real_gyros: Gyroscopes | None = None
     virtual_gyros: Gyroscopes | None = None
-    window_s: float | None = None
-    seed: int | None = None
+    window_s: Seconds | None = None
+    seed: Seed | None = None
 
 
 class PublishedResult(Parameter):
@@ -555,7 +571,9 @@ class PublishedSpecification(Parameter):
     section: str
     sensor: str
     name: str = Field(description="as the paper writes it")
-    rate_hz: tuple[float, float] = Field(description="lowest and highest sample rate, Hz")
+    rate_hz: Annotated[tuple[float, float], Strict(False)] = Field(
+        description="lowest and highest sample rate, Hz"
+    )
     noise_density_mdps_rthz: float | None = Field(description="one-sided, mdps/sqrt(Hz)")
     bias_stability_dph: float | None = Field(description="bias instability, deg/h")
 
@@ -612,8 +630,8 @@ class Parameters(Parameter):
     training: Training
     execution: Execution
     evaluation: Evaluation
-    windows_s: list[Annotated[float, Field(gt=0)]] = Field(min_length=1)
-    seeds: list[int] = Field(min_length=1)
+    windows_s: list[Seconds] = Field(min_length=1)
+    seeds: list[Seed] = Field(min_length=1)
     studies: dict[str, Study]
     only: Only
     published: Published

@@ -1,7 +1,8 @@
 """Runs the nodes whose inputs, settings or code changed, and says which are left as they are.
 
 The fingerprint of a node is a hash of the package's code, of its parameters and of its inputs: of
-an input that a node makes, the fingerprint of that node; of any other, the state of the dataset.
+an input that a node makes, the fingerprint of that node; of any other, the state of the dataset,
+which is the digest of a stored file (:mod:`gyro_pipeline.datasets.stored`).
 A node that ends leaves its fingerprint in a file. It is run again if that is another one, or if
 what it stored is not there or was changed since.
 """
@@ -20,6 +21,7 @@ from pluggy import PluginManager
 
 from gyro_pipeline.conventions import ALWAYS
 from gyro_pipeline.datasets.atomic import replacing
+from gyro_pipeline.datasets.stored import digest_of
 from gyro_pipeline.estimators import ESTIMATORS
 from gyro_pipeline.fingerprints import code_hash, fingerprint
 
@@ -138,9 +140,7 @@ def _state(name: str, catalog: CatalogProtocol) -> Any:
     if hasattr(dataset, "state"):
         return dataset.state()
     path = Path(dataset._describe().get("filepath", ""))
-    if not path.is_file():
-        return None
-    return [path.stat().st_size, path.stat().st_mtime_ns]
+    return digest_of(path) if path.is_file() else None
 
 
 def _states(node: Node, catalog: CatalogProtocol) -> list[Any]:

@@ -14,7 +14,7 @@ import numpy as np
 if TYPE_CHECKING:
     from gyro_pipeline.estimators.base import Estimator
 
-LAYOUT = "2"
+LAYOUT = "3"
 """Layout of runs. Earlier ones carry no such tag and are never read: their metrics meant else."""
 
 LAYOUT_TAG = "layout"

@@ -403,12 +403,13 @@ def test_after_a_kill_trained_runs_are_evaluated_and_others_continued(store):
 
 
 def unfinished(store, seed=0, **owner):
-    """A run that lacks a fit, and the owner it is left with: host, pid, started."""
+    """A run that lacks a fit, and the owner it is left with: host, pid, started, written."""
     tracked(store).save(fitted(fold="fold 0", folds=("fold 0", MODEL), seed=seed))
     client = MlflowClient(f"sqlite:///{store}")
     experiment = client.get_experiment_by_name("real2real").experiment_id
     newest, *_ = client.search_runs([experiment], f"params.seed = '{seed}'")
-    before = dict(zip(("host", "pid", "started"), newest.data.tags["process"].split(), strict=True))
+    names = "host", "pid", "started", "written"
+    before = dict(zip(names, newest.data.tags["process"].split(), strict=True))
     client.set_tag(newest.info.run_id, "process", " ".join((before | owner).values()))
     return newest.info.run_id
 
@@ -436,7 +437,8 @@ def gone():
     [
         ({"pid": "gone"}, "KILLED"),
         ({"started": "1.5"}, "KILLED"),  # another process got its number
-        ({"host": "elsewhere", "pid": "gone"}, "RUNNING"),  # cannot be known from here
+        ({"host": "elsewhere", "pid": "gone"}, "RUNNING"),  # cannot be known from here ...
+        ({"host": "elsewhere", "written": "1700000000"}, "KILLED"),  # ... but is long silent
     ],
 )
 def test_whose_process_is_gone_is_told_by_host_number_and_start(store, gone, owner, status):
@@ -465,12 +467,6 @@ def test_a_run_that_is_not_described_yet_is_described_when_it_is_continued(store
     (run,) = tracked(store).load()
     assert (run.run_id, run.fits, run.trained) == (run_id, {"fold 0", MODEL}, True)
     assert run.params["sensor"] == "dot"
-
-
-def test_a_fold_whose_name_was_cut_off_is_fitted_again(store):
-    run_id = unfinished(store)
-    MlflowClient(f"sqlite:///{store}").set_tag(run_id, "fits", "fold 0; fold 66")
-    assert [run.fits for run in tracked(store).load()] == [{"fold 0"}]
 
 
 def test_a_fit_that_cannot_be_written_is_not_taken_for_stored(store):
@@ -506,7 +502,7 @@ def test_a_link_opens_the_runs_of_a_study_best_first(store):
     assert run_link(sensors[:1]) == f"{address}&viewStateShareKey=runs_simulated_dot"
     tags = MlflowClient(f"sqlite:///{store}").get_experiment("1").tags
     view = json.loads(tags["mlflow.sharedViewState.runs_simulated_dot"])
-    wanted = "tags.layout = '2' and params.source = 'simulated' and params.sensor = 'dot'"
+    wanted = "tags.layout = '3' and params.source = 'simulated' and params.sensor = 'dot'"
     assert view["searchFilter"] == wanted
     assert view["orderByKey"] == "metrics.`accuracy_gain_pct`"
 
@@ -658,3 +654,116 @@ def test_a_tracking_uri_of_the_environment_wins(store, new_store, tmp_path, monk
     assert tracked(tmp_path / "none.db").exists()
     monkeypatch.delenv("MLFLOW_TRACKING_URI")
     assert tracked(store).load() == []
+
+
+def evaluated(store, seed=0, trained=False):
+    """A finished run with its history, scores and errors."""
+    runs = tracked(store)
+    if not trained:
+        runs.save(fitted(estimator=Constant(seed, history(3)), seed=seed))
+    run = next(run for run in runs.load() if run.params["seed"] == str(seed))
+    table = pd.DataFrame({"error_dps": [1e-3, seed * 1e-3]})
+    artifacts = {"errors.parquet": table, "scores.csv": table}
+    given = {"evaluated_with": "x"}
+    runs.save(EvaluatedRun(run.run_id, {"rmse_mdps": 1.0 + seed}, given, artifacts))
+    return run.run_id
+
+
+def flip(path):
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+DAMAGES = [
+    *(("errors.parquet", flip), ("scores.csv", Path.unlink), ("history.csv", flip)),
+    *(("estimator.pkl", flip), ("estimator.pkl", Path.unlink)),
+]
+
+
+@pytest.mark.parametrize(("name", "damage"), DAMAGES)
+def test_a_damaged_artifact_sets_its_run_back_and_no_other(store, name, damage, caplog):
+    run_id, other = evaluated(store), evaluated(store, seed=1)
+    (path,) = (path for path in store.parent.rglob(name) if is_of(path, run_id, store))
+    damage(path)
+    (there,) = (run for run in tracked(store).load() if run.run_id == other)
+    assert there.finished
+    (broken,) = (run for run in tracked(store).load() if run.run_id == run_id)
+    again = "trained" if name in ("history.csv", "estimator.pkl") else "evaluated"
+    assert f"run {run_id}: damaged or not there: " in caplog.text
+    assert f"it is {again} again" in caplog.text
+    assert not broken.finished
+    assert "evaluated_with" not in broken.tags
+    assert broken.trained == (again == "evaluated")
+    assert evaluated(store, trained=broken.trained) == run_id
+    assert all(run.finished for run in tracked(store).load())
+
+
+def is_of(path, run_id, store):
+    model = MlflowClient(f"sqlite:///{store}").get_run(run_id).outputs.model_outputs[0].model_id
+    return run_id in path.parts or model in path.parts
+
+
+def test_artifacts_of_two_runs_that_changed_places_are_told(store):
+    evaluated(store)
+    evaluated(store, seed=1)
+    one, other = sorted(store.parent.rglob("errors.parquet"))
+    one.rename(one.with_name("kept"))
+    other.rename(one)
+    one.with_name("kept").rename(other)
+    assert [run.finished for run in tracked(store).load()] == [False, False]
+
+
+def test_an_artifact_that_is_damaged_after_its_run_was_loaded_is_refused(store):
+    run_id = evaluated(store)
+    (run,) = tracked(store).load()
+    flip(next(store.parent.rglob("errors.parquet")))
+    with pytest.raises(InputError, match=f"run {run_id}: .* type the same command again"):
+        run.load("errors.parquet")
+    assert not tracked(store).load()[0].finished
+
+
+@pytest.mark.parametrize("table", ["params", "latest_metrics"])
+def test_edited_values_of_a_run_are_told(store, table):
+    run_id = evaluated(store)
+    with sqlite3.connect(store) as connection:
+        names = ("params", "seed") if table == "params" else ("latest_metrics", "rmse_mdps")
+        connection.execute("update {} set value = '7' where key = '{}'".format(*names))
+    connection.close()
+    if table == "params":
+        with pytest.raises(DatasetError, match=f"mlflow runs delete --run-id {run_id}"):
+            tracked(store).load()
+    else:
+        assert not tracked(store).load()[0].finished
+
+
+@pytest.mark.parametrize("spoil", [Path.unlink, lambda store: store.write_bytes(b"")])
+def test_artifacts_without_their_store_are_no_new_beginning(store, spoil):
+    evaluated(store)
+    spoil(store)
+    with pytest.raises(DatasetError, match="artifacts of 1 runs; put the store back"):
+        tracked(store).load()
+    assert not store.exists() or not store.stat().st_size
+
+
+def test_what_two_projects_train_at_once_is_stored_once(store, monkeypatch, tmp_path):
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{store}")
+    monkeypatch.chdir(tmp_path)
+    one, other = tracked(tmp_path / "one.db"), tracked(tmp_path / "other.db")
+    folds = ("fold 0", MODEL)
+    for runs in (one, other):
+        runs.save(fitted(fold="fold 0", folds=folds, started_ms=STARTED_MS))
+        running = MlflowClient().search_runs(["1"], "attributes.status = 'RUNNING'")
+        client = MlflowClient()
+        client.set_tag(running[0].info.run_id, "process", "elsewhere 1 1 99999999999")
+    for runs in (one, other):
+        runs.save(fitted(folds=folds))
+    assert len(one.load()) == 1
+
+
+def test_a_server_that_does_not_answer_is_told_at_once(tmp_path, monkeypatch):
+    runs = tracked(tmp_path / "mlflow.db")
+    runs.check_reachable()
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:9")
+    with pytest.raises(InputError, match="http://127.0.0.1:9: .* does not answer"):
+        tracked(tmp_path / "mlflow.db").check_reachable()

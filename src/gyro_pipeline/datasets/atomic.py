@@ -2,11 +2,17 @@
 
 import errno
 import os
+import re
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from gyro_pipeline.conventions import InputError
+
+_TEMPORARY = re.compile(r"\..+\.\d+(\.\w+)?")
+_SPARE_BYTES = 1 << 16
+"""Of tables, labels and what the file system itself writes, beside the samples of a file."""
 
 
 @contextmanager
@@ -20,18 +26,14 @@ def replacing(path: Path) -> Iterator[Path]:
         An empty file in the same folder, with the same suffix, that no other process uses.
 
     Raises:
-        InputError: A file is where a folder is needed or the other way round, or the folder
-            cannot be written to.
+        InputError: A file is where a folder is needed or the other way round.
+        OSError: The folder cannot be written to.
     """
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    check_writable(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         temporary.touch()
-    except OSError as error:
-        raise InputError(in_the_way(path, error)) from error
-    try:
-        if path.is_dir():
-            raise InputError(f"cannot write {path}: a folder has that name; move it away")
         yield temporary
         os.replace(temporary, path)
     except BaseException:  # an interrupt from the keyboard as well
@@ -39,23 +41,46 @@ def replacing(path: Path) -> Iterator[Path]:
         raise
 
 
+def remove_leftovers(folder: Path) -> int:
+    """Remove what killed processes left of :func:`replacing` in a folder that nobody writes to.
+
+    Returns:
+        How many files there were.
+    """
+    left = [path for path in folder.glob(".*") if _TEMPORARY.fullmatch(path.name)]
+    for path in left:
+        path.unlink()
+    return len(left)
+
+
+def require_room(path: Path, size: int) -> None:
+    """Refuse to write a file that there is no room for: libraries that map files crash on it.
+
+    Args:
+        path: In a folder that is there.
+        size: Bytes.
+
+    Raises:
+        OSError: Its error number is ENOSPC.
+    """
+    if shutil.disk_usage(path.parent).free < size + _SPARE_BYTES:
+        reason = f"no space left, where {size / 1e6:.1f} MB are needed"
+        raise OSError(errno.ENOSPC, reason, str(path))
+
+
 def check_writable(path: Path) -> None:
     """Refuse before a long run what :func:`replacing` would refuse at its end; makes nothing.
 
     Raises:
-        InputError: A file is where a folder is needed, or the folder cannot be written to.
+        InputError: A file is where a folder is needed or the other way round.
+        OSError: The folder cannot be written to.
     """
     nearest = next(folder for folder in path.parents if folder.exists())
-    if not nearest.is_dir() or not os.access(nearest, os.W_OK):
-        raise InputError(in_the_way(path, PermissionError(errno.EACCES, "no permission to write")))
-
-
-def in_the_way(path: Path, error: OSError) -> str:
-    """Say which of the folders above a path is the trouble, and what to do."""
-    nearest = next(folder for folder in path.parents if folder.exists())
     if not nearest.is_dir():
-        return f"cannot write {path}: {nearest} is a file where a folder is needed; move it away"
-    return (
-        f"cannot write {path}: {error.strerror} in {nearest}; make that folder writable, with "
-        "space left, or choose another path in the catalog"
-    )
+        raise InputError(
+            f"cannot write {path}: {nearest} is a file where a folder is needed; move it away"
+        )
+    if path.is_dir():
+        raise InputError(f"cannot write {path}: a folder has that name; move it away")
+    if not os.access(nearest, os.W_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))

@@ -25,7 +25,6 @@ from tqdm import tqdm
 from urllib3.exceptions import HTTPError
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.datasets.atomic import in_the_way
 
 _LOG = logging.getLogger(__name__)
 
@@ -58,8 +57,6 @@ def ensure(url: str, path: Path, blob: str) -> None:
             _fetch(url, path, blob)
         except (requests.RequestException, HTTPError) as error:  # the first is an OSError as well
             raise InputError(_no_answer(url, path, error)) from error
-        except OSError as error:
-            raise InputError(in_the_way(path, error)) from error
     try:
         found = blob_id(path)
     except OSError as error:
@@ -68,7 +65,7 @@ def ensure(url: str, path: Path, blob: str) -> None:
         raise InputError(
             f"{path} is not the published file: expected git blob id {blob}, got {found}. It is "
             "left as it is; move it away and run again to fetch the published one, or read it by "
-            "a source of your own (README, Real recordings)"
+            "a source of your own (docs/your_data.md)"
         )
 
 

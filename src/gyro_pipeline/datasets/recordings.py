@@ -14,79 +14,57 @@ import h5py
 import numpy as np
 import xarray as xr
 from kedro.io import AbstractDataset
+from xarray.backends import CachingFileManager, H5NetCDFStore
 
-from gyro_pipeline.conventions import AXES, InputError, Missing
-from gyro_pipeline.datasets.atomic import replacing
-from gyro_pipeline.fingerprints import data_hash
+from gyro_pipeline.conventions import AXES, InputError
+from gyro_pipeline.datasets.atomic import replacing, require_room
+from gyro_pipeline.datasets.stored import StoredFile, check_content, digest_of
+from gyro_pipeline.fingerprints import data_hash, fingerprint
 from gyro_pipeline.logs import Finding, Listing, Recording, with_recordings
 
 _ENGINE: Final = "h5netcdf"
 
 _INSPECTION: Final = "inspection"
 """The variable (imu, recording) with all of a :class:`Recording` but its samples, as JSON."""
+_SEAL: Final = "fingerprint"
+"""Of all else in such a text: it may be damaged in a file that is not complete."""
 _PLACE: Final = ("imu", "recording")
 _TEXT: Final = h5py.string_dtype()
 _UNITS: Final = {"angular_rate": "deg/s", "temperature_c": "degrees Celsius", "acceleration_g": "g"}
 
 
-class Recordings(AbstractDataset[xr.Dataset, xr.Dataset | Missing]):
+class Recordings(StoredFile):
     """Keeps recordings in one netCDF file and reads them lazily.
 
     What ``load`` returns stays in the file until values are asked for, and again afterwards, so
-    it is small to hold and is handed to another process as a reference to the file.
+    it is small to hold and is handed to another process as a reference to the file. Whoever opens
+    the file, in whichever process, gets what was there when it was loaded, or an error.
 
-    Args:
-        filepath: The netCDF file.
-        made_by: The command that makes it. Where it is given and there is no file, ``load``
-            returns it as :class:`Missing`, so that a report can say what it lacks.
-        metadata: For other tools, such as Kedro-Viz.
+    What is saved are labelled arrays, which may themselves be read from the same file. Those with
+    ``samples``, 0 for recordings that are not to be used, but without ``angular_rate`` complete
+    what :class:`InspectedRecordings` has kept.
     """
 
-    def __init__(
-        self, filepath: str, made_by: str | None = None, metadata: dict[str, Any] | None = None
-    ) -> None:
-        self._filepath = Path(filepath)
-        self._made_by = made_by
-        self.metadata = metadata
-
-    def load(self) -> xr.Dataset | Missing:
-        """Open the file.
-
-        Returns:
-            What was saved, with the values still in the file.
-
-        Raises:
-            InputError: As the cause of Kedro's ``DatasetError``, a damaged file.
-        """
-        if self._made_by and not self._exists():
-            return Missing((self._made_by,))
-        return open_recordings(self._filepath)
-
     def save(self, data: xr.Dataset) -> None:
-        """Write the file under a temporary name and rename it; open readers keep the old one.
-
-        Args:
-            data: Labelled arrays. They may themselves be read from the same file. Those with
-                ``samples``, 0 for recordings that are not to be used, but without
-                ``angular_rate`` complete what :class:`InspectedRecordings` has kept.
-        """
-        if "samples" in data and "angular_rate" not in data:
-            path = path_in_progress(self._filepath)
-            _erase(path, data["samples"])
-            data.to_netcdf(path, mode="a", engine=_ENGINE)
-            os.replace(path, self._filepath)
+        """Write the file under a temporary name and rename it; open readers keep the old one."""
+        if "samples" not in data or "angular_rate" in data:
+            super().save(data)
             return
+        path = path_in_progress(self._filepath)
+        _erase(path, data["samples"])
+        data.to_netcdf(path, mode="a", engine=_ENGINE)
+        self._record(path)
+        os.replace(path, self._filepath)
+
+    def _read(self, path: Path) -> xr.Dataset:
+        return open_recordings(path)
+
+    def _write(self, data: xr.Dataset, path: Path) -> None:
+        require_room(path, data.nbytes)
         # in place of the encodings that variables read from a file carry, which say how they were
         # stored there and not what they hold now
         encoding = {name: {"_FillValue": None} for name in data.variables}
-        with replacing(self._filepath) as temporary:
-            data.to_netcdf(temporary, engine=_ENGINE, encoding=encoding)
-
-    def _exists(self) -> bool:
-        return self._filepath.is_file()
-
-    def _describe(self) -> dict[str, Any]:
-        return {"filepath": str(self._filepath)}
+        data.to_netcdf(path, engine=_ENGINE, encoding=encoding)
 
 
 class InspectedRecordings(AbstractDataset[Listing | Recording, list[Recording]]):
@@ -166,6 +144,7 @@ class _Writer:
 
     def add(self, recording: Recording) -> None:
         """Write the samples, and the description with those of the next ``every_s`` seconds."""
+        require_room(Path(self._file.filename), sum(v.nbytes for v in recording.variables.values()))
         index = tuple(of[n] for of, n in zip(self._index, recording.place, strict=True))
         for name, values in recording.variables.items():
             if name not in self._arrays or self._arrays[name].shape[-1] < values.shape[-1]:
@@ -176,8 +155,9 @@ class _Writer:
             part.select_hyperslab((*index, *[0] * values.ndim), (1, 1, *values.shape))
             stored.write(h5py.h5s.create_simple(values.shape), part, values)
         findings = [vars(finding) for finding in recording.findings]
-        changed = {"findings": findings, "variables": list(recording.variables)}
-        self._texts[index] = json.dumps(vars(recording) | changed)
+        contents = {name: data_hash(values, None) for name, values in recording.variables.items()}
+        described = vars(recording) | {"findings": findings, "variables": contents}
+        self._texts[index] = json.dumps(described | {_SEAL: fingerprint(described)})
         if time.monotonic() >= self._due:
             self._flush()
 
@@ -210,19 +190,23 @@ def open_recordings(path: Path) -> xr.Dataset:
     Raises:
         InputError: A damaged file.
     """
-    try:  # values that are cached once read would be pickled, and kept in memory
-        lazy = xr.open_dataset(path, engine=_ENGINE, cache=False, drop_variables=[_INSPECTION])
-    except FileNotFoundError:
-        raise
-    except Exception as error:  # a damaged file fails in many ways
-        raise InputError(
-            f"{path}: expected a netCDF file written by this project, but: {error}. "
-            "It is damaged; delete it and run the pipeline that makes it again"
-        ) from error
+    files = CachingFileManager(_open_unchanged, str(path), check_content(path), mode="r")
+    store = H5NetCDFStore(files, mode="r")
+    # values that are cached once read would be pickled, and kept in memory
+    lazy = xr.open_dataset(store, cache=False, drop_variables=[_INSPECTION])
     # netCDF gives NumPy numbers, which JSON does not take
     plain = {key: v.item() if isinstance(v, np.generic) else v for key, v in lazy.attrs.items()}
     recordings = lazy.assign_attrs(plain)
     return with_recordings(recordings) if "samples" in recordings else recordings
+
+
+def _open_unchanged(path: str, digest: str, mode: str) -> h5netcdf.File:
+    """Open a file whose content has this digest, also in a worker that was sent a reference."""
+    if digest_of(Path(path)) != digest:
+        raise InputError(
+            f"{path}: replaced or changed since this run loaded it; type the same command again"
+        )
+    return h5netcdf.File(path, mode, decode_vlen_strings=True)
 
 
 def _begin(path: Path, places: Collection[tuple[int, int]]) -> None:
@@ -261,7 +245,9 @@ def _stored(path: Path, wanted: Mapping[tuple[int, int], str] | None = None) -> 
             if not text:
                 continue
             described = json.loads(text)
-            names = described.pop("variables")
+            if described.pop(_SEAL) != fingerprint(described):
+                continue
+            contents = described.pop("variables")
             described["findings"] = tuple(Finding(**kind) for kind in described["findings"])
             recording = Recording(**described)
             if wanted is None:
@@ -269,8 +255,8 @@ def _stored(path: Path, wanted: Mapping[tuple[int, int], str] | None = None) -> 
             elif recording.key and recording.key == wanted.get(recording.place):
                 stretch = (*index, ..., slice(recording.stop - recording.start))
                 with suppress(*damage):  # each by itself, or one would hide the others
-                    kept = {name: file[name][stretch] for name in names}
-                    if not kept or data_hash(kept["angular_rate"], None) == recording.content:
+                    kept = {name: file[name][stretch] for name in contents}
+                    if contents == {name: data_hash(v, None) for name, v in kept.items()}:
                         yield replace(recording, variables=kept)
 
 

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from gyro_pipeline.conventions import InputError, Missing
 from gyro_pipeline.datasets.atomic import replacing
-from gyro_pipeline.datasets.tables import Table, read_table
+from gyro_pipeline.datasets.tables import preview_table, read_table, write_table
 
 _PNG_DPI = 160
 _WITHOUT_EXPONENT = 1e4
@@ -85,7 +85,8 @@ class ReportTable(AbstractDataset[pd.DataFrame | Missing, pd.DataFrame | Missing
             _remove(self._csv, self._md, self._tex)
             return
         markdown, latex = to_markdown(data), to_latex(data)
-        Table(str(self._csv)).save(data)
+        with replacing(self._csv) as temporary:
+            write_table(data, temporary)
         for path, text in ((self._md, markdown), (self._tex, latex)):
             with replacing(path) as temporary:
                 temporary.write_text(text, encoding="utf-8")
@@ -99,7 +100,7 @@ class ReportTable(AbstractDataset[pd.DataFrame | Missing, pd.DataFrame | Missing
         Returns:
             Columns and rows as Kedro-Viz takes them.
         """
-        return Table(str(self._csv)).preview(nrows)
+        return preview_table(self._csv, nrows)
 
     def _exists(self) -> bool:
         return all(path.is_file() for path in (self._csv, self._md, self._tex))

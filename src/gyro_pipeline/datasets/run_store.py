@@ -1,19 +1,29 @@
 """The file of a run store: made complete or not at all, and refused where it cannot be used."""
 
+import errno
+import os
+import socket
 import sqlite3
 from collections.abc import Mapping
 from contextlib import closing
+from functools import cache
 from pathlib import Path
+from urllib.parse import urlsplit
 
+import requests
+import sqlalchemy
 from mlflow import MlflowClient
 from mlflow.entities import Experiment
 from mlflow.utils.file_utils import local_file_uri_to_path
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.datasets.atomic import replacing
+from gyro_pipeline.datasets.atomic import check_writable, replacing
 
 _BUSY_S = 20
 """How long to wait for another process that writes to the store."""
+
+_ANSWER_S = 5
+_PORTS = {"http": 80, "https": 443, "postgresql": 5432, "mysql": 3306, "mssql": 1433}
 
 _MOVED = "type `python -m gyro_pipeline.store --artifacts-in mlruns`"
 
@@ -22,6 +32,56 @@ def make_store(path: Path) -> None:
     """Make a store that is complete or not there: MLflow cannot use one that is half made."""
     with replacing(path) as temporary:
         MlflowClient(f"sqlite:///{temporary}")
+
+
+def ready_store(path: Path) -> None:
+    """Make the store if there is none, and see that it can be used and written to.
+
+    Raises:
+        InputError: It is damaged, or missing beside the artifacts of its runs.
+        OSError: It cannot be written to.
+    """
+    if not path.exists() or not path.stat().st_size:
+        artifacts = path.parent / "mlruns"
+        if count := sum(1 for _ in artifacts.glob("*/*/artifacts")):
+            raise InputError(
+                f"{path}: there is no store, or an empty one, beside {artifacts} with the "
+                f"artifacts of {count} runs; put the store back, or move {artifacts} away to begin "
+                "without these runs"
+            )
+        make_store(path)
+    check_store(path)
+    check_writable(path)
+    check_writable(path.parent / "mlruns" / "artifacts")
+    if not os.access(path, os.W_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+
+@cache
+def check_answers(uri: str) -> None:
+    """Ask a server or a database once whether it is there.
+
+    Raises:
+        InputError: It does not answer.
+    """
+    address = urlsplit(uri)
+    port = address.port or _PORTS.get(address.scheme.partition("+")[0])
+    try:
+        if address.hostname and port:
+            socket.create_connection((address.hostname, port), timeout=_ANSWER_S).close()
+        if address.scheme.startswith("http"):
+            requests.get(f"{uri.rstrip('/')}/health", timeout=_ANSWER_S).raise_for_status()
+        elif address.hostname:
+            sqlalchemy.create_engine(uri).connect().close()
+    except (
+        OSError,
+        sqlalchemy.exc.SQLAlchemyError,
+        ImportError,
+    ) as error:  # requests' are OSErrors
+        raise InputError(
+            f"{uri}: the run store of MLFLOW_TRACKING_URI does not answer ({error}); start it, "
+            "correct the address, or unset the variable to use mlflow.db"
+        ) from error
 
 
 def check_store(path: Path) -> None:

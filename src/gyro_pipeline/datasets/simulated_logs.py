@@ -2,6 +2,7 @@
 
 import hashlib
 import logging
+import math
 import zlib
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,7 +15,7 @@ from pydantic import ValidationError
 
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 from gyro_pipeline.datasets.array_logs import LAYOUT, ArrayLogs
-from gyro_pipeline.datasets.atomic import replacing
+from gyro_pipeline.datasets.atomic import replacing, require_room
 from gyro_pipeline.datasets.recordings import Recordings, open_recordings
 from gyro_pipeline.fingerprints import fingerprint
 from gyro_pipeline.logs import Logs
@@ -191,12 +192,7 @@ def write_logs(
         test: File for the other recordings.
     """
     cut, model = entry.train_recordings, entry.simulated
-    arrays = [
-        np.lib.format.open_memmap(
-            path, "w+", np.float32, (count, entry.imus * len(AXES), entry.samples)
-        )
-        for path, count in ((train, cut), (test, entry.recordings - cut))
-    ]
+    arrays = _new_array(train, cut, entry), _new_array(test, entry.recordings - cut, entry)
     for gyroscope in range(entry.imus * len(AXES)):
         imu, axis = divmod(gyroscope, len(AXES))
         noise = simulate_noise(
@@ -216,3 +212,11 @@ def write_logs(
         arrays[0][:, gyroscope], arrays[1][:, gyroscope] = rates[:cut], rates[cut:]
     for array in arrays:
         array.flush()
+
+
+def _new_array(
+    path: Path, recordings: int, entry: SimulatedSensor
+) -> np.memmap[Any, np.dtype[Any]]:
+    shape = (recordings, entry.imus * len(AXES), entry.samples)
+    require_room(path, 4 * math.prod(shape))  # a mapped file that outgrows the disk is a crash
+    return np.lib.format.open_memmap(path, mode="w+", dtype=np.float32, shape=shape)

@@ -1,49 +1,20 @@
 """Tables as CSV or Parquet files."""
 
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
-from kedro.io import AbstractDataset
 from kedro_datasets._typing import TablePreview
 
-from gyro_pipeline.conventions import Missing
-from gyro_pipeline.datasets.atomic import replacing
+from gyro_pipeline.datasets.stored import StoredFile
 from gyro_pipeline.tracking import FINGERPRINT
 
 
-class Table(AbstractDataset[pd.DataFrame, pd.DataFrame | Missing]):
+class Table(StoredFile):
     """Keeps a table without its index; numbers come back exactly as they were.
 
-    Args:
-        filepath: The file, ``.csv`` or, for long tables, ``.parquet``.
-        made_by: The command that makes it. Where it is given and there is no file, ``load``
-            returns it as :class:`Missing`, so that a report can say what it lacks.
-        metadata: For other tools, such as Kedro-Viz.
+    The file is a ``.csv`` or, for long tables, a ``.parquet``. An empty cell is a missing value,
+    and nothing else is.
     """
-
-    def __init__(
-        self, filepath: str, made_by: str | None = None, metadata: dict[str, Any] | None = None
-    ) -> None:
-        self._filepath = Path(filepath)
-        self._made_by = made_by
-        self.metadata = metadata
-
-    def load(self) -> pd.DataFrame | Missing:
-        """Read the table; an empty cell is a missing value, and nothing else is."""
-        if self._made_by and not self._exists():
-            return Missing((self._made_by,))
-        return read_table(self._filepath)
-
-    def save(self, data: pd.DataFrame) -> None:
-        """Write the table.
-
-        Args:
-            data: Its columns are stored, its index is not.
-        """
-        with replacing(self._filepath) as temporary:
-            write = data.to_parquet if self._filepath.suffix == ".parquet" else data.to_csv
-            write(temporary, index=False)
 
     def preview(self, nrows: int = 40) -> TablePreview:
         """Show the first rows in Kedro-Viz.
@@ -54,17 +25,28 @@ class Table(AbstractDataset[pd.DataFrame, pd.DataFrame | Missing]):
         Returns:
             Columns and rows as Kedro-Viz takes them.
         """
-        return TablePreview(read_table(self._filepath).head(nrows).to_dict(orient="split"))
+        return preview_table(self._filepath, nrows)
 
-    def _exists(self) -> bool:
-        return self._filepath.is_file()
+    def _read(self, path: Path) -> pd.DataFrame:
+        return read_table(path)
 
-    def _describe(self) -> dict[str, Any]:
-        return {"filepath": str(self._filepath)}
+    def _write(self, data: pd.DataFrame, path: Path) -> None:
+        write_table(data, path)
+
+
+def write_table(data: pd.DataFrame, path: Path) -> None:
+    """Write a table without its index."""
+    write = data.to_parquet if path.suffix == ".parquet" else data.to_csv
+    write(path, index=False)
+
+
+def preview_table(path: Path, rows: int) -> TablePreview:
+    """The first rows of a table, as Kedro-Viz takes them."""
+    return TablePreview(read_table(path).head(rows).to_dict(orient="split"))
 
 
 def read_table(path: Path) -> pd.DataFrame:
-    """Read a table that :class:`Table` wrote."""
+    """Read a table that :func:`write_table` wrote."""
     if path.suffix == ".parquet":
         return pd.read_parquet(path)
     texts = {FINGERPRINT: str}  # some look like numbers

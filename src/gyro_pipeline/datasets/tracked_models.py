@@ -16,6 +16,7 @@ from mlflow.models import Model, ModelSignature
 from mlflow.types import ParamSchema, ParamSpec, Schema, TensorSpec
 
 from gyro_pipeline.conventions import BIAS
+from gyro_pipeline.datasets.stored import digest_of
 from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.tracking import DESCRIPTION, MODEL
 
@@ -36,7 +37,7 @@ _SIGNATURE = ModelSignature(
 )
 
 
-def log_model(client: MlflowClient, run: Run, estimator: Estimator, example: np.ndarray) -> None:
+def log_model(client: MlflowClient, run: Run, estimator: Estimator, example: np.ndarray) -> str:
     """Store a fit as the model of a run, in place of one that was left half written.
 
     Args:
@@ -44,6 +45,9 @@ def log_model(client: MlflowClient, run: Run, estimator: Estimator, example: np.
         run: It has no other model.
         estimator: The fit.
         example: Windows (n, gyroscopes, samples), deg/s; the first is shown as input example.
+
+    Returns:
+        The digest of the fit.
     """
     model_id = model_of(run) or _new_model(client, run, estimator)
     with TemporaryDirectory() as folder:
@@ -60,8 +64,10 @@ def log_model(client: MlflowClient, run: Run, estimator: Estimator, example: np.
             input_example=np.round(example[:1].astype(np.float64), _EXAMPLE_DECIMALS),
             pip_requirements=[f"{name}=={version(name)}" for name in _REQUIREMENTS],
         )
+        digest = digest_of(model / "data" / _FIT)
         client.log_model_artifacts(model_id, str(model))
     client.finalize_logged_model(model_id, "READY")
+    return digest
 
 
 def model_fit_uri(client: MlflowClient, run: Run) -> str:

@@ -16,6 +16,7 @@ from urllib.parse import urlencode
 
 import pandas as pd
 import psutil
+from alembic.util.exc import CommandError
 from kedro.io import AbstractDataset
 from mlflow import MlflowClient
 from mlflow.artifacts import download_artifacts
@@ -31,19 +32,22 @@ from mlflow.entities import (
     RunTag,
 )
 from mlflow.exceptions import MlflowException
+from mlflow.utils.file_utils import local_file_uri_to_path
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.datasets.atomic import check_writable
 from gyro_pipeline.datasets.run_store import (
+    check_answers,
     check_not_moved,
-    check_store,
     count_finished,
-    make_store,
+    ready_store,
 )
+from gyro_pipeline.datasets.stored import digest_of
 from gyro_pipeline.datasets.tracked_models import log_model, model_fit_uri, model_of
 from gyro_pipeline.estimators.base import Estimator
+from gyro_pipeline.fingerprints import fingerprint
 from gyro_pipeline.tracking import (
     DESCRIPTION,
+    EVALUATED_WITH,
     FINGERPRINT,
     HISTORY,
     LAYOUT,
@@ -58,14 +62,21 @@ logger = logging.getLogger(__name__)
 _TRAINED = "trained"
 """Tag, set last: when the last fit ended. A run without it lacks fits."""
 
-_FITS, _END = "fits", "; "
-"""Tag, and folder of artifacts: the folds whose fits are stored. MLflow cuts very long tags."""
+_FITS = "fits"
+"""Folder of the fits that are no model."""
+
+_FIT, _ARTIFACT, _METRICS, _PARAMS = "fit.", "artifact.", "digest.metrics", "digest.params"
+"""Tags, or how they begin: the digest of the fit of a fold, of an artifact, of the metrics of the
+evaluation and of the parameters. What has none is not there."""
 
 _MODEL_FOLD = "model_fold"
 """Tag: the fold whose fit is the model of the run, and is stored nowhere else."""
 
 _OWNER = "process"
-"""Tag: the process that writes a run, as ``host pid started``."""
+"""Tag: the process that writes a run and when it last did, as ``host pid started written``."""
+
+_SILENT_S = 24 * 3600
+"""After so long without a sign of life a process of another machine counts as dead."""
 
 _ABOUT = """Study `{study}` of gyro_pipeline. One run is one row of the study: an estimator, its
 training set, a window length and a seed.
@@ -163,6 +174,7 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
             self._stored(run, studies[run.info.experiment_id])
             for run in _pages(partial(search, " and ".join(wanted)))
             if _TRAINED in run.data.tags or _is_left(run)
+            for run in [self._whole(run)]
         ]
         return sorted(stored, key=lambda run: run.started_ms, reverse=True)
 
@@ -195,13 +207,10 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
     @cached_property
     def _client(self) -> MlflowClient:
         if self._is_own_file:
-            if not self._path.exists():
-                make_store(self._path)
-            check_store(self._path)
-            check_writable(self._path.parent / "mlruns" / "artifacts")
+            ready_store(self._path)
         try:
             client = MlflowClient(tracking_uri=self._uri)
-        except Exception as error:  # alembic and SQLAlchemy have no common base
+        except (CommandError, MlflowException) as error:  # also of alembic, about its layout
             raise InputError(
                 f"{self._uri}: not a run store that this MLflow can open ({error}); move it away, "
                 "or run `mlflow db upgrade` on it"
@@ -210,6 +219,15 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
             for experiment in _pages(client.search_experiments):
                 check_not_moved(experiment, self._path)
         return client
+
+    def check_reachable(self) -> None:
+        """Refuse a server or database that does not answer, before a run works for it.
+
+        Raises:
+            InputError: It says what was asked.
+        """
+        if not self._is_own_file:
+            check_answers(self._uri)
 
     def _experiments(self) -> list[Experiment]:
         experiments = _pages(self._client.search_experiments)
@@ -244,61 +262,128 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
         )
 
     def _load_artifact(self, run: Run, name: str) -> Any:
-        with self._downloaded(run, f"{run.info.artifact_uri}/{name}") as path:
+        with self._downloaded(run, _ARTIFACT + name) as path:
             return _READERS[path.suffix](path)
 
     def _load_fit(self, run: Run, fold: str) -> Estimator:
-        if fold == run.data.tags.get(_MODEL_FOLD):
-            source = model_fit_uri(self._client, run)
-        else:
-            source = f"{run.info.artifact_uri}/{_fit_folder(fold)}"
-        with self._downloaded(run, source) as path:
+        with self._downloaded(run, _FIT + fold) as path:
             return Estimator.load(path)
 
+    def _uri_of(self, run: Run, tag: str) -> str:
+        """Where that is whose digest a tag holds."""
+        fold = tag.removeprefix(_FIT)
+        if tag.startswith(_ARTIFACT):
+            return f"{run.info.artifact_uri}/{tag.removeprefix(_ARTIFACT)}"
+        if fold == run.data.tags.get(_MODEL_FOLD):
+            return model_fit_uri(self._client, run)
+        return f"{run.info.artifact_uri}/{_fit_folder(fold)}"
+
     @contextmanager
-    def _downloaded(self, run: Run, uri: str) -> Iterator[Path]:
+    def _downloaded(self, run: Run, tag: str) -> Iterator[Path]:
+        """What was stored, as it was stored, or an error."""
+        uri = self._uri_of(run, tag)
         with tempfile.TemporaryDirectory() as folder:
             try:
-                path = download_artifacts(uri, dst_path=folder, tracking_uri=self._uri)
-            except (MlflowException, OSError) as error:
+                path = Path(download_artifacts(uri, dst_path=folder, tracking_uri=self._uri))
+                digest = digest_of(path)
+                whole = digest == run.data.tags.get(tag) or digest == self._digest_now(run, tag)
+            except (MlflowException, FileNotFoundError):
+                whole = False
+            if not whole:
+                self._set_back(run, [tag])
                 raise InputError(
-                    f"run {run.info.run_id}: {uri} cannot be read ({error}); delete the run, and "
-                    "the next `kedro run` makes it again"
-                ) from error
-            yield Path(path)
+                    f"run {run.info.run_id}: {uri} is not there, or not what was written; type the "
+                    "same command again, which makes it again"
+                )
+            yield path
+
+    def _digest_now(self, run: Run, tag: str) -> str | None:
+        """What the store says now: the run may have been evaluated since it was loaded."""
+        return self._client.get_run(run.info.run_id).data.tags.get(tag)
+
+    def _whole(self, run: Run) -> Run:
+        """A run, of which what is damaged or not there is marked as to be made again."""
+        tags = run.data.tags
+        if run.data.params and tags.get(_PARAMS) != _digest_of(run.data.params):
+            raise InputError(
+                f"run {run.info.run_id}: its parameters were changed after it was made; delete it "
+                f"with `mlflow runs delete --run-id {run.info.run_id}`, and it is made again"
+            )
+        broken = [tag for tag in tags if tag.startswith((_FIT, _ARTIFACT))]
+        broken = [tag for tag in broken if self._is_broken(run, tag)]
+        judged = tags.get(_METRICS, "")
+        if judged and judged != _metrics_tag(run.data.metrics, judged.split()[1:]):
+            broken.append(_METRICS)
+        return self._set_back(run, broken) if broken else run
+
+    def _is_broken(self, run: Run, tag: str) -> bool:
+        """Whether an artifact on this machine is not what was written."""
+        uri = self._uri_of(run, tag)
+        if not uri.startswith("file:"):
+            return False  # looked at when it is downloaded
+        path = Path(local_file_uri_to_path(uri))
+        return not path.exists() or digest_of(path) != run.data.tags[tag]
+
+    def _set_back(self, run: Run, broken: Sequence[str]) -> Run:
+        """Mark parts of a run as not there: it is trained, or evaluated, again."""
+        run_id, tags = run.info.run_id, run.data.tags
+        fits = [tag for tag in broken if tag.startswith(_FIT)]
+        if _ARTIFACT + HISTORY in broken and _MODEL_FOLD in tags:
+            fits.append(_FIT + tags[_MODEL_FOLD])
+        gone = {*broken, *fits, *([_TRAINED] if fits else []), EVALUATED_WITH}
+        for tag in sorted(gone & tags.keys()):
+            self._client.delete_tag(run_id, tag)
+        self._client.update_run(run_id, "KILLED")
+        logger.warning(
+            "run %s: damaged or not there: %s; it is %s again",
+            *(run_id, ", ".join(broken), "trained" if fits else "evaluated"),
+        )
+        return self._client.get_run(run_id)
 
     def _save_fitted(self, fitted: FittedRun) -> None:
         key = (fitted.run.study, fitted.run.fingerprint)
         if key not in self._begun:
             self._begun[key] = self._begin(fitted)
-        (run_id, fits), tags = self._begun[key], {}
+        run_id, fits = self._begun[key]
+        tags = {_OWNER: _this_process()}
         if fitted.is_model:
             run = self._client.get_run(run_id)
-            log_model(self._client, run, fitted.estimator, fitted.example)
-            self._log_history(run_id, fitted)
+            tags[_FIT + fitted.fold] = log_model(
+                self._client, run, fitted.estimator, fitted.example
+            )
+            tags |= self._log_history(run_id, fitted)
             tags[_MODEL_FOLD] = fitted.fold
         else:
             with tempfile.TemporaryDirectory() as folder:
                 fitted.estimator.save(Path(folder))
+                tags[_FIT + fitted.fold] = digest_of(Path(folder))
                 self._client.log_artifacts(run_id, folder, _fit_folder(fitted.fold))
         fits.add(fitted.fold)
-        tags[_FITS] = "".join(f"{fold}{_END}" for fold in sorted(fits))
         if fits >= set(fitted.run.folds):
             tags[_TRAINED] = str(fitted.ended_ms)
             del self._begun[key]
+            if not self._is_own_file and self._is_stored_already(fitted):
+                self._client.delete_run(run_id)
+                return
         self._client.log_batch(run_id, tags=_tags(tags))
+
+    def _is_stored_already(self, fitted: FittedRun) -> bool:
+        """Whether another project trained the same at the same time and was done first."""
+        others = self._same_runs(fitted, f"tags.{_TRAINED} LIKE '%'")
+        if others:
+            logger.warning("%s: another project has trained it meanwhile", fitted.run.name)
+        return bool(others)
+
+    def _same_runs(self, fitted: FittedRun, more: str = "") -> list[Run]:
+        wanted = f"tags.{LAYOUT_TAG} = '{LAYOUT}' and tags.{FINGERPRINT} = "
+        wanted += f"'{fitted.run.fingerprint}'" + (f" and {more}" if more else "")
+        study = self._experiment_id(fitted.run.study)
+        return list(_pages(partial(self._client.search_runs, [study], wanted)))
 
     def _begin(self, fitted: FittedRun) -> tuple[str, set[str]]:
         """The run that a fit is added to: one that was left unfinished, or a new one."""
-        experiment_id, wanted = self._experiment_id(fitted.run.study), fitted.run
-        left = _pages(
-            partial(
-                self._client.search_runs,
-                [experiment_id],
-                f"tags.{LAYOUT_TAG} = '{LAYOUT}' and tags.{FINGERPRINT} = '{wanted.fingerprint}'",
-            )
-        )
-        run = next((run for run in left if _is_left(run)), None)
+        wanted, experiment_id = fitted.run, self._experiment_id(fitted.run.study)
+        run = next((run for run in self._same_runs(fitted) if _is_left(run)), None)
         if run is None:
             tags = self._tags_of(fitted)
             differs = [f"{key} {wanted.params[key]}" for key in self.changed & wanted.params.keys()]
@@ -329,13 +414,15 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
             LAYOUT_TAG: LAYOUT,
             _OWNER: _this_process(),
             DESCRIPTION: run.note,
+            _PARAMS: _digest_of({key: str(value) for key, value in run.params.items()}),
         }
 
-    def _log_history(self, run_id: str, fitted: FittedRun) -> None:
+    def _log_history(self, run_id: str, fitted: FittedRun) -> dict[str, str]:
         history = fitted.estimator.history
-        if history is not None:
-            self._client.log_batch(run_id, metrics=_thinned(history, fitted.ended_ms))
-            self._log_artifacts(run_id, {HISTORY: history})
+        if history is None:
+            return {}
+        self._client.log_batch(run_id, metrics=_thinned(history, fitted.ended_ms))
+        return self._log_artifacts(run_id, {HISTORY: history})
 
     def _save_evaluated(self, evaluated: EvaluatedRun) -> None:
         run = self._client.get_run(evaluated.run_id)
@@ -345,8 +432,9 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
             for key, value in evaluated.metrics.items()
         ]
         self._client.log_batch(evaluated.run_id, metrics=metrics)
-        self._log_artifacts(evaluated.run_id, evaluated.artifacts)
-        self._client.log_batch(evaluated.run_id, tags=_tags(evaluated.tags))
+        tags = self._log_artifacts(evaluated.run_id, evaluated.artifacts)
+        tags |= {**evaluated.tags, _METRICS: _metrics_tag(evaluated.metrics, evaluated.metrics)}
+        self._client.log_batch(evaluated.run_id, tags=_tags(tags))
         trained_ms = int(run.data.tags[_TRAINED])
         self._client.set_terminated(evaluated.run_id, "FINISHED", trained_ms)
 
@@ -369,12 +457,16 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
             self._client.set_experiment_tag(experiment_id, DESCRIPTION, about)
         return str(experiment_id)
 
-    def _log_artifacts(self, run_id: str, artifacts: Mapping[str, Any]) -> None:
+    def _log_artifacts(self, run_id: str, artifacts: Mapping[str, Any]) -> dict[str, str]:
+        """Store artifacts, and give the tags with their digests."""
+        tags = {}
         with tempfile.TemporaryDirectory() as folder:
             for name, content in artifacts.items():
                 path = Path(folder, name)
                 _WRITERS[path.suffix](content, path)
+                tags[_ARTIFACT + name] = digest_of(path)
             self._client.log_artifacts(run_id, folder)
+        return tags
 
     def _exists(self) -> bool:
         return not self._is_own_file or self._path.exists()
@@ -428,12 +520,21 @@ def _dataset(described: Mapping[str, str]) -> DatasetInput:
 
 
 def _fits(run: Run) -> frozenset[str]:
-    *whole, _ = run.data.tags.get(_FITS, "").split(_END)
-    return frozenset(whole)
+    return frozenset(tag.removeprefix(_FIT) for tag in run.data.tags if tag.startswith(_FIT))
 
 
 def _fit_folder(fold: str) -> str:
     return f"{_FITS}/{re.sub('[^a-zA-Z0-9-]', '_', fold)}"
+
+
+def _digest_of(texts: Mapping[str, str]) -> str:
+    return fingerprint(dict(texts))
+
+
+def _metrics_tag(metrics: Mapping[str, float], names: Iterable[str]) -> str:
+    """A digest of some metrics, and their names."""
+    values = {name: repr(metrics.get(name)) for name in names}
+    return " ".join([fingerprint(values), *sorted(values)])
 
 
 def _tags(tags: Mapping[str, str]) -> list[RunTag]:
@@ -442,7 +543,7 @@ def _tags(tags: Mapping[str, str]) -> list[RunTag]:
 
 def _this_process() -> str:
     process = psutil.Process()
-    return f"{platform.node()} {process.pid} {process.create_time()}"
+    return f"{platform.node()} {process.pid} {process.create_time()} {time.time():.0f}"
 
 
 def _is_left(run: Run) -> bool:
@@ -451,7 +552,8 @@ def _is_left(run: Run) -> bool:
         return False
     owner = run.data.tags.get(_OWNER, "")
     running = run.info.status == RunStatus.to_string(RunStatus.RUNNING)
-    return not running or owner == _this_process() or _is_dead(owner)
+    own = owner.split()[:-1] == _this_process().split()[:-1]
+    return not running or own or _is_dead(owner)
 
 
 def _pages(search: Callable[..., Any]) -> Iterable[Any]:
@@ -465,10 +567,13 @@ def _pages(search: Callable[..., Any]) -> Iterable[Any]:
 
 
 def _is_dead(owner: str) -> bool:
-    """Whether a run's process ran on this machine and is gone."""
-    host, pid, created = owner.split() if owner.count(" ") == 2 else ("", "", "")  # noqa: PLR2004
-    if host != platform.node():
+    """Whether a run's process is gone, or on another machine and long silent."""
+    parts = owner.split()
+    if len(parts) != len(_this_process().split()):
         return False
+    host, pid, created, written = parts
+    if host != platform.node():
+        return time.time() - float(written) > _SILENT_S
     try:
         return str(psutil.Process(int(pid)).create_time()) != created
     except psutil.NoSuchProcess:

@@ -243,9 +243,8 @@ def _library() -> ctypes.CDLL:
     command = [*compiler, *_FLAGS.split(), *native]
     parts = [SOURCE.read_bytes(), " ".join(command).encode(), described]
     key = hashlib.sha256(b"\0".join(parts)).hexdigest()
-    path = _cache() / f"fused-{key[:16]}.so"
-    if not path.exists():
-        _compile(command, path)
+    name = f"fused-{key[:16]}"
+    path = _compiled(name) or _compile(command, name)
     library = ctypes.CDLL(str(path))  # lets go of the interpreter lock while it runs
     library.fused_epoch.restype = ctypes.c_double
     library.fused_epoch.argtypes = [
@@ -253,6 +252,22 @@ def _library() -> ctypes.CDLL:
         *(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64, ctypes.c_double),
     ]
     return library
+
+
+def _compiled(name: str) -> Path | None:
+    """The compiled step, if it is as this user compiled it: it is code that will be run."""
+    for path in _cache().glob(f"{name}-*.so"):
+        own = not hasattr(os, "getuid") or path.stat().st_uid == os.getuid()
+        if own and path.stem == f"{name}-{_digest(path)}":
+            return path
+        logger.warning("%s is damaged or another user's: the step is compiled again", path)
+        if own:
+            path.unlink(missing_ok=True)
+    return None
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def _compiler() -> list[str]:
@@ -277,16 +292,17 @@ def _native(compiler: list[str]) -> tuple[list[str], bytes]:
     raise RuntimeError(_failure(command, done))
 
 
-def _compile(command: list[str], path: Path) -> None:
+def _compile(command: list[str], name: str) -> Path:
     """Under a name of its own first, as other processes may be doing the same."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        made = Path(folder) / path.name
+    cache = _cache()
+    cache.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=cache) as folder:
+        made = Path(folder) / "step.so"
         command = [*command, str(SOURCE), "-lm", "-o", str(made)]
         done = _run(command)
         if done.returncode != 0:
             raise RuntimeError(_failure(command, done))
-        made.replace(path)
+        return made.replace(cache / f"{name}-{_digest(made)}.so")
 
 
 def _run(command: list[str]) -> subprocess.CompletedProcess[bytes]:

@@ -162,6 +162,20 @@ def plan_runs(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     return pd.DataFrame(runs)
 
 
+def _check_plan(specs: Mapping[str, RunSpec], sets: TrainingSets, settings: Training) -> None:
+    """Refuse data, windows or settings that are not those that the plan was made with.
+
+    Raises:
+        InputError: A run would carry the fingerprint of another one.
+    """
+    for key, spec in specs.items():
+        if fingerprint(_content(spec, sets, settings)) != key:
+            raise InputError(
+                f"{_name(spec)}: its plan was made with other data or settings than are read now; "
+                f"type kedro run --pipeline={spec.study}, without options that leave out its plan"
+            )
+
+
 def _content(spec: RunSpec, sets: TrainingSets, settings: Training) -> list[Any]:
     """All that a run depends on: code, settings, data and windows, but not its study."""
     estimator = estimator_class(spec.estimator)
@@ -247,9 +261,13 @@ def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
 
     Yields:
         The fits of runs that then wait for their evaluation.
+
+    Raises:
+        InputError: The plan is not of these recordings, windows and settings.
     """
     sets, settings = TrainingSets(windows, recordings, virtual), study.training_of(training)
     specs = planned(plan)
+    _check_plan(specs, sets, settings)
     here = {run.fingerprint: run for run in reversed(tracked) if run.study == study.experiment}
     elsewhere = {run.fingerprint: run for run in reversed(tracked) if run.trained}
     missing = {

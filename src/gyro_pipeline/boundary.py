@@ -1,0 +1,180 @@
+"""Where every error of a run ends: as one line that says what, where, and what to type.
+
+Code raises :class:`InputError` where it knows more than the error itself says. What the file
+system, the run store, the configuration or a worker throws is explained here and nowhere else. Any
+other exception is a defect, of which the traceback is shown and kept.
+"""
+
+import errno
+import logging
+import re
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from gyro_pipeline.conventions import InputError
+
+logger = logging.getLogger(__name__)
+
+_PASSWORD = re.compile(r"(?<=://)([^/@\s:]*):[^/\s]+@")
+_ERRNO_OF_HDF5 = re.compile(r"errno = (\d+)")
+_NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
+_CONFIGURATION = re.compile(r"-packages/(kedro/config|omegaconf|yaml)/")
+_OTHER_ARGUMENTS = "must only contain arguments valid for the constructor"
+"""In Kedro's words: a key of a catalog entry is unknown, or lacking."""
+
+
+def install(project: Path) -> None:
+    """Let errors that nobody catches end here, and mask passwords in all that is logged."""
+    sys.excepthook = partial(_show, project)
+    if logging.getLogRecordFactory() is logging.LogRecord:
+        logging.setLogRecordFactory(_masked_record)
+
+
+def masked(text: str) -> str:
+    """A text without the passwords in addresses."""
+    return _PASSWORD.sub(r"\1:***@", text)
+
+
+def explanation(error: BaseException, project: Path) -> str | None:
+    """What is wrong, where, and what to type; None for a defect of ours."""
+    causes = [*_causes(error)]
+    for cause in causes:
+        if isinstance(cause, InputError):
+            return masked(str(cause))
+    for cause in reversed(causes):  # from what happened to who noticed
+        for kind in type(cause).__mro__:
+            explain = _EXPLAINED.get(f"{kind.__module__.partition('.')[0]}.{kind.__name__}")
+            if explain is not None:
+                return masked(explain(cause))
+    files = [Path(frame.f_code.co_filename) for frame, _ in traceback.walk_tb(error.__traceback__)]
+    if any(_CONFIGURATION.search(file.as_posix()) for file in files):
+        return f"configuration: {_faulty_file(project / 'conf') or masked(_line(error))}"
+    if _OTHER_ARGUMENTS in str(error):
+        return f"catalog: {masked(_line(error))}"
+    if isinstance(error, ValueError) and _is_about_the_command(files):
+        return masked(_line(error))
+    return None
+
+
+def _show(
+    project: Path, kind: type[BaseException], error: BaseException, trace: TracebackType | None
+) -> None:
+    """In place of Python's own way to end with an error."""
+    said = explanation(error, project)
+    if said is not None:
+        logger.error("error: %s", said)
+        return
+    whole = masked("".join(traceback.format_exception(kind, error, trace)))
+    sys.stderr.write(whole)
+    log, command = project / "data" / "defect.log", " ".join(sys.argv)
+    with suppress(OSError):
+        log.write_text(masked(f"{time.strftime('%F %T')} {command}\n{whole}"))
+        logger.error("error: this is a defect; please report it with %s", log)
+
+
+def _masked_record(*arguments: Any, **options: Any) -> logging.LogRecord:
+    record = logging.LogRecord(*arguments, **options)
+    record.msg, record.args = masked(record.getMessage()), ()
+    if record.exc_info and record.exc_info[0]:
+        record.exc_text = masked("".join(traceback.format_exception(*record.exc_info)))
+    return record
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """An error and what it was raised from; what a worker raised is a cause as well."""
+    while error is not None:
+        yield error
+        error = error.__cause__
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _of_files(error: Any) -> str:
+    """A file that cannot be read or written."""
+    text = _line(error)
+    found = _ERRNO_OF_HDF5.search(text)
+    number = int(found[1]) if found else error.errno
+    where = error.filename or "a file"
+    if number in _NO_ROOM:
+        reason = error.strerror or "no space left"
+        return f"cannot write {where}: {reason}; free some, or move the project to a larger disk"
+    if number in _FORBIDDEN:
+        return (
+            f"cannot use {where}: {error.strerror or text}; make it and its folder readable and "
+            "writable, or choose another path in the catalog"
+        )
+    if number == errno.ENOENT:
+        return f"{where}: there is no such file or folder; put it there, or correct its path"
+    return f"{where}: {error.strerror or text}"
+
+
+def _of_store(error: BaseException) -> str:
+    return (
+        f"the run store cannot be used ({_line(error)}); what was stored before is kept: see that "
+        "it can be reached and written to, with space left, and type the same command again"
+    )
+
+
+def _of_workers(error: BaseException) -> str:
+    return (
+        f"a worker process was killed, probably as memory ran out ({_line(error)}); type the same "
+        "command again, with --params=execution.workers=1 to use less: what is finished is kept"
+    )
+
+
+def _of_memory(error: BaseException) -> str:
+    return (
+        f"memory ran out ({_line(error)}); close other programs, or use less: "
+        "--params=execution.workers=1"
+    )
+
+
+_EXPLAINED: dict[str, Callable[[Any], str]] = {
+    "requests.RequestException": _of_store,  # also an OSError
+    "builtins.OSError": _of_files,
+    "builtins.MemoryError": _of_memory,
+    "numpy._ArrayMemoryError": _of_memory,
+    "concurrent.BrokenExecutor": _of_workers,
+    "sqlalchemy.SQLAlchemyError": _of_store,
+    "sqlite3.Error": _of_store,
+    "mlflow.MlflowException": _of_store,
+}
+"""By package and class: nothing is imported for an error that does not come."""
+
+
+def _faulty_file(conf: Path) -> str | None:
+    """The first file of a configuration that cannot be read, and where in it."""
+    from omegaconf import DictConfig, OmegaConf  # noqa: PLC0415
+
+    for path in sorted(conf.rglob("*.yml")):
+        try:
+            content = OmegaConf.load(path)
+        except UnicodeDecodeError as error:
+            line = path.read_bytes()[: error.start].count(b"\n") + 1
+            return f"{path}, line {line}: not UTF-8; save it as UTF-8"
+        except Exception as error:  # YAML's errors and OmegaConf's have no common base
+            mark = getattr(error, "problem_mark", None)
+            where = f"{path}, line {mark.line + 1}" if mark else path
+            return f"{where}: {getattr(error, 'problem', None) or _line(error)}; correct it"
+        if not isinstance(content, DictConfig):
+            return f"{path}, line 1: expected keys and their values, got a list; correct it"
+    return None
+
+
+def _is_about_the_command(files: list[Path]) -> bool:
+    """Whether Kedro itself refused what it was asked for, before a node ran."""
+    import kedro  # noqa: PLC0415
+
+    kedros = Path(kedro.__file__).parent
+    in_runner = any(file.is_relative_to(kedros / "runner") for file in files)
+    return bool(files) and files[-1].is_relative_to(kedros) and not in_runner

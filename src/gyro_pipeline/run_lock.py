@@ -1,0 +1,114 @@
+"""One run at a time in a project's folder, and Ctrl-C that ends it for certain."""
+
+import json
+import logging
+import os
+import platform
+import shlex
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+
+from filelock import FileLock, Timeout
+from kedro.framework.hooks import hook_impl
+
+from gyro_pipeline.conventions import InputError
+
+logger = logging.getLogger(__name__)
+
+_READ_AS_PATTERNS = "?*[]{}#%"
+"""Characters that Kedro or MLflow reads in a path as a pattern, or as part of an address."""
+
+
+def check_folder(project: Path) -> None:
+    """Refuse a project whose path Kedro or MLflow would take for another one.
+
+    Raises:
+        InputError: It names the characters.
+    """
+    odd = [character for character in _READ_AS_PATTERNS if character in str(project)]
+    if odd:
+        raise InputError(
+            f"{project}: Kedro and MLflow read {' '.join(odd)} in a path as a pattern or as part "
+            "of an address, and would use other files; move the project to a folder without"
+        )
+
+
+@contextmanager
+def only_run(path: Path) -> Iterator[None]:
+    """Hold the lock of a project, after waiting for whoever holds it.
+
+    Args:
+        path: The lock file; the lock of a process that is gone is none.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(path)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        logger.warning("%s; waiting until it ends (Ctrl-C ends the wait)", _owner(path))
+        lock.acquire(poll_interval=0.5)
+        logger.info("it has ended: this run goes on")
+    with lock:
+        lock.release()  # the second of two
+        owner = {"pid": os.getpid(), "host": platform.node(), "since": time.strftime("%F %T")}
+        path.write_text(json.dumps(owner | {"command": shlex.join(sys.argv)}))
+        yield
+
+
+def _owner(path: Path) -> str:
+    """Who holds a lock, as far as is known."""
+    try:
+        owner = json.loads(path.read_text())
+        who = "process {pid} on {host} since {since}: {command}".format(**owner)
+    except (OSError, ValueError, LookupError, TypeError):
+        who = "who has not said yet who it is"
+    return f"another run works in {path.parent}, {who}"
+
+
+class Interrupts:
+    """Ends a run on Ctrl-C, also where Python could only print and forget the exception.
+
+    An exception that a signal raises in a finaliser or in a callback of C code is not passed on.
+    So the signal is noted, and the exception raised again once the next result is stored.
+    """
+
+    def __init__(self) -> None:
+        self._came = False
+
+    @contextmanager
+    def heard(self) -> Iterator[None]:
+        """Note Ctrl-C inside the block, which ends with an exception if it came."""
+        default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        if not default or threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        signal.signal(signal.SIGINT, self._note)
+        try:
+            yield
+            self._raise()
+        finally:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    @hook_impl
+    def before_node_run(self) -> None:
+        """Raise what was lost while inputs were loaded."""
+        self._raise()
+
+    @hook_impl
+    def after_dataset_saved(self) -> None:
+        """Raise what was lost since the last result."""
+        self._raise()
+
+    def _note(self, _signal: int, _frame: FrameType | None) -> None:
+        self._came = True
+        raise KeyboardInterrupt
+
+    def _raise(self) -> None:
+        if self._came:
+            raise KeyboardInterrupt

@@ -1,0 +1,159 @@
+"""What is loaded is what was written, whatever kind of file it is in."""
+
+import errno
+import json
+import shutil
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+from kedro.io import DatasetError
+
+from gyro_pipeline.conventions import InputError, Missing
+from gyro_pipeline.datasets.atomic import remove_leftovers, replacing, require_room
+from gyro_pipeline.datasets.recordings import Recordings
+from gyro_pipeline.datasets.tables import Table
+
+TABLE = pd.DataFrame({"imu": [1, 2], "bias_dps": [0.25, 0.5]})
+ARRAY = xr.Dataset({"variance": ("time", np.arange(100.0))})
+KINDS = {"bias.csv": (Table, TABLE), "windows.parquet": (Table, TABLE), "a.nc": (Recordings, ARRAY)}
+MADE_BY = "kedro run --pipeline=ground_truth"
+
+
+@pytest.fixture(params=KINDS)
+def stored(request, tmp_path):
+    """A file of each kind, as saved."""
+    kind, data = KINDS[request.param]
+    dataset = kind(str(tmp_path / "new" / request.param), made_by=MADE_BY)
+    assert dataset.load() == Missing((MADE_BY,))
+    assert dataset.state() is None
+    dataset.save(data)
+    assert dataset.load().equals(data)
+    return dataset, data, dataset._filepath
+
+
+def flip(path):
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[:-1])
+
+
+def empty(path):
+    path.write_bytes(b"")
+
+
+def forget(path):
+    path.with_name(f"{path.name}.made.json").unlink()
+
+
+def spoil_record(path):
+    path.with_name(f"{path.name}.made.json").write_text("{")
+
+
+@pytest.mark.parametrize("damage", [flip, cut, empty, forget, spoil_record])
+def test_what_is_not_what_was_written_is_refused_and_can_be_made_again(stored, damage):
+    dataset, data, path = stored
+    digest = dataset.state()
+    damage(path)
+    assert dataset.state() is None
+    with pytest.raises(DatasetError, match=f"type {MADE_BY}") as caught:
+        dataset.load()
+    assert isinstance(caught.value.__cause__, InputError)
+    assert str(path) in str(caught.value)
+    dataset.save(data)
+    assert dataset.load().equals(data)
+    assert (dataset.state() == digest) or path.suffix == ".nc"  # which may hold its time
+
+
+def test_a_copy_is_what_was_written_and_a_file_without_a_maker_is_just_missing(stored, tmp_path):
+    dataset, data, path = stored
+    copied = type(dataset)(str(shutil.copytree(path.parent, tmp_path / "copy") / path.name))
+    copied._filepath.touch()
+    assert copied.state() == dataset.state()
+    assert copied.load().equals(data)
+    copied._filepath.unlink()
+    with pytest.raises(DatasetError) as caught:
+        copied.load()
+    assert isinstance(caught.value.__cause__, FileNotFoundError)
+
+
+def test_a_file_of_other_settings_or_sources_is_named(tmp_path):
+    bias = Table(str(tmp_path / "bias.csv"), made_by=MADE_BY)
+    drawn = Recordings(str(tmp_path / "sub" / "drawn.nc"), made_by="draw")
+    settings = {"virtual_gyros": {"imus": 8, "seed": 1}, "ground_truth": {"tolerance_mdps": 5.0}}
+    bias.settings = {"ground_truth": settings["ground_truth"]}
+    drawn.settings, drawn.sources = {"virtual_gyros": settings["virtual_gyros"]}, [bias]
+    drawn.check_made_with(settings)  # nothing is there
+    bias.save(TABLE)
+    drawn.save(ARRAY)
+    drawn.check_made_with(settings | {"training": {"epochs": 3}})
+    for changed, words in (
+        ({"virtual_gyros": {"imus": 8, "seed": 2}}, "virtual_gyros.seed 1, .* 2; type draw"),
+        ({"ground_truth": {"tolerance_mdps": 6.0}}, "bias.csv: .*tolerance_mdps 5.0, .* 6.0"),
+        ({"ground_truth": {}}, "tolerance_mdps 5.0, while this run has None"),
+    ):
+        with pytest.raises(InputError, match=words):
+            drawn.check_made_with(settings | changed)
+    bias.save(TABLE + 1)
+    with pytest.raises(InputError, match="drawn.nc: made from another .*bias.csv than there is"):
+        drawn.check_made_with(settings)
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_an_interrupted_write_leaves_the_old_file_and_no_other(tmp_path, error):
+    path = tmp_path / "table.csv"
+    path.write_text("old")
+    with pytest.raises(error), replacing(path) as temporary:
+        assert (temporary.suffix, temporary.parent) == (".csv", path.parent)
+        temporary.write_text("half")
+        raise error
+    assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {"table.csv": "old"}
+
+
+def test_what_kills_left_is_removed_and_nothing_else(tmp_path):
+    for name in (".bias.4711.csv", ".table.4711", ".gitkeep", "bias.4711.csv", ".hidden.csv"):
+        (tmp_path / name).touch()
+    assert remove_leftovers(tmp_path) == 2
+    kept = {path.name for path in tmp_path.iterdir()}
+    assert kept == {".gitkeep", "bias.4711.csv", ".hidden.csv"}
+
+
+def test_what_is_in_the_way_of_a_file_is_named(tmp_path, monkeypatch):
+    def refused(path, words, kind=InputError):
+        with pytest.raises(kind, match=words) as caught, replacing(path):
+            pass
+        return caught.value
+
+    (tmp_path / "table.csv").mkdir()
+    refused(tmp_path / "table.csv", "a folder has that name")
+    (tmp_path / "data").write_text("")
+    refused(tmp_path / "data" / "sub" / "table.csv", f"{tmp_path / 'data'} is a file")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "table.csv"]
+    monkeypatch.setattr("os.access", lambda *_: False)  # root may write anywhere
+    refused(tmp_path / "other.csv", "Permission denied", PermissionError)
+
+
+def test_room_is_looked_for_before_a_large_file_is_written(tmp_path, monkeypatch):
+    free = SimpleNamespace(free=10**6)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: free)
+    require_room(tmp_path / "a.nc", 900_000)
+    with pytest.raises(OSError, match="1.0 MB are needed") as caught:
+        require_room(tmp_path / "a.nc", 10**6)
+    assert caught.value.errno == errno.ENOSPC
+    large = xr.Dataset({"rate": ("sample", np.zeros(10**6))})
+    with pytest.raises(DatasetError, match="8.0 MB are needed"):
+        Recordings(str(tmp_path / "a.nc")).save(large)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_record_says_how_a_file_was_made(stored):
+    dataset, _, path = stored
+    record = json.loads(path.with_name(f"{path.name}.made.json").read_text())
+    assert record["digest"] == dataset.state()
+    assert record["bytes"] == path.stat().st_size
