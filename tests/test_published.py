@@ -8,6 +8,11 @@ import pytest
 
 PAPER = "rapid_gyroscope_calibration.tex"
 SENSORS = {"SparkFan": "sparkfun", "DOT": "dot", "NG": "ng", "Memsense": "memsense"}
+RESULTS = {
+    "tab:three_gyro_results": "three_gyroscopes",
+    "tab:mg_results": "multiple_gyroscopes",
+    "tab:generalization": "generalization",
+}
 
 
 @pytest.fixture(scope="module")
@@ -37,27 +42,14 @@ def table(text, label):
     return [row for row in cells if re.fullmatch(r"[\d.]+|N/A", row[-1])]
 
 
-def number(cell):
-    return None if cell == "N/A" else float(cell)
-
-
-@pytest.mark.parametrize(
-    ("label", "name"),
-    [
-        ("tab:three_gyro_results", "three_gyroscopes"),
-        ("tab:mg_results", "multiple_gyroscopes"),
-        ("tab:generalization", "generalization"),
-    ],
-)
-def test_results_are_the_papers(text, published, label, name):
-    theirs = table(text, label)
-    ours = published.of_table(name)
-    assert len(theirs) == len(ours)
-    for (approach, gyroscopes, saving, gain), row in zip(theirs, ours, strict=True):
-        if name == "generalization":
-            assert SENSORS[approach] == row.sensor
+@pytest.mark.parametrize("label", RESULTS)
+def test_results_are_the_papers(text, published, label):
+    results = zip(table(text, label), published.of_table(RESULTS[label]), strict=True)
+    for (approach, gyroscopes, saving, gain), row in results:
+        if label == "tab:generalization":
+            assert row.sensor == SENSORS[approach]
         else:
-            assert approach.replace(" ", "") == row.approach.replace(" ", "")
+            assert row.approach.replace(" ", "") == approach.replace(" ", "")
             assert row.sensor == ("dot" if "DOT" in approach else "sparkfun")
         counts = [int(count) for count in re.findall(r"\d+", gyroscopes)]
         assert counts == [row.real_gyros] + [row.virtual_gyros] * (row.virtual_gyros > 0)
@@ -67,43 +59,27 @@ def test_results_are_the_papers(text, published, label, name):
         assert row.section.startswith("IV-G")
 
 
-def test_specifications_are_the_papers(text, published):
-    theirs = table(text, "sensor_specifications")
-    assert len(theirs) == len(published.specifications)
-    for (name, rate, density, stability), row in zip(theirs, published.specifications, strict=True):
-        assert name == row.name
+def test_specifications_and_hours_are_the_papers(text, published):
+    specifications = table(text, "sensor_specifications")
+    for (name, rate, *figures), row in zip(specifications, published.specifications, strict=True):
+        assert row.name == name
         ends = [float(end) for end in rate.split("-")]
         assert row.rate_hz == (ends[0], ends[-1])
-        assert row.noise_density_mdps_rthz == number(density)
-        assert row.bias_stability_dph == number(stability)
-
-
-def test_hours_are_the_papers(text, published):
-    theirs = table(text, "tab:dataset_in_hours")
+        stated = [row.noise_density_mdps_rthz, row.bias_stability_dph]
+        assert stated == [None if cell == "N/A" else float(cell) for cell in figures]
     ours = [[row.dataset, row.train_h, row.test_h, row.total_h] for row in published.hours]
-    assert [[float(cell) for cell in row] for row in theirs] == ours
-    total = sum(row.total_h for row in published.hours)
-    assert f"contain {total:.1f} hours" in text
+    assert [[float(cell) for cell in row] for row in table(text, "tab:dataset_in_hours")] == ours
+    assert f"contain {sum(row.total_h for row in published.hours):.1f} hours" in text
 
 
-@pytest.mark.parametrize("quoted", ["400 recordings", "6.83 hours", "100 recordings"])
-def test_what_the_notes_speak_of_is_in_the_paper(text, published, quoted):
-    assert quoted in text
-    assert any(quoted.removesuffix("ours") in row.note for row in published.hours)
-
-
-def test_the_sections_are_the_papers(text, published):
+def test_every_row_names_its_section_and_notes_quote_the_paper(text, published):
+    for quoted in ("400 recordings", "6.83 hours", "100 recordings"):
+        assert quoted in text
+        assert any(quoted.removesuffix("ours") in row.note for row in published.hours)
     results = text.index(r"\section{Analysis and Results}")
     sections = re.findall(r"\\subsection\{(.*?)\}", text[results:])
     letters = dict(zip("ABCDEFG", sections, strict=True))
-    assert letters["A"] == "Dataset"
-    assert letters["G"] == "Summary"
-    rows = [*published.results, *published.specifications, *published.hours]
-    assert {row.section.split(",")[0] for row in rows} == {"IV-A", "IV-G"}
-
-
-def test_every_row_names_its_section(published):
+    assert (letters["A"], letters["G"]) == ("Dataset", "Summary")
     rows = [*published.results, *published.specifications, *published.hours]
     assert len(rows) == 10 + 4 + 6
-    for row in rows:
-        assert row.section
+    assert {row.section.split(",")[0] for row in rows} == {"IV-A", "IV-G"}

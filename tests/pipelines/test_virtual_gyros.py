@@ -35,47 +35,38 @@ def virtual(real, bias):
     return synthesise(real, bias, SETTINGS)
 
 
-def test_biases_fill_the_range_of_training_recordings_and_no_more(virtual, bias):
-    training = bias[bias.recording <= 10].bias_dps
+def test_biases_and_noise_are_those_of_training_recordings(virtual, bias):
+    training = bias[bias.recording <= 10]
     slack = 5 * SIGMA / np.sqrt(SAMPLES)
     low, high = float(virtual.recording_mean.min()), float(virtual.recording_mean.max())
-    assert low > training.min() - slack
-    assert high < training.max() + slack
-    assert high - low > 0.7 * np.ptp(training)
-
-
-def test_noise_is_that_of_training_recordings(virtual, bias):
-    training = bias[bias.recording <= 10].sample_sigma_dps
+    assert low > training.bias_dps.min() - slack
+    assert high < training.bias_dps.max() + slack
+    assert high - low > 0.7 * np.ptp(training.bias_dps)
     noise = virtual.angular_rate - virtual.recording_mean
-    assert float(noise.std()) == pytest.approx(np.sqrt(np.mean(training**2)), rel=0.005)
+    expected = np.sqrt(np.mean(training.sample_sigma_dps**2))
+    assert float(noise.std()) == pytest.approx(expected, rel=0.005)
     successive = float((noise[..., 1:].to_numpy() * noise[..., :-1].to_numpy()).mean())
     assert successive / float((noise**2).mean()) == pytest.approx(0, abs=0.01)
 
 
-def test_a_gyroscope_keeps_one_bias_over_its_recordings(virtual):
+def test_a_gyroscope_keeps_one_bias_over_its_recordings_or_with_jitter_about_one(
+    virtual, real, bias
+):
     over_recordings = virtual.recording_mean.std("recording", ddof=1)
     assert float(over_recordings.mean()) == pytest.approx(SIGMA / np.sqrt(SAMPLES), rel=0.1)
     assert np.unique(virtual.recording_mean.mean("recording").round(2)).size > 15
-
-
-def test_jitter_moves_it_from_one_power_on_to_the_next(real, bias):
-    jittery = SETTINGS.model_copy(update={"turn_on_jitter_mdps": 50.0})
-    moved = synthesise(real, bias, jittery)
+    moved = synthesise(real, bias, SETTINGS.model_copy(update={"turn_on_jitter_mdps": 50.0}))
     over_recordings = moved.recording_mean.std("recording", ddof=1)
     assert float(np.sqrt((over_recordings**2).mean())) == pytest.approx(0.05, rel=0.1)
 
 
-def test_counts_layout_and_means(virtual, real):
+def test_the_seed_and_the_sensor_decide_and_the_layout_is_that_of_recordings(virtual, real, bias):
     assert dict(virtual.sizes) == {"imu": 8, "recording": 20, "axis": 3, "sample": SAMPLES}
     assert virtual.angular_rate.dtype == np.float32
     assert (virtual.rate_hz, virtual.source, virtual.simulated) == (RATE_HZ, "test", 1)
     expected = virtual.angular_rate.to_numpy().astype(np.float64).mean(axis=-1)
     np.testing.assert_allclose(virtual.recording_mean, expected, rtol=1e-12)
-
-
-def test_the_seed_and_the_sensor_decide(virtual, real, bias):
-    again = synthesise(real, bias, SETTINGS)
-    xr.testing.assert_identical(again, virtual)
+    xr.testing.assert_identical(synthesise(real, bias, SETTINGS), virtual)
     others = [
         synthesise(real, bias, SETTINGS.model_copy(update={"seed": 1})),
         synthesise(real.assign_attrs(sensor="dot"), bias, SETTINGS),
