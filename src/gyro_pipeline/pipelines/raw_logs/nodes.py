@@ -67,7 +67,7 @@ def _read(sensor: str, jobs: Sequence[Inspection], execution: Execution) -> Iter
     """Recordings in any order, read here or in several processes."""
     sizes = [job.entry.size for job in jobs]
     if sum(sizes) < _WORTH_PROCESSES:
-        return (judge(job, lambda work: None) for job in jobs)
+        return map(judge, jobs)
     at_once = int(np.clip(_BYTES_AT_ONCE // max(sizes), 1, _AT_ONCE))
     read = run_jobs(jobs, judge, execution, sensor, "recordings", at_once)
     return (recording for _, recording in read)
