@@ -20,7 +20,7 @@ from kedro.framework.session import KedroSession
 from kedro.framework.startup import bootstrap_project
 
 from gyro_pipeline.conventions import HOLD_OUT
-from gyro_pipeline.estimators.paper_network import PaperNetwork
+from gyro_pipeline.estimators import make_estimator
 from gyro_pipeline.executors import run_jobs
 from gyro_pipeline.learning.jobs import TrainingJob, run_training
 from gyro_pipeline.parameters import Only, Parameters
@@ -63,13 +63,13 @@ def main() -> None:
     sets = TrainingSets(windows, alike, None)
     rows = study_rows(study, "sparkfun", parameters.source, [10.0], [0], Only())
     jobs = []
-    for number, sizes in enumerate(CANDIDATES):
+    for sizes in CANDIDATES:
         changes = dict(zip(NAMES, sizes, strict=True)) | {"epochs": options.epochs}
         training = parameters.training.model_copy(update=changes)
         for row in (row for row in rows if row.estimator == CNN and row.real_gyros in (3, 12)):
             for seed in range(options.seeds):
-                job = PaperNetwork(training, seed).job(sets.of(row)[HOLD_OUT])
-                jobs.append(replace(job, name=f"{number} {row.real_gyros}"))
+                job = make_estimator(CNN, training, seed).job(sets.of(row)[HOLD_OUT])
+                jobs.append(replace(job, cell=row.real_gyros))
     rows = [
         _row(job, result) for job, result in run_jobs(jobs, timed, parameters.execution, "sizes")
     ]
@@ -77,18 +77,18 @@ def main() -> None:
     print(table.to_string())  # noqa: T201 - a program for a terminal
 
 
-def timed(job: TrainingJob, report):  # noqa: ANN001, ANN201, D103
+def timed(job: TrainingJob):  # noqa: ANN201, D103
     started = time.perf_counter()
-    return run_training(job, report), time.perf_counter() - started
+    return run_training(job), time.perf_counter() - started
 
 
 def _row(job: TrainingJob, result: tuple) -> dict[str, float]:
     network, seconds = result
     losses = network.history.val_loss
     steps = job.settings.epochs * -(-job.windows // job.settings.batch_size)
-    sizes = {name: getattr(job.settings, name) for name in NAMES}
+    sizes = {name: job.design.options[name] for name in NAMES}
     return sizes | {
-        "real": int(job.name.split()[1]),
+        "real": job.cell,
         "last": float(np.sqrt(losses.iloc[-1])),
         "best": float(np.sqrt(losses.min())),
         "step_ms": 1e3 * seconds / steps,

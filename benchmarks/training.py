@@ -44,23 +44,22 @@ from torch.utils.data import DataLoader, Sampler, TensorDataset
 
 from gyro_pipeline.conventions import AXES, DIMENSIONS, HOLD_OUT, TEST, TRAIN
 from gyro_pipeline.datasets.recordings import Recordings
-from gyro_pipeline.estimators.paper_network import PaperNetwork
+from gyro_pipeline.estimators import entry, make_estimator
 from gyro_pipeline.estimators.training import TrainingSet
 from gyro_pipeline.executors import available_cores, run_jobs
 from gyro_pipeline.learning import fused
+from gyro_pipeline.learning.design import Design, options_of
 from gyro_pipeline.learning.examples import Device, Examples
 from gyro_pipeline.learning.fused import FusedEngine
 from gyro_pipeline.learning.jobs import (
     TrainingJob,
-    initial_network,
     run_training,
     shuffling,
-    sized,
 )
 from gyro_pipeline.learning.network import Architecture, CalibrationNetwork
 from gyro_pipeline.learning.packing import pack
 from gyro_pipeline.learning.trainer import Engine, TorchEngine, predict, train
-from gyro_pipeline.parameters import Execution, Only, Parameters, Study
+from gyro_pipeline.parameters import Execution, Only, Parameters, Study, Training
 from gyro_pipeline.pipelines.training.nodes import TrainingSets
 from gyro_pipeline.pipelines.windowed_splits.nodes import split_windows
 from gyro_pipeline.protocol.splits import split_recordings
@@ -249,6 +248,11 @@ def peaks() -> dict[str, float]:
     return measured
 
 
+def initial_network(a: Architecture, seed: int) -> CalibrationNetwork:
+    torch.manual_seed(seed)
+    return CalibrationNetwork(**vars(a))
+
+
 def step_operations(a: Architecture, batch: int = BATCH) -> float:
     """Operations of one step, counted from the sizes as if nothing could be skipped.
 
@@ -279,7 +283,7 @@ def one_core(parameters: Parameters, sizes: list[str], repetitions: int, steps: 
     for name in sizes:
         changes, gyroscopes, window = SIZES[name]
         training = parameters.training.model_copy(update=changes)
-        architecture = sized(training, gyroscopes, window)
+        architecture = sized(training, gyroscopes, window).layout.packed
         ways, networks = prepared(architecture)
         for run in ways.values():
             run(1)
@@ -321,7 +325,7 @@ def prepared(a: Architecture) -> tuple[dict[str, Run], dict[str, Callable[[], fl
     targets = random.standard_normal((n, a.gyroscopes), np.float32)
     x, y = torch.from_numpy(windows), torch.from_numpy(targets)
     packed = pack(windows.transpose(1, 0, 2), a)
-    start = initial_network(a, seed=0)
+    start = initial_network(a, 0)
     ways: dict[str, Run] = {}
     losses: dict[str, Callable[[], float]] = {}
 
@@ -399,7 +403,7 @@ def loop_way(
     return run
 
 
-def engine_way(  # noqa: PLR0913, PLR0917 - the last two are for benchmarks/gpu.py
+def engine_way(  # noqa: PLR0913, PLR0917 - what a way is made of
     network: CalibrationNetwork,
     engine: type[Engine],
     packed: np.ndarray,
@@ -491,8 +495,8 @@ STEP_PROGRAM = """
 import sys, time
 import numpy as np, torch
 from gyro_pipeline.learning.fused import FusedEngine
-from gyro_pipeline.learning.jobs import initial_network, shuffling
-from gyro_pipeline.learning.network import Architecture
+from gyro_pipeline.learning.jobs import shuffling
+from gyro_pipeline.learning.network import Architecture, CalibrationNetwork
 from gyro_pipeline.learning.packing import pack
 
 torch.set_num_threads(1)
@@ -502,7 +506,12 @@ random = np.random.default_rng(0)
 windows = random.standard_normal((n, a.gyroscopes, a.window), np.float32)
 targets = random.standard_normal((n, a.gyroscopes), np.float32)
 packed = pack(windows.transpose(1, 0, 2), a)
-engine, order = FusedEngine(initial_network(a, 0), packed, targets, batch), shuffling(0)
+torch.manual_seed(0)
+try:
+    network = CalibrationNetwork(**vars(a))
+except TypeError:  # of an older commit
+    network = CalibrationNetwork(a)
+engine, order = FusedEngine(network, packed, targets, batch), shuffling(0)
 for line in sys.stdin:
     started = time.process_time()
     for _ in range(int(line)):
@@ -525,7 +534,8 @@ def against(  # noqa: PLR0917 - what the part is asked for
     sources = {commit: folder / "src", "here": project / "src"}
     for name in sizes:
         changes, gyroscopes, window = SIZES[name]
-        a = sized(parameters.training.model_copy(update=changes), gyroscopes, window)
+        changed = parameters.training.model_copy(update=changes)
+        a = sized(changed, gyroscopes, window).layout.packed
         programs = {way: _step_program(source, a) for way, source in sources.items()}
         once = [_asked(program, 1)[0] for program in programs.values()]
         epochs = max(3, int(MEASURE_S / max(once)))
@@ -575,20 +585,17 @@ class Enough(Exception):  # noqa: N818 - not an error: a training was measured f
     """Ends a training from within its report of an epoch."""
 
 
-def timed_training(job: TrainingJob, report: Callable[[float], None]) -> tuple[float, float, float]:
+def timed_training(job: TrainingJob) -> tuple[float, float, float]:
     """Seconds before the first epoch, of an epoch with its validation; share on the processor."""
     started, busy, ends = time.perf_counter(), -time.process_time(), []
 
-    def after_epoch(work: float) -> None:
-        if work != job.epoch_work:
-            return  # part of the preparation
+    def after_epoch() -> None:
         ends.append(time.perf_counter())
         if len(ends) > 3 and ends[-1] - ends[0] > MEASURE_S:  # noqa: PLR2004 - see MEASURE_S
             raise Enough
 
     with contextlib.suppress(Enough):
         run_training(job, after_epoch)
-    report(job.work)
     share = (busy + time.process_time()) / (time.perf_counter() - started)
     epoch_s = (ends[-1] - ends[0]) / (len(ends) - 1)
     return ends[0] - started - epoch_s, epoch_s, share
@@ -634,8 +641,8 @@ def study_jobs(parameters: Parameters, folder: Path) -> dict[RunSpec, TrainingJo
                 alike = spec.method, spec.sensor, spec.real_gyros, spec.virtual_gyros, spec.window_s
                 if alike not in seen:
                     seen.add(alike)
-                    job = PaperNetwork(p.training, seed=0).job(training)
-                    jobs[spec] = replace(job, name=str(len(seen)))
+                    job = make_estimator(CNN, p.training, seed=0).job(training)
+                    jobs[spec] = replace(job, cell=len(seen))
     return dict(sorted(jobs.items(), key=lambda item: item[1].work, reverse=True))
 
 
@@ -662,7 +669,7 @@ def _training_sets(
 def study(parameters: Parameters, folder: Path) -> None:
     """Measure a few epochs of each with all cores busy; extrapolate to all epochs and seeds."""
     top, jobs = peaks(), study_jobs(parameters, folder)
-    specs = {job.name: spec for spec, job in jobs.items()}
+    specs = {job.cell: spec for spec, job in jobs.items()}
     execution = Execution(executor="processes", workers=None)
     rows = []
     for job, (preparation_s, epoch_s, share) in run_jobs(
@@ -672,17 +679,17 @@ def study(parameters: Parameters, folder: Path) -> None:
         minutes = (preparation_s + job.settings.epochs * epoch_s) / 60
         rows.append(
             {
-                "study": specs[job.name].study,
-                "sensor": specs[job.name].sensor,
-                "gyros": f"{specs[job.name].real_gyros}+{specs[job.name].virtual_gyros}",
-                "S": job.window,
+                "study": specs[job.cell].study,
+                "sensor": specs[job.cell].sensor,
+                "gyros": f"{specs[job.cell].real_gyros}+{specs[job.cell].virtual_gyros}",
+                "S": job.design.window,
                 "windows": n,
                 "preparation_s": preparation_s,
                 "epoch_ms": 1e3 * epoch_s,
                 "minutes": minutes,
                 "busy": minutes * share,
                 "steps": steps * job.settings.epochs,
-                "GFLOP": job.settings.epochs * step_operations(job.architecture, n) / 1e9,
+                "GFLOP": job.settings.epochs * step_operations(job.design.layout.packed, n) / 1e9,
             }
         )
     table = pd.DataFrame(rows).sort_values("minutes", ascending=False)
@@ -718,11 +725,11 @@ class Watched:
     work: float = 1.0
 
 
-def epochs_per_second(job: Watched, report: Callable[[float], None]) -> float:
+def epochs_per_second(job: Watched) -> float:
     """Epochs per second on the processor while all processes are at work."""
     ends, busy = [], []
 
-    def after_epoch(work: float) -> None:
+    def after_epoch() -> None:
         ends.append(time.time())
         busy.append(time.process_time())
         if ends[-1] > job.start + SCALING_S:
@@ -746,7 +753,7 @@ def scaling(parameters: Parameters, folder: Path, repetitions: int) -> None:
     spec = next(s for s in jobs if (s.sensor, s.real_gyros, s.virtual_gyros) == wanted)
     endless = jobs[spec].settings.model_copy(update={"epochs": 10**6, "decay_every": 10**6})
     job = replace(jobs[spec], settings=endless)
-    print(f"epochs per second of {job.windows} windows of {job.window} samples")
+    print(f"epochs per second of {job.windows} windows of {job.design.window} samples")
     ratios = []
     for _ in range(repetitions):
         rates = {}
@@ -779,13 +786,13 @@ def memory(parameters: Parameters, folder: Path) -> None:
             for imus in MEMORY_IMUS
         ]
     largest = max(study_jobs(parameters, folder).values(), key=_megabytes)
-    jobs.append(replace(largest, name=f"{STUDY} {len(largest.devices)}"))
+    jobs.append(replace(largest, cell=(STUDY, len(largest.devices))))
     spawn = multiprocessing.get_context("spawn")
     with spawn.Pool(1, maxtasksperchild=1) as fresh:
         for job, (megabytes, preparation_s, epoch_s) in zip(
             jobs, fresh.imap(peak_memory, jobs, chunksize=1), strict=True
         ):
-            given = (*job.name.split(), job.window, _megabytes(job))
+            given = (*job.cell, job.design.window, _megabytes(job))
             rows.append((*given, megabytes, preparation_s, 1e3 * epoch_s))
     columns = ["method", "N", "S", "recordings_MB", *MEASURED]
     table = pd.DataFrame(rows, columns=columns).astype({"N": int})
@@ -811,7 +818,14 @@ def _memory_job(
         bias = data.recording_mean.sel(imu=list(some), recording=list(numbers))
         biases = bias.transpose("recording", "imu", "axis").to_numpy().reshape(len(numbers), -1)
         devices.append(Device(data.angular_rate, some, numbers, biases, starts))
-    return TrainingJob(f"{method} {imus}", devices, None, samples, parameters.training, seed=0)
+    design = sized(parameters.training, devices[0].biases.shape[1], samples)
+    return TrainingJob(design, devices, None, parameters.training, seed=0, cell=(method, imus))
+
+
+def sized(training: Training, gyroscopes: int, window: int) -> Design:
+    """The paper's network with these settings."""
+    path = entry(CNN)
+    return Design(path, gyroscopes, window, options_of(path, training, {}))
 
 
 def _megabytes(job: TrainingJob) -> float:
@@ -828,7 +842,7 @@ def peak_memory(job: TrainingJob) -> tuple[float, float, float]:
     getrusage would do, but what it reports starts with the peak of the process that spawned.
     """
     before = _status("VmRSS")
-    preparation_s, epoch_s, _ = timed_training(job, lambda work: None)
+    preparation_s, epoch_s, _ = timed_training(job)
     return _status("VmHWM") - before, preparation_s, epoch_s
 
 
@@ -842,7 +856,7 @@ def _status(key: str) -> float:
 
 def agreement(parameters: Parameters) -> None:
     """Train to the last epoch by each path, seed by seed; RMSE on windows that did not train."""
-    architecture = sized(parameters.training, 3, 1494)
+    architecture = sized(parameters.training, 3, 1494).layout.packed
     ways: dict[str, type[Engine]] = {"packed": TorchEngine}
     if fused.available():
         ways["fused"] = FusedEngine

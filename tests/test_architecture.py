@@ -18,7 +18,7 @@ ALLOWED = {
     "fingerprints": set(),
     "units": set(),
     "parameters": {"conventions", "units"},
-    "executors": {"parameters"},
+    "executors": {"conventions", "parameters"},
     "studies": {"conventions", "estimators", "parameters"},
     "logs": {"conventions"},
     "readers": {"conventions", "logs", "parameters", "units"},

@@ -19,7 +19,10 @@ CONF = ROOT / "conf"
 ENVS = sorted(
     path.name for path in CONF.iterdir() if path.is_dir() and path.name not in ("base", "local")
 )
-STUDIES = {"augmentation", "estimators", "input_channels", "leakage", "real2real", "unseen_devices"}
+STUDIES = {
+    *("augmentation", "estimators", "input_channels", "leakage", "networks", "real2real"),
+    *("sweep", "unseen_devices"),
+}
 PIPELINES = STUDIES | {"__default__", "ground_truth", "reporting", "virtual_gyros"}
 MEMORY = "kedro.io.MemoryDataset"
 SHARED = {"mlflow.db", "data/08_reporting/report"}  # by all sources

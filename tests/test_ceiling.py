@@ -20,7 +20,7 @@ from gyro_pipeline.conventions import (
     TRUE,
     VALIDATION,
 )
-from gyro_pipeline.estimators.paper_network import PaperNetwork
+from gyro_pipeline.estimators import make_estimator
 from gyro_pipeline.physics.ceiling import running_mean_rmse
 from gyro_pipeline.pipelines.evaluation.bench import Bench
 from gyro_pipeline.pipelines.evaluation.device import describe_devices
@@ -89,7 +89,7 @@ def errors_of(recordings, parameters, benches):
         place = ("", "sparkfun", "test", "by_recording", CNN, 2)
         spec = RunSpec(*place, real_gyros, 0, window_s, window_s, seed=0)
         training = TrainingSets(table_of(roles, window_s), recordings, None).of(spec)[HOLD_OUT]
-        network = PaperNetwork(base.model_copy(update=settings), seed=0).fit(training)
+        network = make_estimator(CNN, base.model_copy(update=settings), seed=0).fit(training)
         found = {which: {HOLD_OUT: one} for which, one in network.variants().items()}
         return {which: benches[window_s].errors(fits) for which, fits in found.items()}
 

@@ -3,8 +3,8 @@
 import importlib
 import io
 import logging
-import multiprocessing
 import os
+import pickle
 import re
 import signal
 import subprocess
@@ -13,23 +13,24 @@ import threading
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 
 import psutil
 import pytest
+from joblib.externals.loky import get_reusable_executor
 
 from gyro_pipeline import executors
+from gyro_pipeline.conventions import InputError
 from gyro_pipeline.executors import available_cores, run_jobs
 from gyro_pipeline.parameters import Execution
 
 SERIAL = Execution(executor="serial", workers=None)
-ALONE = Execution(executor="processes", workers=1)
 PAIR = Execution(executor="processes", workers=2)
-BOTH = pytest.mark.parametrize("execution", [SERIAL, PAIR], ids=["serial", "processes"])
 
 LONG_S = 120.0
-SOON_S = 30.0
+SOON_S = 60.0
 """Start-up of a worker on a busy machine included; a fraction of ``LONG_S``."""
 
 
@@ -40,34 +41,28 @@ class Job:
     folder: str = ""
 
 
-def square(job, report):
-    report(job.work)
-    return job.work**2
+def square(job):
+    return time.monotonic(), os.getpid(), job.work**2
 
 
-def started(job, report):
-    """When, and in which process, it ran."""
-    began = time.monotonic()
-    time.sleep(0.01)
-    return began, os.getpid()
-
-
-def fails(job, report):
+def fails(job):
     if job.name == "bad":
         raise ArithmeticError("the loss is nan in epoch 7")
-    sleeps(job, report)
 
 
-def sleeps(job, report):
-    """For as many seconds as it has work; tells in a file that it runs."""
-    Path(job.folder, f"{os.getpid()}.pid").touch()
+def sleeps(job):
+    """For as many seconds as it has work; tells in a file that it runs, and how often it did."""
+    with Path(job.folder, f"{os.getpid()}.pid").open("a") as file:
+        file.write(f"{job.name}\n")
     time.sleep(job.work)
+    return job.name
 
 
 @pytest.fixture
 def here(monkeypatch):
-    """This file as a module that spawned workers can import, however pytest imported it."""
+    """This file as a module that workers can import, however pytest imported it."""
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
     yield importlib.import_module(Path(__file__).stem)
     sys.modules.pop(Path(__file__).stem)
 
@@ -77,18 +72,18 @@ def no_terminal(monkeypatch):
     monkeypatch.setattr(sys, "stderr", io.StringIO())
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def nothing_left_behind():
     yield
-    assert multiprocessing.active_children() == []
+    get_reusable_executor().shutdown(kill_workers=True)
 
 
-def soon(condition, what):
+def soon(condition, told):
     """Wait until a condition holds, but not for ever."""
     deadline = time.monotonic() + SOON_S
     while not condition():
-        assert time.monotonic() < deadline, f"after {SOON_S:g} s: {what}"
-        time.sleep(0.02)
+        assert time.monotonic() < deadline, f"after {SOON_S:g} s: {told}"
+        time.sleep(0.05)
 
 
 def runs(process):
@@ -99,36 +94,40 @@ def runs(process):
         return False
 
 
-@BOTH
-@pytest.mark.parametrize("at_once", [None, 1, 16])
-def test_every_job_is_run_once_and_comes_back_with_its_result(here, execution, at_once):
-    jobs = [here.Job(f"job {i}", float(i)) for i in range(1, 20)]
-    results = dict(run_jobs(jobs, here.square, execution, "squares", at_once=at_once))
-    assert results == {job: job.work**2 for job in jobs}
+@pytest.mark.parametrize("execution", [SERIAL, PAIR], ids=["serial", "processes"])
+def test_every_job_is_run_once_the_longest_first_where_it_was_asked_for(here, execution, caplog):
+    caplog.set_level(logging.INFO, executors.__name__)
+    jobs = [here.Job(f"job {i}", float(i % 7 + 0.1 * i)) for i in range(1, 20)]
+    for at_once in (1, 16):
+        results = list(run_jobs(jobs, here.square, execution, "study", at_once=at_once))
+        assert sorted(job.name for job, _ in results) == sorted(job.name for job in jobs)
+        assert all(value == job.work**2 for job, (_, _, value) in results)
+        pids = {pid for _, (_, pid, _) in results}
+        assert (pids == {os.getpid()}) == (execution is SERIAL)
+        assert len(pids) <= 2
+    if execution is SERIAL:
+        works = [job.work for job, _ in results]
+        assert works == sorted(works, reverse=True)
+    assert not list(run_jobs([], square, execution, "nothing"))
+    assert caplog.messages[0] == f"study: 19 jobs on {1 + (execution is PAIR)} processes"
+    assert re.fullmatch(r"study: 19 jobs in 0 min \d\d s", caplog.messages[1])
 
 
-@pytest.mark.parametrize("execution", [SERIAL, ALONE], ids=["serial", "processes"])
-def test_the_longest_jobs_start_first(here, execution):
-    jobs = [here.Job(str(work), work) for work in (3.0, 1.0, 5.0, 2.0, 4.0)]
-    results = list(run_jobs(jobs, here.started, execution, "sorted"))
-    in_order = [job.work for job, _ in sorted(results, key=lambda one: one[1][0])]
-    assert in_order == [5.0, 4.0, 3.0, 2.0, 1.0]
-
-
-def test_processes_are_others_and_no_more_than_asked(here):
-    jobs = [here.Job(str(i), 1.0) for i in range(6)]
-    pids = {pid for _, (_, pid) in run_jobs(jobs, here.started, PAIR, "pids")}
-    assert os.getpid() not in pids
-    assert 1 <= len(pids) <= 2
-
-
-def test_serial_runs_in_this_process(here):
-    ((_, (_, pid)),) = run_jobs([here.Job("one", 1.0)], here.started, SERIAL, "pids")
-    assert pid == os.getpid()
-
-
-def test_no_jobs_need_no_workers():
-    assert list(run_jobs([], square, PAIR, "nothing")) == []
+def test_lines_tell_how_much_of_the_work_is_done_and_a_terminal_gets_a_bar(monkeypatch, caplog):
+    caplog.set_level(logging.INFO, executors.__name__)
+    clock = count(0.0, 40.0)
+    monkeypatch.setattr(executors, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    list(run_jobs([Job("a", 3.0), Job("b", 1.0)], lambda job: None, SERIAL, "study"))
+    assert "study: 1 of 2 jobs done, 75 %, about 0 min 26 s left" in caplog.text
+    caplog.clear()
+    monkeypatch.undo()
+    terminal = io.StringIO()
+    terminal.isatty = lambda: True
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setattr(executors, "_LOG_EVERY_S", 0)
+    list(run_jobs([Job("a", 5.0), Job("b", 7.0)], lambda job: None, SERIAL, "study"))
+    assert "study 100%" in terminal.getvalue()
+    assert " left" not in caplog.text
 
 
 def test_available_cores_are_those_this_process_may_use():
@@ -143,79 +142,36 @@ def test_available_cores_are_those_this_process_may_use():
         os.sched_setaffinity(0, mine)
 
 
-def test_serial_and_processes_train_identical_networks():
-    """The jobs that the pipeline runs, each with another network to find."""
-    import numpy as np  # noqa: PLC0415 - the program at the end needs none of these
-    import torch  # noqa: PLC0415
-    import xarray as xr  # noqa: PLC0415
-
-    from gyro_pipeline.learning.examples import Device  # noqa: PLC0415
-    from gyro_pipeline.learning.jobs import TrainingJob, run_training  # noqa: PLC0415
-    from gyro_pipeline.parameters import Training  # noqa: PLC0415
-
-    generator = np.random.default_rng(0)
-    bias = generator.normal(size=(8, 3))
-    rates = (bias[..., None] + generator.normal(size=(1, 8, 3, 90))).astype(np.float32)
-    coords = {"imu": [1], "recording": np.arange(8), "axis": list("xyz")}
-    recordings = xr.DataArray(rates, coords, ("imu", "recording", "axis", "sample"))
-    starts = (np.array([0, 30, 60]),) * 8
-    device = Device(recordings, (1,), tuple(range(8)), bias, starts)
-    training = Training(
-        centring="per_device",
-        **{"channels": 4, "kernel": 6, "stride": 5, "pool": 2, "hidden": 8},
-        **{"epochs": 3, "batch_size": 8, "learning_rate": 1e-3, "decay": 0.1, "decay_every": 2},
-    )
-    jobs = [TrainingJob(str(seed), [device], device, 30, training, seed) for seed in range(3)]
-
-    def weights(execution):
-        results = run_jobs(jobs, run_training, execution, "networks")
-        return {job.name: trained.artifact["last"] for job, trained in results}
-
-    serial, processes = weights(SERIAL), weights(PAIR)
-    torch.use_deterministic_algorithms(False)
-    assert set(serial) == set(processes) == {"0", "1", "2"}
-    for name, state in serial.items():
-        for key, value in state.items():
-            assert torch.equal(value, processes[name][key]), (name, key)
-    assert not torch.equal(serial["0"]["output.bias"], serial["1"]["output.bias"])
-
-
-def test_a_failing_job_raises_at_once_and_ends_the_others(here, tmp_path):
-    jobs = [here.Job("good", LONG_S, str(tmp_path)), here.Job("bad", 1.0)]
-    began = time.monotonic()
+@pytest.mark.parametrize("execution", [SERIAL, PAIR], ids=["serial", "processes"])
+def test_a_failing_job_raises_here(here, execution):
+    jobs = [here.Job("good", 2.0), here.Job("bad", 1.0)]
     with pytest.raises(ArithmeticError, match="the loss is nan in epoch 7"):
-        list(run_jobs(jobs, here.fails, PAIR, "failing"))
-    assert time.monotonic() - began < SOON_S
-    assert multiprocessing.active_children() == []
-
-
-def test_a_failing_job_raises_in_this_process_too(here):
-    with pytest.raises(ArithmeticError, match="the loss is nan in epoch 7"):
-        list(run_jobs([here.Job("bad", 1.0)], here.fails, SERIAL, "failing"))
+        list(run_jobs(jobs, here.fails, execution, "failing"))
 
 
 def test_who_stops_asking_ends_the_workers(here, tmp_path):
     """What Kedro does when saving a result fails."""
-    jobs = [
-        here.Job(name, work, str(tmp_path)) for name, work in (("long", LONG_S), ("short", 0.1))
-    ]
+    names = ("long", LONG_S), ("short", 0.1)
+    jobs = [here.Job(name, work, str(tmp_path)) for name, work in names]
     results = run_jobs(jobs, here.sleeps, PAIR, "stopped")
     assert next(results)[0].name == "short"
-    soon(lambda: list(tmp_path.iterdir()), "the jobs have not started")
     workers = [psutil.Process(int(path.stem)) for path in tmp_path.iterdir()]
     began = time.monotonic()
     results.close()
     assert time.monotonic() - began < SOON_S
-    assert not any(map(runs, workers))
+    soon(lambda: not any(map(runs, workers)), "workers still run")
 
 
 @contextmanager
 def signalled(folder, number):
-    """Sends a signal to the worker that tells in ``folder`` that it runs."""
+    """Sends a signal to a worker that tells in ``folder`` that it runs the long job."""
+
+    def at_work():
+        return [path.stem for path in folder.glob("*.pid") if "long" in path.read_text()]
 
     def send():
-        soon(lambda: list(folder.iterdir()), "the job has not started")
-        os.kill(int(next(folder.iterdir()).stem), number)
+        soon(at_work, "the job has not started")
+        os.kill(int(at_work()[0]), number)
 
     sender = threading.Thread(target=send)
     sender.start()
@@ -224,21 +180,15 @@ def signalled(folder, number):
 
 
 def test_a_worker_that_is_killed_is_an_error_and_no_endless_wait(here, tmp_path):
-    job = here.Job("long", LONG_S, str(tmp_path))
+    jobs = [here.Job("long", LONG_S, str(tmp_path)), here.Job("short", 0.1, str(tmp_path))]
     with signalled(tmp_path, signal.SIGKILL):
-        with pytest.raises(RuntimeError, match="terminated abruptly"):
-            list(run_jobs([job], here.sleeps, ALONE, "killed"))
-
-
-def test_workers_leave_an_interrupt_to_their_parent(here, tmp_path):
-    job = here.Job("short", 0.5, str(tmp_path))
-    with signalled(tmp_path, signal.SIGINT):
-        assert [result for _, result in run_jobs([job], here.sleeps, ALONE, "kept")] == [None]
+        with pytest.raises(InputError, match="a worker process was killed.*execution.workers=1"):
+            list(run_jobs(jobs, here.sleeps, PAIR, "killed"))
 
 
 @pytest.fixture
 def program(tmp_path):
-    """This file as a program in a process group of its own, one worker at work and one idle."""
+    """This file as a program in a process group of its own, with workers at work."""
     process = subprocess.Popen(
         [sys.executable, __file__, str(tmp_path)],
         stdout=subprocess.PIPE,
@@ -255,70 +205,90 @@ def program(tmp_path):
         process.wait()
 
 
-def test_workers_end_when_the_parent_is_killed(program):
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_workers_end_with_their_parent_and_leave_ctrl_c_to_it(program, number):
     family = psutil.Process(program.pid).children(recursive=True)
     assert len(family) >= 2
-    program.kill()
+    if number == signal.SIGINT:
+        os.killpg(program.pid, number)  # a terminal tells the whole group
+        output, _ = program.communicate(timeout=SOON_S)
+        assert program.returncode == -signal.SIGINT
+        assert output.decode().count("KeyboardInterrupt") == 1
+    else:
+        program.kill()
     soon(lambda: not any(map(runs, family)), f"still running: {list(filter(runs, family))}")
 
 
-def test_an_interrupt_from_the_keyboard_leaves_no_process(program):
-    family = psutil.Process(program.pid).children(recursive=True)
-    os.killpg(program.pid, signal.SIGINT)  # a terminal tells the whole group
-    output, _ = program.communicate(timeout=SOON_S)
-    assert program.returncode == -signal.SIGINT
-    assert output.decode().count("KeyboardInterrupt") == 1
-    soon(lambda: not any(map(runs, family)), f"still running: {list(filter(runs, family))}")
+# on a cluster
 
 
-def test_progress_lines_tell_what_is_done_and_what_is_left(monkeypatch, caplog):
-    clock = SimpleNamespace(now=100.0)
-    monkeypatch.setattr(executors, "time", SimpleNamespace(monotonic=lambda: clock.now))
+@pytest.fixture
+def cluster(here, tmp_path):
+    """A scheduler and two workers, each a process of its own, as docs/cluster.md starts them."""
+    pytest.importorskip("distributed", reason="the extra [cluster] is not installed")
+    started, address = [], tmp_path / "scheduler.json"
 
-    def train_one(job, report):
-        for _ in range(4):
-            clock.now += 20
-            report(job.work / 4)
+    def start(*command):
+        where = {"cwd": tmp_path, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        process = subprocess.Popen([sys.executable, "-m", *command], **where)
+        started.append(process)
+        return process
 
-    with caplog.at_level(logging.INFO, executors.__name__):
-        list(run_jobs([Job("a", 4e9), Job("b", 4e9)], train_one, SERIAL, "study dot"))
-    assert caplog.messages[1:] == [
-        # every 40 s, because 20 s are less than the half minute between lines
-        "study dot: 0 of 2 jobs done, 25 %, 2 min 00 s left",
-        "study dot: 0 of 2 jobs done, 50 %, 1 min 20 s left",
-        "study dot: 1 of 2 jobs done, 75 %, 0 min 40 s left",
-        "study dot: 1 of 2 jobs done, 100 %, 0 min 00 s left",
-        "study dot: 2 jobs in 2 min 40 s",
-    ]
-    assert caplog.messages[0].startswith("study dot: 2 jobs on ")
-
-
-def test_work_reported_by_workers_reaches_the_log(here, monkeypatch, caplog):
-    monkeypatch.setattr(executors, "_LOG_EVERY_S", 0)
-    jobs = [here.Job(str(i), 1e6) for i in range(4)]
-    with caplog.at_level(logging.INFO, executors.__name__):
-        list(run_jobs(jobs, here.square, PAIR, "study"))
-    first, *between, last = caplog.messages
-    assert first == "study: 4 jobs on 2 processes"
-    pattern = r"study: \d of 4 jobs done, (\d+) %, .* left"
-    shares = [int(re.fullmatch(pattern, line)[1]) for line in between]
-    assert shares == sorted(shares)
-    assert shares[-1] == 100
-    assert re.fullmatch(r"study: 4 jobs in 0 min \d\d s", last)
+    scheduler = start(
+        *("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"),
+        *("--no-dashboard", "--scheduler-file", str(address)),
+    )
+    soon(address.exists, "no scheduler")
+    settings = "--nthreads 1 --no-dashboard --no-nanny --scheduler-file".split()
+    workers = [start("distributed.cli.dask_worker", *settings, str(address)) for _ in range(2)]
+    yield scheduler, workers, importlib.import_module("json").loads(address.read_text())["address"]
+    for process in started:
+        process.kill()
+        process.wait()
 
 
-def test_a_terminal_gets_a_bar_and_no_lines(monkeypatch, caplog):
-    terminal = io.StringIO()
-    terminal.isatty = lambda: True
-    monkeypatch.setattr(sys, "stderr", terminal)
-    monkeypatch.setattr(executors, "_LOG_EVERY_S", 0)
-    with caplog.at_level(logging.INFO, executors.__name__):
-        list(run_jobs([Job("a", 5.0), Job("b", 7.0)], square, SERIAL, "study"))
-    assert "study 2/2: 100%" in terminal.getvalue()
-    assert re.search(r"\| \d\d:\d\d, 0 min 00 s left", terminal.getvalue())
-    assert [line for line in caplog.messages if " left" in line] == []
+def on(address):
+    return Execution(executor="dask", workers=None, scheduler=address)
+
+
+def test_a_cluster_gives_what_processes_give_also_where_a_worker_is_killed(here, tmp_path, cluster):
+    _, workers, address = cluster
+    jobs = [here.Job(f"job {i}", 0.5, str(tmp_path)) for i in range(8)]
+    jobs.append(here.Job("long", 3.0, str(tmp_path)))
+    with signalled(tmp_path, signal.SIGKILL):
+        results = [result for _, result in run_jobs(jobs, here.sleeps, on(address), "cluster")]
+    assert sorted(results) == sorted(job.name for job in jobs)  # none lost, none twice
+    assert sum(worker.poll() is not None for worker in workers) == 1
+    begun = [line for path in tmp_path.glob("*.pid") for line in path.read_text().splitlines()]
+    assert begun.count("long") == 2
+
+
+def test_a_scheduler_that_is_killed_or_was_never_there_is_an_error(here, tmp_path, cluster):
+    scheduler, _, address = cluster
+    jobs = [here.Job("long", LONG_S, str(tmp_path)), here.Job("short", 0.1, str(tmp_path))]
+    results = run_jobs(jobs, here.sleeps, on(address), "cluster")
+    assert next(results)[1] == "short"
+    scheduler.kill()
+    with pytest.raises(InputError, match="the scheduler of the cluster is gone; start it"):
+        next(results)
+    executors._LOG_EVERY_S, before = 1, executors._LOG_EVERY_S
+    try:
+        with pytest.raises(InputError, match="execution.scheduler: .*docs/cluster.md"):
+            list(run_jobs(jobs, here.sleeps, on("tcp://127.0.0.1:9"), "cluster"))
+    finally:
+        executors._LOG_EVERY_S = before
+
+
+def test_what_a_cluster_is_handed_is_small(tmp_path):
+    jobs = [Job("large" * 10**5, 1.0), Job("small", 1.0)]
+    starts = executors._write(jobs, tmp_path / "jobs.pkl")
+    call = executors._call_written, square, str(tmp_path / "jobs.pkl"), starts[1]
+    assert len(pickle.dumps(call)) < 1000
+    assert call[0](*call[1:])[2] == 1.0
+    with pytest.raises(InputError, match="--params=execution.folder=FOLDER"):
+        executors._call_written(square, "/not/there", 0)
 
 
 if __name__ == "__main__":
-    pair = [Job("long", LONG_S, sys.argv[1]), Job("short", 0.01, sys.argv[1])]
+    pair = [Job("long", LONG_S, sys.argv[1]), Job("longer", 2 * LONG_S, sys.argv[1])]
     list(run_jobs(pair, sleeps, PAIR, "program"))

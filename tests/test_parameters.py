@@ -86,11 +86,6 @@ REFUSED = [
         "studies.estimators:",
         "estimators: ['mean', 'mean'] names one of them twice",
     ),
-    (
-        of_study("unseen_devices", estimators=["cnn"]),
-        "studies.unseen_devices:",
-        "cnn cannot be judged on unseen devices",
-    ),
     (of_study("leakage", strides_s=[1, 0]), "studies.leakage.strides_s.1:", "greater than 0"),
     (of_study("leakage", strides_s=[1, 1]), "studies.leakage:", "names one of them twice"),
     (

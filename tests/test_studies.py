@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.estimators import ESTIMATORS
+from gyro_pipeline.estimators import ESTIMATORS, estimator_class
 from gyro_pipeline.parameters import Only
 from gyro_pipeline.studies import (
     CNN,
@@ -15,6 +15,7 @@ from gyro_pipeline.studies import (
     MEAN,
     RESIDUAL_NETWORK,
     RunSpec,
+    check_possible,
     planned,
     run_params,
     run_spec,
@@ -92,7 +93,7 @@ def test_the_other_grids_are_the_papers_and_all_three_need_46_networks(base):
 
 def test_the_estimators_study_is_all_of_them_at_five_windows_on_every_sensor(base, parameters):
     runs = runs_of(base, "estimators")
-    names = [name for name in ESTIMATORS if name != "cnn_shuffled"]
+    names = [name for name in ESTIMATORS if name == CNN or not estimator_class(name).seeded]
     named = [(run.estimator, run.sensor, run.window_s) for run in runs]
     assert sorted(named) == sorted(product(names, base.sensors, (1.0, 2.0, 5.0, 10.0, 30.0)))
     mine = parameters("base", sensors={"mine": {}})
@@ -215,3 +216,23 @@ def test_a_run_carries_its_identity_and_the_settings_that_it_depends_on(base):
 def test_an_unknown_estimator_is_refused_with_those_there_are():
     with pytest.raises(InputError, match="unknown estimator 'oracle'; there are mean, median, .*"):
         run_spec(replace(ROW, estimator="oracle"), False)
+
+
+def test_networks_are_refused_on_devices_that_they_cannot_have_seen(parameters):
+    study = {"unseen_devices": {"estimators": ["mean", "lstm units=4"]}}
+    with pytest.raises(InputError, match="unseen_devices.*: lstm units=4 cannot be judged on uns"):
+        check_possible(parameters("base", studies=study), ["unseen_devices"])
+
+
+def test_a_sweep_is_a_run_for_every_combination_named_by_what_differs(parameters):
+    p = parameters("base", sweep={"learning_rate": "1e-4/0.001", "units": [4, 8]})
+    study = p.studies["sweep"].model_copy(update={"estimators": ["lstm", "ridge"]})
+    rows = study_rows(study, "sparkfun", "simulated", [10.0], [0], Only())
+    combinations = product(("0.0001", "0.001"), (4, 8))
+    expected = {f"lstm learning_rate={rate} units={units}" for rate, units in combinations}
+    assert {row.estimator for row in rows} == {MEAN, "ridge", *expected}
+    last = next(row for row in rows if row.estimator == "lstm learning_rate=0.001 units=8")
+    params = run_params(last, study, p.training, p.splits, p.virtual_gyros)
+    assert (params["learning_rate"], params["units"], params["layers"]) == (0.001, 8, 1)
+    assert "channels" not in params
+    assert study_rows(p.studies["real2real"], "ng", "simulated", [10.0], [0], Only())

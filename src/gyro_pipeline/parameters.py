@@ -5,6 +5,7 @@ such as a study of a sensor, is checked for the studies that are to run
 (:func:`gyro_pipeline.studies.check_possible`). Both before any node runs.
 """
 
+import json
 import math
 from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, Literal, Self
@@ -378,6 +379,11 @@ class Training(NetworkSizes):
             self.learning_rates(1)
         return self
 
+    @property
+    def schedule(self) -> dict[str, Any]:
+        """What all networks are trained with, whatever their options are."""
+        return self.model_dump(exclude={*NetworkSizes.model_fields})
+
     def learning_rates(self, windows: int) -> np.ndarray:
         """Learning rate of every epoch until the end, shape (epochs,), for so many windows.
 
@@ -400,11 +406,22 @@ class Training(NetworkSizes):
 class Execution(Parameter):
     """How the trainings are run; has no effect on their results but rounding."""
 
-    executor: Literal["auto", "processes", "serial", "batched"] = Field(
+    executor: Literal["auto", "processes", "serial", "batched", "dask"] = Field(
         description="many at once (on a GPU, else on the CPU), in processes or one after the other "
-        "(both on the CPU); auto: batched where there is a GPU, else processes"
+        "(both on the CPU), or on the workers of a dask scheduler; auto: batched where there is a "
+        "GPU, else processes"
     )
     workers: int | None = Field(ge=1, description="processes; null: one per core")
+    scheduler: str | None = Field(None, description="of dask: its address, tcp://HOST:8786")
+    folder: str | None = Field(
+        None, description="of dask: one that all workers see; null: this machine's for such files"
+    )
+
+    @model_validator(mode="after")
+    def _dask_has_a_scheduler(self) -> Self:
+        if (self.executor == "dask") != (self.scheduler is not None):
+            raise ValueError("executor dask and scheduler=tcp://HOST:8786 go together: give both")
+        return self
 
 
 class Evaluation(Parameter):
@@ -442,6 +459,14 @@ Protocol = Literal[
 ]
 
 
+def _as_typed(value: Any) -> Any:
+    """A number where a text is one, as one number may be typed in several ways."""
+    try:
+        return json.loads(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
+
+
 class Study(Parameter):
     """Estimators to compare, tracked in one MLflow experiment; each of the paper's has networks."""
 
@@ -475,10 +500,24 @@ class Study(Parameter):
     )
     folds: int | None = Field(None, ge=2, description="its own; null: those of splits")
     training: dict[str, Any] = Field({}, description="settings of training that it changes")
+    sweep: dict[str, list[str | float | int | bool]] = Field(
+        {},
+        description="values of settings of training or options of networks, of which all "
+        "combinations are trained; in --params separated by slashes: 1e-4/1e-3",
+    )
     sensors: dict[str, Grid] = {}
     any_sensor: Grid | None = Field(
         None, description="of every other sensor of globals.yml; null: they are no part of it"
     )
+
+    @field_validator("sweep", mode="before")
+    @classmethod
+    def _slashes_separate_values(cls, sweep: dict[str, Any]) -> dict[str, Any]:
+        separated = {
+            name: values if isinstance(values, list) else str(values).split("/")
+            for name, values in sweep.items()
+        }
+        return {name: [_as_typed(value) for value in values] for name, values in separated.items()}
 
     @property
     def unseen_devices(self) -> bool:
@@ -529,15 +568,9 @@ class Study(Parameter):
         return self
 
     @model_validator(mode="after")
-    def _networks_know_their_device(self) -> Self:
+    def _unseen_devices_have_one_protocol(self) -> Self:
         if LEAVE_ONE_DEVICE_OUT in self.also:
             raise ValueError(f"also: {LEAVE_ONE_DEVICE_OUT} is a study's only protocol")
-        networks = [name for name in self.estimators if name.startswith("cnn")]
-        if self.unseen_devices and networks:
-            raise ValueError(
-                f"estimators: {', '.join(networks)} cannot be judged on unseen devices; leave "
-                "them out of a study with protocol leave_one_device_out"
-            )
         return self
 
 
@@ -634,6 +667,7 @@ class Parameters(Parameter):
     seeds: list[Seed] = Field(min_length=1)
     studies: dict[str, Study]
     only: Only
+    sweep: dict[str, Any] = Field({}, description="of the study of this name: see there")
     published: Published
 
     @model_validator(mode="after")

@@ -22,7 +22,7 @@ from pluggy import PluginManager
 from gyro_pipeline.conventions import ALWAYS
 from gyro_pipeline.datasets.atomic import replacing
 from gyro_pipeline.datasets.stored import digest_of
-from gyro_pipeline.estimators import ESTIMATORS
+from gyro_pipeline.estimators import own_classes
 from gyro_pipeline.fingerprints import code_hash, fingerprint
 
 logger = logging.getLogger(__name__)
@@ -128,8 +128,7 @@ def _fingerprints(pipeline: Pipeline, catalog: CatalogProtocol) -> dict[str, str
 def _own_classes(inputs: Iterable[Any]) -> list[str]:
     """Estimators of one's own, ``package.module:Class``, in studies: their code counts as well."""
     studies = [value for value in inputs if isinstance(value, Mapping) and "estimators" in value]
-    names = {name for study in studies for name in study["estimators"]}
-    return sorted(names - ESTIMATORS.keys())
+    return own_classes(name for study in studies for name in study["estimators"])
 
 
 def _state(name: str, catalog: CatalogProtocol) -> Any:

@@ -1,6 +1,7 @@
 """Which runs the studies ask for: one :class:`RunSpec` each."""
 
-from collections.abc import Iterable, Sequence
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import product
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from gyro_pipeline.conventions import AXES, NOTHING, OWN, REAL, InputError
-from gyro_pipeline.estimators import ESTIMATORS, estimator_class
+from gyro_pipeline.estimators import estimator_class, settings_of
 from gyro_pipeline.parameters import Only, Parameters, Splits, Study, Training, VirtualGyros
 
 CNN, CNN_SHUFFLED, MEAN, CONSTANT = "cnn", "cnn_shuffled", "mean", "training_mean"
@@ -88,7 +89,7 @@ def study_rows(  # noqa: PLR0917 - what a grid is made of
         for window_s, stride_s in product(study.windows_s or windows_s, study.strides_s or [0])
         for protocol, estimators in study.estimators_of.items()
         for estimator, real, virtual, seed in product(
-            estimators, grid.real_gyros, grid.virtual_gyros, seeds
+            swept(estimators, study.sweep), grid.real_gyros, grid.virtual_gyros, seeds
         )
     ]
     rows = [row for row in rows if all(getattr(row, key) == v for key, v in wanted.items())]
@@ -104,6 +105,31 @@ def study_rows(  # noqa: PLR0917 - what a grid is made of
         for row in rows
     ]
     return [*dict.fromkeys(means), *(row for row in rows if row.estimator != MEAN)]
+
+
+def swept(estimators: Iterable[str], grid: Mapping[str, Sequence[Any]]) -> list[str]:
+    """Estimators with each seeded one once for every combination of some settings.
+
+    Args:
+        estimators: Their names.
+        grid: Values of each setting.
+    """
+    if not any(grid.values()):
+        return list(estimators)
+    combinations = [
+        "".join(f" {key}={_text(value)}" for key, value in zip(grid, values, strict=True))
+        for values in product(*grid.values())
+    ]
+    return [
+        name + settings
+        for name in estimators
+        for settings in (combinations if estimator_class(name).seeded else [""])
+    ]
+
+
+def _text(value: Any) -> str:
+    """As the name of an estimator has it: words without quotes."""
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 def run_specs(rows: Iterable[RunSpec], unseen_devices: bool) -> list[RunSpec]:
@@ -205,8 +231,12 @@ def _check_rows(p: Parameters, study: str, name: str) -> None:
     asked_study = p.studies[study]
     rows = study_rows(asked_study, name, p.source, p.windows_s, p.seeds, p.only)
     for estimator in dict.fromkeys(row.estimator for row in rows):
-        if estimator not in ESTIMATORS:
-            estimator_class(estimator)  # an unknown one is refused here
+        settings_of(estimator, asked_study.training_of(p.training))  # refuses unknown ones
+        if asked_study.unseen_devices and estimator_class(estimator).seeded:
+            raise InputError(
+                f"studies.{study}.estimators: {estimator} cannot be judged on unseen devices; "
+                "leave it out of a study with protocol leave_one_device_out"
+            )
     imus, length_s = p.sensors[name].imus, p.sensors[name].recording_s
     has, makes = len(AXES) * (imus or 0), len(AXES) * p.virtual_gyros.imus
     for asked, limit, words in (
@@ -241,6 +271,5 @@ def run_params(
     if spec.virtual_gyros:
         drawn = virtual_gyros.model_dump()
         params |= {f"virtual_{name}": value for name, value in drawn.items()}
-    if estimator_class(spec.estimator).seeded:
-        params |= study.training_of(training).model_dump(exclude_none=True)
-    return params
+    made_with = settings_of(spec.estimator, study.training_of(training))
+    return params | {name: value for name, value in made_with.items() if value is not None}

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from gyro_pipeline.conventions import BIAS, MDPS, PAPER, RECORDING_MEAN, TRUE, InputError
-from gyro_pipeline.estimators import DEFAULT, ESTIMATORS, make_estimator
+from gyro_pipeline.estimators import DEFAULT, ESTIMATORS, estimator_class, make_estimator
 from gyro_pipeline.estimators.averages import RunningMean
 from gyro_pipeline.estimators.shrinkage import (
     EmpiricalBayes,
@@ -21,7 +21,7 @@ RATE, SAMPLES, SIZE = 20.0, 1600, 200
 N, TAU = 5 * MDPS, 1 * MDPS
 MODEL = constant_bias(SAMPLES, RATE, NoiseFigures(N, 0, 0), 0.0, TAU)
 NO_SIGMA = {"median", "trimmed_mean", "ridge", "ridge_same_time", "window_mean_network"}
-NAMES = [name for name in ESTIMATORS if not name.startswith("cnn")]
+NAMES = [name for name in ESTIMATORS if not estimator_class(name).seeded]
 NO_PRIOR = {"mean", "median", "trimmed_mean"}
 
 

@@ -1,5 +1,11 @@
+"""Recordings and schedules small enough to train on in a second."""
+
+import numpy as np
 import pytest
 import torch
+import xarray as xr
+
+from gyro_pipeline.parameters import Training
 
 
 @pytest.fixture(autouse=True)
@@ -10,3 +16,32 @@ def one_thread():
     yield
     torch.set_num_threads(threads)
     torch.use_deterministic_algorithms(False)
+
+
+@pytest.fixture(scope="session")
+def schedule():
+    """Settings of training: ``schedule(epochs=3)``."""
+    given = {
+        **{"channels": 4, "kernel": 6, "stride": 5, "pool": 2, "hidden": 8},
+        **{"epochs": 5, "batch_size": 16, "learning_rate": 1e-3, "decay": 0.1, "decay_every": 2},
+    }
+    return lambda **changes: Training(**{"centring": "per_device", **given, **changes})
+
+
+@pytest.fixture(scope="session")
+def recorded():
+    """Rates (imu, recording, axis, sample) and biases: units far apart, turn-ons by ``spread``."""
+
+    def made(imus=2, recordings=12, samples=83, spread=1.0, noise=0.3, seed=0):
+        generator = np.random.default_rng(seed)
+        bias = 5 * generator.normal(size=(imus, 1, 3)) + spread * generator.normal(
+            size=(imus, recordings, 3)
+        )
+        rates = bias[..., None] + noise * generator.normal(size=(*bias.shape, samples))
+        numbers = np.arange(1, recordings + 1)
+        coords = {"imu": np.arange(1, imus + 1), "recording": numbers, "axis": list("xyz")}
+        dims = ("imu", "recording", "axis", "sample")
+        labels = xr.DataArray(bias, dims=dims[:-1], coords=coords)
+        return xr.DataArray(rates.astype(np.float32), dims=dims, coords=coords), labels
+
+    return made

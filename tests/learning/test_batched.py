@@ -50,7 +50,7 @@ def seeded(make, seed):
     return make()
 
 
-def learners(make=lambda: CalibrationNetwork(SIZES), n=75, watched=21, seeds=(0, 1), **how):
+def learners(make=lambda: CalibrationNetwork(**vars(SIZES)), n=75, watched=21, seeds=(0, 1), **how):
     """Two sets of examples, each with every seed."""
     cells = [
         (drawn(n, at, **how), drawn(watched, 9 + at, **how) if watched else None) for at in (0, 1)
@@ -65,12 +65,12 @@ def learners(make=lambda: CalibrationNetwork(SIZES), n=75, watched=21, seeds=(0,
 
 def together(given, training, device=CPU):
     given = [Learner(**vars(one) | {"shuffling": one.shuffling.clone_state()}) for one in given]
-    return train_together(given, training, device, lambda: None)
+    return train_together(given, training, device)
 
 
 def alone(one, training):
     network, shuffling = copy.deepcopy(one.network), one.shuffling.clone_state()
-    return train(network, one.training, one.validation, training, shuffling, lambda: None)
+    return train(network, one.training, one.validation, training, shuffling)
 
 
 def outputs(one, weights):
@@ -99,7 +99,7 @@ def assert_those_alone(given, training, tolerance=1e-5, device=CPU):
 def test_networks_trained_together_are_those_trained_alone(architecture, dtype, tolerance):
     """In batches of 16, the last of which has 11."""
     a = ARCHITECTURES[architecture]
-    given = learners(lambda: CalibrationNetwork(a), a=a, dtype=dtype)
+    given = learners(lambda: CalibrationNetwork(**vars(a)), a=a, dtype=dtype)
     results = assert_those_alone(given, schedule(epochs=10), tolerance)
     moved = outputs(given[0], results[0].last) - outputs(given[0], given[0].network.state_dict())
     assert float(moved.std()) > 0.01 * given[0].training.targets.std()  # after fifty steps
@@ -136,13 +136,13 @@ def test_so_are_other_networks_that_vmap_can_batch(compute):
     [
         (lambda: nn.LSTM(SHAPE[1], 3), "rule not implemented for aten::lstm"),
         (lambda: Computed(lambda x: x.renorm(2, 0, 1.0)), "batching rule for aten::renorm"),
-        (lambda: Computed(nn.BatchNorm1d(13)), "depends on the others of the batch"),
+        (lambda: Computed(nn.BatchNorm1d(13)), "depends on the other windows of the batch"),
         (lambda: Computed(nn.Dropout(0.1)), "called random operation"),
     ],
 )
 def test_what_cannot_be_batched_is_told(layer, reason):
     assert reason in obstacle(layer(), SHAPE, CPU)
-    assert obstacle(CalibrationNetwork(SIZES), SHAPE, CPU) is None
+    assert obstacle(CalibrationNetwork(**vars(SIZES)), SHAPE, CPU) is None
 
 
 @pytest.mark.parametrize(
@@ -190,5 +190,5 @@ def test_a_loss_that_is_no_longer_finite_ends_the_training():
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 def test_on_a_gpu_networks_are_the_same(architecture):
     a, cuda = ARCHITECTURES[architecture], torch.device("cuda")
-    assert obstacle(CalibrationNetwork(a), packed_shape(a), cuda) is None
-    assert_those_alone(learners(lambda: CalibrationNetwork(a), a=a), schedule(), 1e-4, cuda)
+    assert obstacle(CalibrationNetwork(**vars(a)), packed_shape(a), cuda) is None
+    assert_those_alone(learners(lambda: CalibrationNetwork(**vars(a)), a=a), schedule(), 1e-4, cuda)

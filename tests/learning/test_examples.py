@@ -12,11 +12,18 @@ from gyro_pipeline.learning.examples import (
     with_shuffled_labels,
 )
 from gyro_pipeline.learning.network import Architecture
+from gyro_pipeline.learning.packing import Layout
 from gyro_pipeline.physics.bias import windows_at
 
 WINDOW, STRIDE = 20, 5
-ONE_IMU = Architecture(3, WINDOW, 2, 5, STRIDE, 2, 4)
-TWO_IMUS = Architecture(6, WINDOW, 2, 5, STRIDE, 2, 4)
+
+
+def packed(gyroscopes, window, *sizes):
+    return Layout(gyroscopes, window, Architecture(gyroscopes, window, *sizes))
+
+
+ONE_IMU = packed(3, WINDOW, 2, 5, STRIDE, 2, 4)
+TWO_IMUS = packed(6, WINDOW, 2, 5, STRIDE, 2, 4)
 
 
 def labelled(array, dims="imu recording axis sample"):
@@ -140,7 +147,7 @@ def test_examples_are_the_windows_of_each_recording_in_turn_scaled_by_hand(centr
 
 def test_training_inputs_and_targets_have_a_root_mean_square_of_one():
     rates, bias = drawn(samples=53)
-    for unseen in (Architecture(3, 23, 2, 8, 5, 1, 4), Architecture(3, 22, 2, 3, 5, 1, 4)):
+    for unseen in (packed(3, 23, 2, 8, 5, 1, 4), packed(3, 22, 2, 3, 5, 1, 4)):
         used = device(rates, bias, size=unseen.window)
         examples, _ = training_examples([used], unseen, "per_device")
         seen = examples.inputs[examples.inputs != 0]  # padding is zero; noise never is
@@ -208,7 +215,7 @@ def test_making_examples_changes_no_recording_and_needs_one_packed_copy_of_them(
     original = rates.copy()
     numbers = tuple(range(1, 21))
     devices = [device(rates, bias, (imu,), numbers, size=1083) for imu in (1, 2)]
-    papers = Architecture(3, 1083, 8, 10, 10, 8, 32)
+    papers = packed(3, 1083, 8, 10, 10, 8, 32)
     tracemalloc.start()
     training_examples(devices, papers, "per_device")
     _, peak = tracemalloc.get_traced_memory()
@@ -236,7 +243,7 @@ def test_overlapping_windows_need_one_packed_copy_of_them():
     rates, bias = drawn(imus=1, recordings=20, samples=2_000)
     starts = (np.arange(0, 1_500, 5),) * 20
     dense = device(rates, bias, (1,), tuple(range(1, 21)), starts)
-    sizes = Architecture(3, 500, 8, 10, 10, 8, 32)
+    sizes = packed(3, 500, 8, 10, 10, 8, 32)
     tracemalloc.start()
     examples, _ = training_examples([dense], sizes, "per_device")
     _, peak = tracemalloc.get_traced_memory()

@@ -69,7 +69,7 @@ def forget():
 
 def network(a, seed=0):
     torch.manual_seed(seed)
-    return CalibrationNetwork(a)
+    return CalibrationNetwork(**vars(a))
 
 
 def examples(a, n=150, seed=1):

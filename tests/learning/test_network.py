@@ -1,23 +1,28 @@
+"""The paper's network, on plain and on packed windows, and the other networks there are."""
+
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch import nn
 
 from gyro_pipeline.conventions import InputError
+from gyro_pipeline.learning.design import Design, options_of
 from gyro_pipeline.learning.network import Architecture, CalibrationNetwork
-from gyro_pipeline.learning.packing import pack, packed_shape
+from gyro_pipeline.learning.packing import Layout, pack, packed_shape
 
 # gyroscopes, window, kernel, stride, pool; 5 channels and 7 hidden units
 SIZES = [
     (3, 120, 10, 10, 4),  # everything a multiple of the stride
     (3, 123, 12, 5, 3),  # kernel and window are no multiples of the stride
     (6, 100, 3, 7, 2),  # kernel shorter than the stride: samples are skipped
-    (6, 97, 20, 10, 3),  # the kernel is two strides; the window leaves a rest
     (12, 60, 7, 1, 5),  # stride one
     (3, 25, 25, 4, 1),  # the kernel is the window
-    (12, 26, 25, 4, 1),  # one output, one sample unseen
     (3, 43, 4, 10, 1),  # the last block is cut short by the window's end
 ]
+HERE = "gyro_pipeline.learning"
+OTHERS = [f"{HERE}.network:SingleGyroscope", f"{HERE}.sequences:LSTM", f"{HERE}.sequences:TCN"]
 
 
 def architecture(gyroscopes, window, kernel, stride, pool):
@@ -30,10 +35,10 @@ def channel_by_channel(hidden_weight, a):
     return by_time.transpose(1, 2).reshape(a.hidden, -1)
 
 
-def networks(a, seed=0):
+def networks(a):
     """Ours, and the paper's written down layer by layer (section III-D) with equal weights."""
-    torch.manual_seed(seed)
-    ours = CalibrationNetwork(a).double()
+    torch.manual_seed(0)
+    ours = CalibrationNetwork(**vars(a)).double()
     paper = nn.Sequential(
         nn.Conv1d(a.gyroscopes, a.channels, a.kernel, a.stride),
         nn.LeakyReLU(0.1),
@@ -51,35 +56,21 @@ def networks(a, seed=0):
     return ours, paper
 
 
-def windows_of(a, n=9):
-    """The same windows as (n, gyroscopes, window) and packed, float64."""
-    plain = np.random.default_rng(1).normal(size=(n, a.gyroscopes, a.window))
-    packed = pack(plain.transpose(1, 0, 2), a, out=np.zeros((n, *packed_shape(a))))
-    return torch.from_numpy(plain), torch.from_numpy(packed)
-
-
 @pytest.mark.parametrize("sizes", SIZES)
-def test_plain_and_packed_windows_give_what_the_papers_network_gives(sizes):
+def test_outputs_and_gradients_are_those_of_the_papers_network(sizes):
     a = architecture(*sizes)
     ours, paper = networks(a)
-    plain, packed = windows_of(a)
-    expected = paper(plain)
-    assert expected.shape == (9, a.gyroscopes)
-    assert expected.std(dim=0).min() > 1e-3  # the outputs tell the windows apart
-    torch.testing.assert_close(ours(plain), expected, rtol=0, atol=1e-12)
-    torch.testing.assert_close(ours.forward_packed(packed), expected, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("sizes", SIZES)
-def test_gradients_are_those_of_the_papers_network(sizes):
-    a = architecture(*sizes)
-    ours, paper = networks(a)
-    plain, packed = windows_of(a)
+    windows = np.random.default_rng(1).normal(size=(9, a.gyroscopes, a.window))
+    packed = pack(windows.transpose(1, 0, 2), a, out=np.zeros((9, *packed_shape(a))))
     wanted = torch.from_numpy(np.random.default_rng(2).normal(size=(9, a.gyroscopes)))
-    nn.functional.mse_loss(paper(plain), wanted).backward()
-    for forward, inputs in ((ours, plain), (ours.forward_packed, packed)):
+    expected = paper(torch.from_numpy(windows))
+    assert expected.std(dim=0).min() > 1e-3  # the outputs tell the windows apart
+    nn.functional.mse_loss(expected, wanted).backward()
+    for forward, inputs in ((ours, windows), (ours.forward_packed, packed)):
         ours.zero_grad()
-        nn.functional.mse_loss(forward(inputs), wanted).backward()
+        outputs = forward(torch.from_numpy(inputs))
+        torch.testing.assert_close(outputs, expected, rtol=0, atol=1e-12)
+        nn.functional.mse_loss(outputs, wanted).backward()
         got = {name: value.grad for name, value in ours.named_parameters()}
         got["hidden.weight"] = channel_by_channel(got["hidden.weight"], a)
         for theirs, (name, gradient) in zip(paper.parameters(), got.items(), strict=True):
@@ -88,17 +79,86 @@ def test_gradients_are_those_of_the_papers_network(sizes):
 
 
 @pytest.mark.parametrize(
-    ("window", "kernel", "stride", "pool"),
-    [(9, 10, 10, 1), (5, 10, 3, 1), (49, 10, 10, 5), (20, 10, 10, 3)],
+    ("window", "kernel", "stride", "pool"), [(9, 10, 10, 1), (49, 10, 10, 5), (20, 10, 10, 3)]
 )
 def test_a_window_too_short_for_the_network_is_refused(window, kernel, stride, pool):
-    with pytest.raises(InputError, match=f"window of {window} samples is too short") as refused:
+    sizes = f"kernel {kernel}, stride {stride} and pool {pool}"
+    with pytest.raises(InputError, match=f"window of {window} samples is too short for {sizes}"):
         architecture(3, window, kernel, stride, pool)
-    for size in (f"kernel {kernel}", f"stride {stride}", f"pool {pool}"):
-        assert size in str(refused.value)
+    assert architecture(3, 50, 10, 10, 5).pooled == 1
 
 
-def test_the_shortest_window_that_fits_is_accepted():
-    shortest = architecture(3, 50, 10, 10, 5)
-    assert (shortest.convolved, shortest.pooled) == (5, 1)
-    assert CalibrationNetwork(shortest)(torch.zeros(2, 3, 50)).shape == (2, 3)
+@st.composite
+def architectures(draw):
+    kernel = draw(st.integers(1, 12))
+    gyroscopes, window = draw(st.sampled_from([1, 3, 6, 12])), draw(st.integers(kernel, 60))
+    return Architecture(gyroscopes, window, 4, kernel, draw(st.integers(1, 13)), 1, 8)
+
+
+@settings(max_examples=100, deadline=None)
+@given(architectures(), st.integers(1, 4))
+def test_every_number_is_in_its_place_zeros_elsewhere_and_no_block_to_spare(a, n):
+    numbers = np.arange(1, a.gyroscopes * n * a.window + 1, dtype=np.float32)
+    windows = numbers.reshape(n, a.gyroscopes, a.window).transpose(1, 0, 2)  # a view
+    blocks, width = packed_shape(a)
+    last_seen = (a.convolved - 1) * a.stride + a.kernel
+    assert (blocks - 1) * a.stride < last_seen <= blocks * a.stride
+    assert width % 16 == 0
+    expected = np.zeros((n, blocks, width), np.float32)
+    for sample in range(min(a.window, blocks * a.stride)):
+        block, within = divmod(sample, a.stride)
+        for gyroscope in range(a.gyroscopes):
+            expected[:, block, gyroscope * a.stride + within] = windows[gyroscope, :, sample]
+    packed = pack(windows, a)
+    np.testing.assert_array_equal(packed, expected)
+    assert packed.ctypes.data % 64 == 0
+    whole = np.zeros((n + 2, blocks, width), np.float32)
+    Layout(a.gyroscopes, a.window, a).write(windows, whole[1:-1])
+    np.testing.assert_array_equal(whole[1:-1], expected)
+    assert not whole[[0, -1]].any()
+
+
+@pytest.mark.parametrize("path", OTHERS)
+def test_other_networks_see_plain_windows_and_learn_from_all_of_them(path, schedule):
+    design = Design(path, 3, 100, options_of(path, schedule(), {}, rate_hz=20.0))
+    design.check()
+    windows = torch.randn((4, 3, 100), generator=torch.Generator().manual_seed(0))
+    plain = np.zeros((4, *design.layout.shape), np.float32)
+    design.layout.write(windows.numpy().transpose(1, 0, 2), plain)
+    np.testing.assert_array_equal(plain, windows.numpy())
+    network = design.build(seed=1)
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(network.parameters(), design.build(1).parameters(), strict=True)
+    )
+    windows.requires_grad_()
+    network(windows).sum().backward()
+    assert (windows.grad.abs().amax(dim=2) > 0).all()  # each window and gyroscope
+    assert all(parameter.grad is not None for parameter in network.parameters())
+
+
+def test_a_single_gyroscope_is_estimated_from_its_own_samples(schedule):
+    network = Design(OTHERS[0], 3, 100, options_of(OTHERS[0], schedule(), {})).build(0)
+    windows = torch.randn((2, 3, 100))
+    other = windows.clone()
+    other[:, 1] += 1
+    same = (network(windows) == network(other)).all(dim=0)
+    assert same.tolist() == [True, False, True]
+    turned = network(windows[:, [2, 0, 1]])
+    torch.testing.assert_close(turned, network(windows)[:, [2, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("path", "given_options", "told"),
+    [
+        (OTHERS[1], {"width": 3}, "has no option 'width'; it has units, layers, block_s"),
+        (OTHERS[1], {"units": "many"}, r"LSTM\(3, 100, units='many'"),
+        ("torch.nn:Linear", {}, "option 'in_features' has no default"),
+        ("torch.nn:Identity", {}, r"output of shape \(2, 3\), got .*\[2, 3, 100\]"),
+    ],
+)
+def test_what_cannot_be_a_network_is_refused_before_it_is_trained(
+    path, given_options, told, schedule
+):
+    with pytest.raises(InputError, match=told):
+        Design(path, 3, 100, options_of(path, schedule(), given_options, 20.0)).check()

@@ -43,7 +43,7 @@ def drawn(n, dtype=np.float32, seed=0):
 
 def network(seed=0):
     torch.manual_seed(seed)
-    return CalibrationNetwork(SIZES)
+    return CalibrationNetwork(**vars(SIZES))
 
 
 def ordered(seed=5):
@@ -58,7 +58,7 @@ def trained(examples, validation=None, of=None, **changes):
 
 def loss_of(weights, examples):
     """Mean squared error of stored weights, on plain windows' equivalent, in NumPy."""
-    restored = CalibrationNetwork(SIZES)
+    restored = CalibrationNetwork(**vars(SIZES))
     restored.load_state_dict(weights)
     with torch.no_grad():
         outputs = restored.forward_packed(torch.from_numpy(examples.inputs)).numpy()

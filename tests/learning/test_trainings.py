@@ -1,4 +1,4 @@
-"""Which trainings are made together, and that it does not matter."""
+"""Trainings as jobs: one by one, and many at once."""
 
 import logging
 from dataclasses import replace
@@ -7,148 +7,194 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-import xarray as xr
 from torch import nn
 
-from gyro_pipeline.learning import jobs as jobs_module
 from gyro_pipeline.learning import trainings
-from gyro_pipeline.learning.examples import Device
+from gyro_pipeline.learning.design import Design, options_of
+from gyro_pipeline.learning.examples import Device, training_examples
 from gyro_pipeline.learning.jobs import StoredNetwork, TrainingJob, run_training
-from gyro_pipeline.learning.network import CalibrationNetwork
-from gyro_pipeline.learning.trainings import batch_device, in_batches, run_trainings, train_batch
-from gyro_pipeline.parameters import Training
+from gyro_pipeline.learning.trainings import batch_device, in_batches, run_trainings
+from gyro_pipeline.physics.bias import windows_at
 
+WINDOW = 40
+STARTS = np.array([0, WINDOW])
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-SETTINGS = Training(
-    centring="per_device",
-    **{"channels": 4, "kernel": 6, "stride": 5, "pool": 2, "hidden": 8},
-    **{"epochs": 4, "batch_size": 8, "learning_rate": 1e-3, "decay": 0.1, "decay_every": 2},
-)
+PAPER = "gyro_pipeline.learning.network:CalibrationNetwork"
+BOTH = pytest.mark.parametrize("imus", [((1,), (2,)), ((2, 1),)], ids=["training data", "channels"])
 
 
-def recorded():
-    generator = np.random.default_rng(0)
-    bias = generator.normal(size=(3, 12, 3))
-    rates = bias[..., None] + generator.normal(size=(3, 12, 3, 123))
-    coords = {"imu": [1, 2, 3], "recording": np.arange(1, 13), "axis": list("xyz")}
-    dims = ("imu", "recording", "axis", "sample")
-    return (
-        xr.DataArray(rates.astype(np.float32), dims=dims, coords=coords),
-        xr.DataArray(bias, dims=dims[:-1], coords=coords),
-    )
+class Dropping(nn.Module):
+    """A network of one's own with dropout, which no two trainings share."""
+
+    def __init__(self, gyroscopes, window, share=0.1):
+        super().__init__()
+        self.drop, self.output = nn.Dropout(share), nn.Linear(window, 1)
+
+    def forward(self, windows):
+        return self.output(self.drop(windows)).squeeze(2)
 
 
-def device(rates, bias, imu, numbers, size):
-    starts = np.arange(0, rates.sizes["sample"] - size + 1, size)
-    biases = bias.sel(imu=imu, recording=list(numbers)).to_numpy()
-    return Device(rates, (imu,), numbers, biases, (starts,) * len(numbers))
+def device(rates, bias, imus, numbers):
+    labels = bias.sel(imu=list(imus), recording=list(numbers))
+    biases = labels.transpose("recording", "imu", "axis").to_numpy().reshape(len(numbers), -1)
+    return Device(rates, imus, tuple(numbers), biases, (STARTS,) * len(numbers))
 
 
-def grid(windows=(40, 60), imus=(1, 2), seeds=(0, 1)):
-    """Every window with so many IMUs and every seed, and once more without the last recording."""
+@pytest.fixture
+def make(recorded, schedule):
+    """A job: ``make(seed=1, epochs=3)``."""
+
+    def made(
+        data=None,
+        imus=((1,), (2,)),
+        train=range(1, 9),
+        validate=(9, 10),
+        seed=0,
+        path=PAPER,
+        cell=None,
+        **changes,
+    ):
+        rates, bias = data or recorded()
+        settings = schedule(**{"batch_size": 8, "epochs": 6, "decay_every": 4, **changes})
+        devices = [device(rates, bias, one, train) for one in imus]
+        validation = device(rates, bias, imus[0], validate) if validate else None
+        design = Design(path, 3 * len(imus[0]), WINDOW, options_of(path, settings, {}))
+        return TrainingJob(design, devices, validation, settings, seed, cell)
+
+    return made
+
+
+def differing(one, other, which="last"):
+    mine, theirs = one.artifact[which], other.artifact[which]
+    return {name for name in mine if not torch.equal(mine[name], theirs[name])}
+
+
+@pytest.mark.parametrize("path", [PAPER, f"{__name__}:Dropping"])
+def test_the_seed_alone_is_random_and_global_state_is_left_alone(make, path, monkeypatch):
+    if path != PAPER:
+        design = "gyro_pipeline.learning.design.network_class"
+        monkeypatch.setattr(design, lambda _: Dropping)
+    torch.manual_seed(3)
+    before = torch.get_rng_state()
+    first = run_training(make(path=path))
+    assert torch.equal(torch.get_rng_state(), before)
+    torch.rand(3)
+    torch.set_num_threads(2)
+    again, other = run_training(make(path=path)), run_training(make(path=path, seed=1))
+    assert not differing(first, again) | differing(first, again, "best")
+    assert first.history.equals(again.history)
+    assert differing(first, other) == set(first.artifact["last"])
+    reordered = replace(make(), seed=1)
+    monkeypatch.setattr(Design, "build", lambda self, _, build=Design.build: build(self, 0))
+    assert differing(run_training(make()), run_training(reordered))
+
+
+def test_validation_and_test_recordings_do_not_reach_the_weights(make, recorded):
     rates, bias = recorded()
+    untouched = run_training(make((rates, bias)))
+    other_rates, other_bias = rates.copy(deep=True), bias.copy(deep=True)
+    other_rates[:, 8:] *= -3  # numbers 9 and 10 validate, 11 and 12 test
+    other_bias[:, 8:] += 7
+    changed = run_training(make((other_rates, other_bias)))
+    assert not differing(untouched, changed)
+    assert not untouched.history.val_loss.equals(changed.history.val_loss)
+    alone = run_training(make(validate=()))
+    assert (alone.artifact["best"], alone.artifact["best_epoch"]) == (None, None)
+    assert not differing(untouched, alone)
+
+
+@BOTH
+@pytest.mark.parametrize("centring", ["per_device", "global"])
+def test_a_stored_network_estimates_its_outputs_scaled_back(make, recorded, imus, centring):
+    rates, bias = recorded()
+    over_fitting = {"train": range(1, 5), "epochs": 40, "learning_rate": 3e-2, "decay_every": 40}
+    job = make((rates, bias), imus, centring=centring, **over_fitting)
+    artifact = run_training(job).artifact
+    assert artifact["best_epoch"] < 40
+    samples = rates.sel(imu=list(imus[0]), recording=11).to_numpy().reshape(-1, rates.shape[-1])
+    windows = windows_at(samples, WINDOW, STARTS).transpose(1, 0, 2)
+    _, scaling = training_examples(job.devices, job.design.layout, centring)
+    centre = scaling.centres[0]
+    scaled = torch.from_numpy((windows - centre[:, None]) / scaling.input_scale)
+    for which in ("last", "best"):
+        network = job.design.build(seed=99)
+        network.load_state_dict(artifact[which])
+        with torch.no_grad():
+            expected = centre + scaling.target_scale * network.double()(scaled).numpy()
+        estimates = StoredNetwork(artifact, which).biases(windows)
+        assert np.abs(expected - centre).max() > 100 * 2e-5 * scaling.target_scale
+        np.testing.assert_allclose(estimates, expected, atol=2e-5 * scaling.target_scale)
+
+
+@BOTH
+def test_a_network_learns_what_is_easy_to_learn(make, recorded, imus):
+    """Windows that tell the bias well: far better than the training mean, which knows nothing."""
+    rates, bias = recorded(recordings=110)
+    easy = {"channels": 16, "hidden": 32, "epochs": 60, "learning_rate": 1e-2, "decay_every": 40}
+    trained = run_training(make((rates, bias), imus, range(1, 81), (), **easy))
+    network = StoredNetwork(trained.artifact, "last")
+    truth = bias.sel(imu=list(imus[0])).transpose("recording", "imu", "axis").to_numpy()
+    truth = truth.reshape(110, -1)
+    tested = rates.sel(imu=list(imus[0])).to_numpy()[:, 80:].swapaxes(0, 1)
+    errors = network.biases(tested.reshape(30, -1, rates.shape[-1])[..., :WINDOW]) - truth[80:]
+    constant = np.sqrt(np.mean((truth[80:] - truth[:80].mean(axis=0)) ** 2))
+    assert constant == pytest.approx(1.0, rel=0.3)
+    assert np.sqrt(np.mean(np.square(errors))) < 0.25 * constant
+
+
+def grid(make, recorded, path=PAPER):
+    """Two numbers of devices and two splits, each with two seeds."""
+    data = recorded(imus=2)
     return [
-        TrainingJob(
-            name=f"{window} {count} {train} {seed}",
-            devices=[device(rates, bias, imu, train, window) for imu in range(1, count + 1)],
-            validation=device(rates, bias, 1, (10, 11), window),
-            window=window,
-            settings=SETTINGS,
-            seed=seed,
-            cell=(window, count, train),
-        )
-        for window in windows
-        for count in imus
-        for train in (tuple(range(1, 9)), tuple(range(2, 10)))
-        for seed in seeds
+        make(data, imus, train, seed=seed, path=path, cell=(len(imus), train))
+        for imus in (((1,),), ((1,), (2,)))
+        for train in (range(1, 9), range(2, 10))
+        for seed in (0, 1)
     ]
 
 
-def results_of(jobs):
-    """Trained in batches."""
-    return {jobs[number].name: trained for number, trained in run_trainings(jobs, "batched", "all")}
+def test_networks_trained_at_once_are_those_trained_one_by_one(make, recorded, monkeypatch):
+    asked, prepared = [], trainings.prepared
+    monkeypatch.setattr(trainings, "prepared", lambda job: asked.append(job.cell) or prepared(job))
+    jobs = grid(make, recorded)
+    results = dict(run_trainings(jobs, DEVICE, "all"))
+    assert sorted(results) == list(range(8))
+    assert len(asked) == len(set(asked)) == 4  # once for all seeds
+    windows = np.random.default_rng(1).normal(size=(50, 3, WINDOW)).astype(np.float32)
+    for number, job in enumerate(jobs):
+        together, alone = results[number], run_training(job)
+        assert together.engine == f"batched {DEVICE.type}"
+        assert together.artifact["best_epoch"] == alone.artifact["best_epoch"]
+        pd.testing.assert_frame_equal(together.history, alone.history, rtol=1e-5)
+        pair = (StoredNetwork(one.artifact, "best").biases(windows) for one in (together, alone))
+        np.testing.assert_allclose(*pair, rtol=0, atol=1e-5)
+    assert not list(run_trainings([], DEVICE, "none"))
 
 
-def assert_those_one_by_one(jobs, results):
-    windows = np.random.default_rng(1).normal(size=(50, 3, 60)).astype(np.float32)
-    assert results.keys() == {job.name for job in jobs}
-    for job in jobs:
-        got, expected = results[job.name], run_training(job, lambda work: None)
-        assert got.artifact["best_epoch"] == expected.artifact["best_epoch"]
-        pd.testing.assert_frame_equal(got.history, expected.history, rtol=1e-5)
-        for which in ("last", "best"):
-            seen = windows[..., : job.window]
-            given = (StoredNetwork(one.artifact, which).biases(seen) for one in (got, expected))
-            np.testing.assert_allclose(*given, rtol=0, atol=1e-5)
-
-
-def test_networks_trained_at_once_are_those_trained_one_by_one():
-    results = results_of(grid())
-    assert_those_one_by_one(grid(), results)
-    assert {trained.engine for trained in results.values()} == {f"batched {DEVICE.type}"}
-
-
-def test_equal_sizes_schedules_and_numbers_of_windows_are_a_batch():
-    steeper = SETTINGS.model_copy(update={"learning_rate": 1e-2})
-    one = grid(windows=(40,), imus=(1,))
-    jobs = grid() + [replace(job, settings=steeper) for job in one]
-    jobs += [replace(job, validation=None) for job in one]
-    assert [len(batch.jobs) for batch in in_batches(jobs, DEVICE, 1e12)] == [4] * 6
-
-
-def test_batches_fit_the_memory_there_is_and_one_training_is_always_made():
-    jobs = grid(windows=(40,), imus=(1,))
-    memory = 2.5 * trainings._bytes(jobs[0])
-    assert [len(batch.jobs) for batch in in_batches(jobs, DEVICE, memory)] == [2, 2]
-    assert [len(batch.jobs) for batch in in_batches(jobs, DEVICE, 1.0)] == [1] * 4
+def test_batches_are_of_equal_designs_and_schedules_and_fit_the_memory(make, recorded):
+    jobs = grid(make, recorded)
+    more = [make(imus=((1,),), learning_rate=1e-2), make(imus=((1,),), validate=())]
+    assert sorted(map(len, in_batches(jobs + more, 1e12))) == [1, 1, 4, 4]
+    memory = 2.5 * trainings._bytes(jobs[-1])
+    assert [len(batch) for batch in in_batches(jobs[4:], memory)] == [2, 2]
+    assert [len(batch) for batch in in_batches(jobs, 1.0)] == [1] * 8
     assert 0 < trainings.free_memory(DEVICE) < 1e15
 
 
-def test_a_cell_is_prepared_once_for_all_its_seeds(monkeypatch):
-    prepared, asked = jobs_module.prepared, []
-    monkeypatch.setattr(trainings, "prepared", lambda job: asked.append(job.cell) or prepared(job))
-    results_of(grid())
-    assert sorted(asked) == sorted({job.cell for job in grid()})
-    asked.clear()
-    strangers = [replace(job, cell=None) for job in grid(windows=(40,), imus=(1,))]
-    assert_those_one_by_one(strangers, results_of(strangers))
-    assert len(asked) == len(strangers)
-
-
-class Dropping(CalibrationNetwork):
-    """The paper's network with dropout, which no two trainings share."""
-
-    def forward_packed(self, packed):
-        return super().forward_packed(nn.functional.dropout(packed, 0.1))
-
-
-def test_networks_that_cannot_be_batched_are_trained_one_by_one_and_the_log_says_why(
-    monkeypatch, caplog
+def test_what_cannot_be_trained_at_once_is_trained_one_by_one_and_the_log_says_why(
+    make, recorded, monkeypatch, caplog
 ):
     caplog.set_level(logging.INFO)
-    for module in (jobs_module, trainings):
-        monkeypatch.setattr(
-            module, "initial_network", lambda architecture, _: Dropping(architecture)
-        )
-    (batch,) = in_batches(grid(windows=(40,), imus=(1,)), DEVICE, 1e12)
-    reported = []
-    assert [one.engine for one in train_batch(batch, reported.append)] == ["cpu"] * 4
-    assert sum(reported) == pytest.approx(batch.work)
+    rates, bias = recorded()
+    jobs = [make((rates.where(rates.recording != 3), bias)), make((rates, bias))]
+    results = dict(run_trainings(jobs, DEVICE, "all"))
+    assert "training samples are not all finite" in str(results[0])
+    assert results[1].engine in {"fused", "cpu"}
+    assert "all: batch 1 of 1, 2 networks: trained one by one: training samples" in caplog.text
+    monkeypatch.setattr("gyro_pipeline.learning.design.network_class", lambda _: Dropping)
+    results = dict(run_trainings(grid(make, recorded)[:4], DEVICE, "own"))
+    assert {result.engine for result in results.values()} == {"cpu"}
     assert "Dropping: trained one by one: vmap: called random operation" in caplog.text
-
-
-def test_the_estimated_work_is_what_is_reported():
-    for batch in in_batches(grid(), DEVICE, 1e12):
-        reported = []
-        train_batch(batch, reported.append)
-        assert sum(reported) == pytest.approx(batch.work)
-        assert len(reported) == len(batch.jobs) + SETTINGS.epochs
-
-
-def test_a_loss_that_is_no_longer_finite_ends_the_run():
-    steep = SETTINGS.model_copy(update={"learning_rate": 1e30})
-    with pytest.raises(FloatingPointError, match="the loss is .* in epoch"):
-        results_of([replace(job, settings=steep) for job in grid()])
 
 
 @pytest.mark.parametrize(
@@ -163,9 +209,5 @@ def test_the_gpu_is_used_where_there_is_one_and_asked_for_nowhere_else(
     monkeypatch, executor, cuda, chosen
 ):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
-    found = batch_device(executor)
-    assert (found and found.type) == chosen
-
-
-def test_nothing_to_train_is_nothing_to_do():
-    assert results_of([]) == {}
+    place = batch_device(executor)
+    assert (place and place.type) == chosen

@@ -257,12 +257,12 @@ def test_of_few_recordings_what_cannot_be_fitted_is_left_out_and_named_first(few
     world = few(count, list(ESTIMATORS))
     plan = world.plan.set_index("estimator")[LEFT_OUT]
     needs = {
-        name: 0 if name.startswith("cnn") else estimator_class(name).fewest_recordings
+        name: 0 if estimator_class(name).seeded else estimator_class(name).fewest_recordings
         for name in ESTIMATORS
     }
     without_one = count - 1  # of which none validates, as too few would train
     left_out = {name for name, fewest in needs.items() if without_one < fewest}
-    left_out |= {name for name in needs if name.startswith("cnn") and without_one < 2}
+    left_out |= {name for name in needs if estimator_class(name).seeded and without_one < 2}
     assert {name for name, problem in plan.items() if problem} == left_out
     for name in left_out:
         assert plan[name].startswith("fold 0: ")

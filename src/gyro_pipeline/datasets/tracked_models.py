@@ -58,7 +58,7 @@ def log_model(client: MlflowClient, run: Run, estimator: Estimator, example: np.
             model,
             loader_module="gyro_pipeline.estimators.served",
             data_path=fit,
-            code_paths=_code_of(type(estimator)),
+            code_paths=_code_of(estimator.source),
             mlflow_model=Model(artifact_path=MODEL, run_id=run.info.run_id, model_id=model_id),
             signature=_SIGNATURE,
             input_example=np.round(example[:1].astype(np.float64), _EXAMPLE_DECIMALS),
@@ -88,7 +88,7 @@ def _new_model(client: MlflowClient, run: Run, estimator: Estimator) -> str:
         source_run_id=run.info.run_id,
         tags={DESCRIPTION: run.data.tags[DESCRIPTION]},
         params=run.data.params,
-        model_type=type(estimator).__name__,
+        model_type=estimator.source.__name__,
     )
     client.log_outputs(run.info.run_id, [LoggedModelOutput(model.model_id, 0)])
     return str(model.model_id)

@@ -4,7 +4,8 @@ Nothing is imported but the estimator that is asked for: a list of names costs n
 """
 
 import importlib
-from collections.abc import Mapping
+import json
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from gyro_pipeline.conventions import InputError
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from gyro_pipeline.parameters import Training
 
 _HERE = "gyro_pipeline.estimators."
+_LEARNING = "gyro_pipeline.learning."
 
 ESTIMATORS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "mean": (f"{_HERE}averages:RunningMean", {}),
@@ -31,10 +33,17 @@ ESTIMATORS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "ridge_same_time": (f"{_HERE}linear:Ridge", {"same_time": True}),
     "window_mean_network": (f"{_HERE}networks:WindowMeanNetwork", {}),
     "residual_network": (f"{_HERE}networks:ResidualNetwork", {}),
-    "cnn": (f"{_HERE}paper_network:PaperNetwork", {}),
-    "cnn_shuffled": (f"{_HERE}paper_network:PaperNetwork", {"shuffled": True}),
+    "single_gyroscope": (f"{_LEARNING}network:SingleGyroscope", {}),
+    "lstm": (f"{_LEARNING}sequences:LSTM", {}),
+    "tcn": (f"{_LEARNING}sequences:TCN", {}),
+    "cnn": (f"{_LEARNING}network:CalibrationNetwork", {}),
+    "cnn_shuffled": (f"{_LEARNING}network:CalibrationNetwork", {"shuffled": True}),
 }
-"""The class and the options of each estimator, by the name that runs and tables give it."""
+"""The class and the options of each estimator, by the name that runs and tables give it.
+
+A class is an :class:`~gyro_pipeline.estimators.base.Estimator`, or an ``nn.Module``, which
+:class:`~gyro_pipeline.estimators.nn_module.ModuleEstimator` trains.
+"""
 
 DEFAULT = "best_linear"
 """What to use where nothing else is known: its sigma holds on coloured noise as well."""
@@ -48,60 +57,125 @@ def entry(name: str) -> str:
     """Where the class of an estimator is, as ``package.module:Class``.
 
     Args:
-        name: One of ``ESTIMATORS``, or the same of an estimator of one's own.
+        name: One of ``ESTIMATORS``, or ``package.module:Class`` of an estimator or a network of
+            one's own; settings may follow, as in ``cnn learning_rate=0.001 channels=16``.
 
     Raises:
         InputError: It is neither.
     """
-    path, _ = ESTIMATORS.get(name, (name, {}))
+    word = name.partition(" ")[0]
+    path, _ = ESTIMATORS.get(word, (word, {}))
     module, _, kind = path.partition(":")
     if not (module and kind):
         raise InputError(
-            f"unknown estimator {name!r}; there are {', '.join(ESTIMATORS)}, and those of your "
+            f"unknown estimator {word!r}; there are {', '.join(ESTIMATORS)}, and those of your "
             "own: package.module:Class"
         )
     return path
 
 
-def estimator_class(name: str) -> "type[Estimator]":
-    """The class of an estimator.
+def own_classes(names: Iterable[str]) -> list[str]:
+    """Which of some estimators are of one's own, each as ``package.module:Class``."""
+    return sorted({entry(name) for name in names if name.partition(" ")[0] not in ESTIMATORS})
+
+
+def named_settings(name: str) -> dict[str, Any]:
+    """The settings that follow the word in the name of an estimator.
+
+    Raises:
+        InputError: One is not of the form key=value.
+    """
+    settings = {}
+    for part in name.split()[1:]:
+        key, equals, text = part.partition("=")
+        if not (key and equals and text) or key in settings:
+            raise InputError(f"estimator {name!r}: expected key=value once, got {part!r}")
+        try:
+            settings[key] = json.loads(text)
+        except ValueError:  # a word, such as per_device
+            settings[key] = text
+    return settings
+
+
+def named_class(name: str) -> type:
+    """The class that a name stands for, an estimator's or a network's.
 
     Args:
         name: As for :func:`entry`.
 
     Raises:
-        InputError: There is no such class, or it is no estimator.
+        InputError: There is no such class.
     """
-    from gyro_pipeline.estimators.base import Estimator  # noqa: PLC0415 - takes xarray
-
     module, _, kind = entry(name).partition(":")
     try:
-        found = getattr(importlib.import_module(module), kind)
+        named: type = getattr(importlib.import_module(module), kind)
     except (ModuleNotFoundError, AttributeError) as error:
         raise InputError(
             f"estimator {name!r}: {error}; expected package.module:Class, of a module that Python "
             "finds, such as a file in src"
         ) from error
-    if not (isinstance(found, type) and issubclass(found, Estimator)):
-        raise InputError(
-            f"estimator {name!r}: expected a subclass of gyro_pipeline.estimators.base.Estimator, "
-            f"got {found!r}"
-        )
-    return found
+    return named
+
+
+def estimator_class(name: str) -> "type[Estimator]":
+    """The class of an estimator; of a network that of what trains it.
+
+    Args:
+        name: As for :func:`entry`.
+
+    Raises:
+        InputError: There is no such class, or it is neither an estimator nor a network.
+    """
+    from gyro_pipeline.estimators.base import Estimator  # noqa: PLC0415 - takes xarray
+
+    named = named_class(name)
+    if isinstance(named, type) and issubclass(named, Estimator):
+        return named
+    from gyro_pipeline.estimators.nn_module import ModuleEstimator  # noqa: PLC0415 - PyTorch
+    from gyro_pipeline.learning.design import is_network  # noqa: PLC0415
+
+    if is_network(named):
+        return ModuleEstimator
+    raise InputError(
+        f"estimator {name!r}: expected a subclass of gyro_pipeline.estimators.base.Estimator or of "
+        f"torch.nn.Module, got {named!r}"
+    )
 
 
 def make_estimator(name: str, training: "Training", seed: int) -> "Estimator":
     """An estimator that is yet to be fitted.
 
     Args:
-        name: As for :func:`entry`.
+        name: As for :func:`entry`. Settings that ``training`` has change it, others are options of
+            the estimator or network.
         training: Sizes and schedule of a network; only an estimator that is seeded gets them.
         seed: Likewise.
 
     Raises:
-        InputError: There is no such estimator.
+        InputError: There is no such estimator, or a setting is unknown.
     """
-    kind = estimator_class(name)
-    _, options = ESTIMATORS.get(name, (name, {}))
-    given = {"training": training, "seed": seed} if kind.seeded else {}
-    return kind(**given, **options)
+    kind: Any = estimator_class(name)
+    options = named_settings(name)
+    _, fixed = ESTIMATORS.get(name.partition(" ")[0], (name, {}))
+    try:
+        if not kind.seeded:
+            return kind(**fixed, **options)
+        changes = {key: options.pop(key) for key in [*options] if key in training.schedule}
+        settings = training.model_validate(training.model_dump() | changes)
+        given = {} if issubclass(named_class(name), kind) else {"network": entry(name)}
+        made = kind(training=settings, seed=seed, **given, **fixed, **options)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"estimator {name!r}: {' '.join(str(error).split())}") from error
+    made.settings = made.settings or settings.model_dump()
+    return made
+
+
+def settings_of(name: str, training: "Training") -> dict[str, Any]:
+    """What a seeded estimator is made with, for runs to carry; nothing of any other.
+
+    Args:
+        name: As for :func:`entry`.
+        training: As for :func:`make_estimator`.
+    """
+    seeded = estimator_class(name).seeded
+    return dict(make_estimator(name, training, seed=0).settings) if seeded else {}

@@ -2,10 +2,11 @@
 
 import copy
 import pickle
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Self
+from types import MappingProxyType
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import pandas as pd
@@ -18,10 +19,6 @@ Estimates = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Biases (n, gyroscopes) and their standard deviations, deg/s; NaN where a method has none."""
 
 _FILE = "estimator.pkl"
-
-
-def unheard(work: float) -> None:
-    """Nobody asked how far the fit is."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +59,7 @@ class Estimator:
         uses_prior: Whether what it learned about the bias enters its estimates.
         engine: What fitted it.
         history: Losses by epoch, of a network.
+        settings: Of a seeded one, what it was made with, but the seed; runs carry it.
     """
 
     uses: ClassVar[str] = OWN
@@ -72,15 +70,15 @@ class Estimator:
     uses_prior: bool = False
     engine: str = "cpu"
     history: pd.DataFrame | None = None
+    settings: Mapping[str, Any] = MappingProxyType({})
     _rate_hz: float = np.nan
     _recording_s: float = np.nan
 
-    def fit(self, training: TrainingSet, report: Callable[[float], None] = unheard) -> Self:
+    def fit(self, training: TrainingSet) -> Self:
         """Learn from a training set, and from nothing else.
 
         Args:
             training: Of which only the part is looked at that the estimator uses.
-            report: Told the work done since it was last called, of ``work(training)`` in all.
 
         Returns:
             Itself.
@@ -92,7 +90,6 @@ class Estimator:
         self.check(training)
         self._rate_hz, self._recording_s = training.rate_hz, training.recording_s
         self._fit(training)
-        report(self.work(training))
         return self
 
     def check(self, training: TrainingSet) -> None:
@@ -102,6 +99,11 @@ class Estimator:
             InputError: It has too few recordings.
         """
         self._demand(training.recordings())
+
+    @property
+    def source(self) -> type:
+        """The class whose file is stored with the estimator where it is not of this package."""
+        return type(self)
 
     def work(self, training: TrainingSet) -> float:
         """Estimated cost of fitting, in training samples of three gyroscopes of a network."""

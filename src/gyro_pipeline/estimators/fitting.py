@@ -1,10 +1,12 @@
 """Fitting many estimators: in one process per core, and networks many at once on a GPU."""
 
+import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+import traceback
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.estimators import estimator_class, make_estimator
@@ -13,13 +15,16 @@ from gyro_pipeline.estimators.training import TrainingSet
 from gyro_pipeline.executors import run_jobs
 from gyro_pipeline.parameters import Execution, Training
 
+logger = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class FitJob:
     """An estimator to fit.
 
     Attributes:
-        name: Whatever tells the caller which run it is of.
+        key: Whatever tells the caller which run it is of.
+        name: Of that run, for messages.
         fold: Of the windows table.
         estimator: As in :data:`gyro_pipeline.estimators.ESTIMATORS`, or of one's own.
         settings: Sizes and schedule, of a network.
@@ -27,6 +32,7 @@ class FitJob:
         training: What to fit it to.
     """
 
+    key: str
     name: str
     fold: str
     estimator: str
@@ -54,6 +60,14 @@ class Fit:
     engine: str
 
 
+@dataclass(frozen=True)
+class Failure:
+    """Why there is no fit; and the way to an error that nobody foresaw, else empty."""
+
+    reason: str
+    trace: str = ""
+
+
 def run_fits(
     jobs: Sequence[FitJob], execution: Execution, label: str
 ) -> Iterator[tuple[FitJob, Fit]]:
@@ -61,72 +75,62 @@ def run_fits(
 
     Args:
         jobs: Independent of each other.
-        execution: Which executor. ``batched``, and ``auto`` where there is a GPU, trains the
-            networks of the paper many at once; all else is fitted in processes.
+        execution: Which executor. ``batched``, and ``auto`` where there is a GPU, trains networks
+            many at once; all else is fitted in processes.
         label: Names the work in progress lines.
 
     Yields:
         A job and its result.
 
     Raises:
-        InputError: One cannot be fitted; the message says which.
+        InputError: Some cannot be fitted, after all others were; the message says which.
     """
-    networks = [job for job in jobs if _is_paper_network(job)]
+    failures = []
+    for job, fit in _attempts(jobs, execution, label):
+        if isinstance(fit, Fit):
+            yield job, fit
+        else:
+            failures.append(f"{job.name}, {job.fold}: cannot be fitted: {fit.reason}")
+            logger.error("%s%s", failures[-1], fit.trace)
+    if failures:
+        raise InputError(
+            f"{failures[0]} ({len(failures)} failed, the other {len(jobs) - len(failures)} are "
+            "fitted); leave it out of the study, or mend it and start again"
+        )
+
+
+def _attempts(
+    jobs: Sequence[FitJob], execution: Execution, label: str
+) -> Iterator[tuple[FitJob, Fit | Failure]]:
+    """Each job with its fit, or with why there is none."""
+    networks = [job for job in jobs if _is_network(job)]
     if networks:
         from gyro_pipeline.learning import fused, trainings  # noqa: PLC0415 - take PyTorch
 
-        if trainings.batch_device(execution.executor) is None:
+        device = trainings.batch_device(execution.executor)
+        if device is None:
             fused.available()  # compiled, or said why not, before the workers need it
         else:
-            yield from _run_batched(networks, execution, label)
-            jobs = [job for job in jobs if not _is_paper_network(job)]
-    groups = _groups(jobs)
-    for group, fits in run_jobs(groups, _fit_group, execution, label, "fits"):
+            yield from _trained_together(networks, device, label)
+            jobs = [job for job in jobs if not _is_network(job)]
+    for group, fits in run_jobs(_groups(jobs), _fit_group, execution, label, "fits"):
         yield from zip(group.jobs, fits, strict=True)
 
 
-def fit_job(job: FitJob, report: Callable[[float], None]) -> Fit:
-    """Fit one estimator.
+def _trained_together(
+    jobs: Sequence[FitJob], device: Any, label: str
+) -> Iterator[tuple[FitJob, Fit | Failure]]:
+    """Networks that are trained many at once."""
+    from gyro_pipeline.learning.trainings import run_trainings  # noqa: PLC0415 - takes PyTorch
 
-    Raises:
-        InputError: It cannot be fitted.
-    """
-    started = time.time()
-    with _explained(job):
-        estimator = job.make().fit(job.training, report)
-    return Fit(estimator, started, time.time(), estimator.engine)
-
-
-@contextmanager
-def _explained(job: FitJob) -> Iterator[None]:
-    """Say which estimator cannot be fitted, to what, and what to do."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(
-            f"{job.fold}: {job.estimator} cannot be fitted: {error}; bring more recordings or "
-            "leave it out of the study"
-        ) from error
-
-
-def _run_batched(
-    jobs: Sequence[FitJob], execution: Execution, label: str
-) -> Iterator[tuple[FitJob, Fit]]:
-    """Train networks of the paper many at once."""
-    from gyro_pipeline.estimators.paper_network import PaperNetwork  # noqa: PLC0415
-    from gyro_pipeline.learning.trainings import run_trainings  # noqa: PLC0415
-
-    networks, trainings = [], []
-    for job in jobs:
-        network = job.make()
-        assert isinstance(network, PaperNetwork)
-        with _explained(job):
-            network.check(job.training)
-        networks.append(network)
-        trainings.append(network.job(job.training))
-    for number, trained in run_trainings(trainings, execution.executor, label):
-        network = networks[number].trained(trained)
-        yield jobs[number], Fit(network, trained.started, time.time(), trained.engine)
+    estimators: list[Any] = [job.make() for job in jobs]
+    trainings = [each.job(job.training) for each, job in zip(estimators, jobs, strict=True)]
+    for number, trained in run_trainings(trainings, device, label):
+        if isinstance(trained, Exception):
+            yield jobs[number], Failure(str(trained))
+        else:
+            estimator = estimators[number].trained(trained)
+            yield jobs[number], Fit(estimator, trained.started, time.time(), trained.engine)
 
 
 @dataclass(frozen=True)
@@ -151,11 +155,22 @@ def _groups(jobs: Sequence[FitJob]) -> list[_Group]:
     return [_Group(group) for group in groups.values()]
 
 
-def _fit_group(group: _Group, report: Callable[[float], None]) -> list[Fit]:
-    return [fit_job(job, report) for job in group.jobs]
+def _fit_group(group: _Group) -> list[Fit | Failure]:
+    return [_fit(job) for job in group.jobs]
 
 
-def _is_paper_network(job: FitJob) -> bool:
+def _fit(job: FitJob) -> Fit | Failure:
+    """A fit, or why there is none: others go on."""
+    started = time.time()
+    try:
+        estimator = job.make().fit(job.training)
+    except (InputError, FloatingPointError) as error:
+        return Failure(str(error))
+    except Exception as error:  # of a stranger's estimator it may be any
+        return Failure(repr(error), f"\n{traceback.format_exc()}")
+    return Fit(estimator, started, time.time(), estimator.engine)
+
+
+def _is_network(job: FitJob) -> bool:
     """Whether it can be trained in a batch; a subclass may differ in anything."""
-    kind = estimator_class(job.estimator)
-    return (kind.__module__, kind.__name__) == (f"{__package__}.paper_network", "PaperNetwork")
+    return estimator_class(job.estimator).__module__ == f"{__package__}.nn_module"

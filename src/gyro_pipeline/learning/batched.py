@@ -8,7 +8,7 @@ own examples and their order, and gets the weights that
 import copy
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
 from torch.nn import functional
+from tqdm import tqdm
 
 from gyro_pipeline.learning.examples import Examples
 from gyro_pipeline.learning.trainer import Losses, StateDict, Trained, forward_of, weights_of
@@ -40,10 +41,7 @@ class Learner:
 
 
 def train_together(
-    learners: Sequence[Learner],
-    schedule: Training,
-    device: torch.device,
-    after_epoch: Callable[[], None],
+    learners: Sequence[Learner], schedule: Training, device: torch.device, label: str = ""
 ) -> list[Trained]:
     """Train networks of one kind on equal numbers of examples, step by step together.
 
@@ -51,7 +49,7 @@ def train_together(
         learners: The networks; :func:`obstacle` must have nothing against them.
         schedule: Epochs, batch size, learning rate and its decay.
         device: Where to train.
-        after_epoch: Called after every epoch of all networks.
+        label: Names the work beside a bar that counts epochs, on a terminal.
 
     Raises:
         FloatingPointError: If a loss is no longer finite.
@@ -61,16 +59,17 @@ def train_together(
     watched = [learner.validation for learner in learners if learner.validation is not None]
     validation = _SharedExamples(watched, device) if watched else None
     losses = [Losses() for _ in learners]
-    for rate in schedule.learning_rates(training.size).tolist():
-        orders = [torch.randperm(training.size, generator=one.shuffling) for one in learners]
+    rates = schedule.learning_rates(training.size).tolist()
+    for rate in tqdm(rates, label, leave=False, unit="epoch", disable=None):
+        orders = [torch.randperm(training.size, generator=each.shuffling) for each in learners]
         means = stack.train(training, torch.stack(orders), rate, schedule.batch_size)
         val_means: Sequence[float | None] = [None] * len(learners)
         if validation is not None:
             val_means = stack.validate(validation, schedule.batch_size)
-        for place, own in enumerate(losses):
-            own.add(rate, means[place], val_means[place], partial(stack.weights, place))
-        after_epoch()
-    return [own.trained(stack.weights(place)) for place, own in enumerate(losses)]
+        for number, history in enumerate(losses):
+            weights = partial(stack.weights, number)
+            history.add(rate, means[number], val_means[number], weights)
+    return [history.trained(stack.weights(number)) for number, history in enumerate(losses)]
 
 
 def obstacle(network: nn.Module, shape: Sequence[int], device: torch.device) -> str | None:
@@ -95,7 +94,7 @@ def obstacle(network: nn.Module, shape: Sequence[int], device: torch.device) -> 
     except (RuntimeError, UserWarning) as reason:
         return str(reason).split(". ")[0]
     if not torch.allclose(outputs[:, :1], first, rtol=1e-3, atol=1e-5):
-        return "what it says to a window depends on the others of the batch"
+        return "its output for a window depends on the other windows of the batch"
     return None
 
 
@@ -109,12 +108,12 @@ class _SharedExamples:
         targets = [torch.from_numpy(part.targets) for part in distinct.values()]
         self._inputs = torch.stack(inputs).to(device)
         self._targets = torch.stack(targets).to(device)
-        self._own = torch.tensor([[numbers[id(part)]] for part in parts], device=device)
+        self._numbers = torch.tensor([[numbers[id(part)]] for part in parts], device=device)
         self.size = len(parts[0].inputs)
 
     def __getitem__(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs and targets of each network's rows, (networks, n) or (1, n) for all."""
-        return self._inputs[self._own, rows], self._targets[self._own, rows]
+        return self._inputs[self._numbers, rows], self._targets[self._numbers, rows]
 
 
 class _StackedNetworks:
@@ -156,18 +155,18 @@ class _StackedNetworks:
         return (torch.stack(parts).sum(0) / examples.size).tolist()
 
     def outputs(self, inputs: Tensor) -> Tensor:
-        """What each network says to its own windows, (networks, n, gyroscopes)."""
+        """Outputs of each network for its windows, (networks, n, gyroscopes)."""
 
-        def of_one(parameters: StateDict, buffers: StateDict, own: Tensor) -> Tensor:
-            return functional_call(self._called, (parameters, buffers), (own,))
+        def alone(parameters: StateDict, buffers: StateDict, windows: Tensor) -> Tensor:
+            return functional_call(self._called, (parameters, buffers), (windows,))
 
-        return vmap(of_one)(self._parameters, self._buffers, inputs)
+        return vmap(alone)(self._parameters, self._buffers, inputs)
 
-    def weights(self, place: int) -> StateDict:
+    def weights(self, number: int) -> StateDict:
         """Those of one network."""
-        rows = {name: row[place] for name, row in (self._parameters | self._buffers).items()}
-        self._networks[place].load_state_dict(rows, strict=False)
-        return weights_of(self._networks[place])
+        rows = {name: row[number] for name, row in (self._parameters | self._buffers).items()}
+        self._networks[number].load_state_dict(rows, strict=False)
+        return weights_of(self._networks[number])
 
     def _losses(self, inputs: Tensor, targets: Tensor) -> Tensor:
         errors = functional.mse_loss(self.outputs(inputs), targets, reduction="none")

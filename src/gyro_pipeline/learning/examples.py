@@ -8,8 +8,7 @@ import pandas as pd
 import xarray as xr
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.learning.network import Architecture
-from gyro_pipeline.learning.packing import aligned_zeros, pack, packed_shape
+from gyro_pipeline.learning.packing import Layout, aligned_zeros
 from gyro_pipeline.physics.bias import windows_at
 
 _READ_AT_ONCE = 16
@@ -83,7 +82,7 @@ class Scaling:
 
 @dataclass(frozen=True)
 class Examples:
-    """Scaled examples: inputs (n, blocks, width) and targets (n, gyroscopes), float32."""
+    """Scaled examples: inputs (n, *layout's shape) and targets (n, gyroscopes), float32."""
 
     inputs: np.ndarray
     targets: np.ndarray
@@ -108,12 +107,12 @@ def device_centres(devices: Sequence[Device], centring: str) -> list[np.ndarray]
 
 
 def training_examples(
-    devices: Sequence[Device], architecture: Architecture, centring: str
+    devices: Sequence[Device], layout: Layout, centring: str
 ) -> tuple[Examples, Scaling]:
     """All windows of the training devices, and the scaling that they fix."""
     centres = device_centres(devices, centring)
-    examples = _centred(devices, centres, architecture)
-    input_scale = _root_mean_square(examples.inputs, architecture)
+    examples = _centred(devices, centres, layout)
+    input_scale = _root_mean_square(examples.inputs, layout)
     if not np.isfinite(input_scale):
         raise InputError("training samples are not all finite; repair or leave out a recording")
     target_scale = float(np.sqrt(np.mean(np.square(examples.targets, dtype=np.float64))))
@@ -127,28 +126,26 @@ def training_examples(
     return examples, Scaling(centres, input_scale, target_scale)
 
 
-def scaled_examples(device: Device, architecture: Architecture, scaling: Scaling) -> Examples:
+def scaled_examples(device: Device, layout: Layout, scaling: Scaling) -> Examples:
     """Windows of other recordings of the first training device, scaled as in training."""
-    examples = _centred([device], scaling.centres[:1], architecture)
+    examples = _centred([device], scaling.centres[:1], layout)
     examples.inputs[...] /= scaling.input_scale
     examples.targets[...] /= scaling.target_scale
     return examples
 
 
-def _centred(
-    devices: Sequence[Device], centres: Sequence[np.ndarray], architecture: Architecture
-) -> Examples:
+def _centred(devices: Sequence[Device], centres: Sequence[np.ndarray], layout: Layout) -> Examples:
     n = sum(device.windows for device in devices)
-    inputs = aligned_zeros((n, *packed_shape(architecture)))
-    targets = np.empty((n, architecture.gyroscopes), np.float32)
+    inputs = aligned_zeros((n, *layout.shape))
+    targets = np.empty((n, layout.gyroscopes), np.float32)
     start = 0
     for device, centre in zip(devices, centres, strict=True):
         used = zip(device.samples(), device.biases, device.starts, strict=True)
         for samples, bias, starts in used:
             centred = samples - centre[:, None].astype(np.float32)
             rows = slice(start, start + len(starts))
-            windows = windows_at(centred, architecture.window, starts)
-            pack(windows, architecture, out=inputs[rows])
+            windows = windows_at(centred, layout.window, starts)
+            layout.write(windows, inputs[rows])
             targets[rows] = bias - centre
             start = rows.stop
     return Examples(inputs, targets)
@@ -158,8 +155,7 @@ def _around(positions: np.ndarray) -> slice:
     return slice(int(positions.min()), int(positions.max()) + 1)
 
 
-def _root_mean_square(inputs: np.ndarray, architecture: Architecture) -> float:
+def _root_mean_square(inputs: np.ndarray, layout: Layout) -> float:
     """Over samples, not over the zeros that pad them."""
-    seen = min(architecture.window, packed_shape(architecture)[0] * architecture.stride)
     squares = sum(float(np.vdot(window, window)) for window in inputs)
-    return float(np.sqrt(squares / (len(inputs) * architecture.gyroscopes * seen)))
+    return float(np.sqrt(squares / (len(inputs) * layout.samples)))

@@ -327,7 +327,7 @@ def _check() -> None:
     random = np.random.default_rng(0)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        network, got = CalibrationNetwork(a), CalibrationNetwork(a)
+        network, got = (CalibrationNetwork(**vars(a)) for _ in range(2))
     inputs = random.normal(size=(11, *packed_shape(a))).astype(np.float32)
     targets = random.normal(size=(11, a.gyroscopes)).astype(np.float32)
     engine = FusedEngine(network, inputs, targets, batch_size=4)

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import pandas as pd
 import torch
 
 from gyro_pipeline.learning import fused
+from gyro_pipeline.learning.design import Design
 from gyro_pipeline.learning.examples import (
     Device,
     Examples,
@@ -18,9 +19,9 @@ from gyro_pipeline.learning.examples import (
     training_examples,
 )
 from gyro_pipeline.learning.fused import FusedEngine
-from gyro_pipeline.learning.network import Architecture, CalibrationNetwork
-from gyro_pipeline.learning.packing import pack
-from gyro_pipeline.learning.trainer import TorchEngine, Trained, predict, train
+from gyro_pipeline.learning.network import CalibrationNetwork
+from gyro_pipeline.learning.packing import aligned_zeros
+from gyro_pipeline.learning.trainer import TorchEngine, Trained, nothing, predict, train
 from gyro_pipeline.parameters import Training
 
 # What a training costs, in samples of three gyroscopes (0.8 ns); measured in every cell.
@@ -28,7 +29,7 @@ _EPOCH_OVERHEAD = 800_000
 """Of an epoch beside its training samples, mostly validation."""
 _LARGE = 15_000_000
 """So many samples cost twice as much each as a few, which stay in the caches."""
-RECORDING_WORK = 500_000
+_RECORDING_WORK = 500_000
 """To read, scale and pack one."""
 
 
@@ -37,29 +38,21 @@ class TrainingJob:
     """A network to train.
 
     Attributes:
-        name: Shown while it runs.
+        design: Its class, and what it is made with.
         devices: Training devices and their windows; the first is the one that is estimated.
         validation: The first device and its windows to validate on; None without.
-        window: Samples.
-        settings: The network's sizes and schedule.
+        settings: The schedule.
         seed: Of the initial weights and the order of examples.
-        cell: Equal for jobs of the same sizes that differ in their seeds alone, so that they can
+        cell: Equal for jobs of the same layout that differ in their seeds alone, so that they can
             share examples; None where that is not known.
     """
 
-    name: str
+    design: Design
     devices: Sequence[Device]
     validation: Device | None
-    window: int
     settings: Training
     seed: int
     cell: Hashable = None
-
-    @property
-    def architecture(self) -> Architecture:
-        """Sizes of the network."""
-        gyroscopes = len(self.devices[0].imus) * self.devices[0].recordings.sizes["axis"]
-        return sized(self.settings, gyroscopes, self.window)
 
     @property
     def windows(self) -> int:
@@ -75,14 +68,14 @@ class TrainingJob:
     @property
     def epoch_work(self) -> float:
         """Estimated cost of an epoch, in samples of three gyroscopes."""
-        samples = self.windows * self.window * len(self.devices[0].imus)
+        samples = self.windows * self.design.window * len(self.devices[0].imus)
         return samples * (1 + samples / _LARGE) + _EPOCH_OVERHEAD
 
     @property
     def work(self) -> float:
         """Estimated cost of the training, in samples of three gyroscopes."""
         epochs = len(self.settings.learning_rates(self.windows))
-        return self.recordings * RECORDING_WORK + epochs * self.epoch_work
+        return self.recordings * _RECORDING_WORK + epochs * self.epoch_work
 
 
 @dataclass(frozen=True)
@@ -95,12 +88,12 @@ class TrainedNetwork:
     engine: str
 
 
-def run_training(job: TrainingJob, report: Callable[[float], None]) -> TrainedNetwork:
+def run_training(job: TrainingJob, after_epoch: Callable[[], None] = nothing) -> TrainedNetwork:
     """Run one training on one thread of the processor.
 
     Args:
         job: What to train.
-        report: Told the work done after the preparation, and after every epoch.
+        after_epoch: Called after every epoch.
 
     Returns:
         Weights at the last and the best validation epoch with all that an estimate needs.
@@ -109,34 +102,36 @@ def run_training(job: TrainingJob, report: Callable[[float], None]) -> TrainedNe
     torch.set_num_threads(1)
     torch.use_deterministic_algorithms(True)
     examples, validation, scaling = prepared(job)
-    report(job.recordings * RECORDING_WORK)
-    network = initial_network(job.architecture, job.seed)
+    network = job.design.build(job.seed)
     compiled = type(network) is CalibrationNetwork and fused.available()
-    trained = train(
-        network,
-        examples,
-        validation,
-        job.settings,
-        shuffling(job.seed),
-        after_epoch=lambda: report(job.epoch_work),
-        engine=FusedEngine if compiled else TorchEngine,
-    )
-    artifact = stored(job.architecture, scaling, trained)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(job.seed)  # of dropout and the like
+        trained = train(
+            network,
+            examples,
+            validation,
+            job.settings,
+            shuffling(job.seed),
+            after_epoch,
+            FusedEngine if compiled else TorchEngine,
+        )
+    artifact = stored(job.design, scaling, trained)
     return TrainedNetwork(artifact, trained.history, started, "fused" if compiled else "cpu")
 
 
 def prepared(job: TrainingJob) -> tuple[Examples, Examples | None, Scaling]:
     """Training and validation examples, and the scaling of both; the same for every seed."""
-    examples, scaling = training_examples(job.devices, job.architecture, job.settings.centring)
+    layout = job.design.layout
+    examples, scaling = training_examples(job.devices, layout, job.settings.centring)
     if job.validation is None:
         return examples, None, scaling
-    return examples, scaled_examples(job.validation, job.architecture, scaling), scaling
+    return examples, scaled_examples(job.validation, layout, scaling), scaling
 
 
-def stored(architecture: Architecture, scaling: Scaling, trained: Trained) -> dict[str, Any]:
+def stored(design: Design, scaling: Scaling, trained: Trained) -> dict[str, Any]:
     """The artifact of a training: plain values and tensors."""
     return {
-        "architecture": asdict(architecture),
+        "network": vars(design),
         "scaling": {
             "centre": torch.from_numpy(scaling.centres[0]),
             "input_scale": scaling.input_scale,
@@ -146,19 +141,6 @@ def stored(architecture: Architecture, scaling: Scaling, trained: Trained) -> di
         "best": trained.best,
         "best_epoch": trained.best_epoch,
     }
-
-
-def sized(settings: Training, gyroscopes: int, window: int) -> Architecture:
-    """The network's sizes for an input of ``gyroscopes`` by ``window`` samples."""
-    sizes = (settings.channels, settings.kernel, settings.stride, settings.pool, settings.hidden)
-    return Architecture(gyroscopes, window, *sizes)
-
-
-def initial_network(architecture: Architecture, seed: int) -> CalibrationNetwork:
-    """PyTorch's default initial weights, drawn from ``seed`` without touching the global state."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        return CalibrationNetwork(architecture)
 
 
 def shuffling(seed: int) -> torch.Generator:
@@ -177,7 +159,9 @@ class StoredNetwork:
             weights: ``last`` or ``best``.
         """
         self._scaling = artifact["scaling"]
-        self._network = CalibrationNetwork(Architecture(**artifact["architecture"]))
+        design = Design(**artifact["network"])
+        self._layout = design.layout
+        self._network = design.build(seed=0).eval()
         self._network.load_state_dict(artifact[weights])
 
     def biases(self, windows: np.ndarray) -> np.ndarray:
@@ -191,6 +175,7 @@ class StoredNetwork:
         """
         centre = self._scaling["centre"].numpy()
         scaled = (windows - centre[:, None].astype(np.float32)) / self._scaling["input_scale"]
-        packed = pack(scaled.transpose(1, 0, 2), self._network.architecture)
-        outputs = predict(self._network, torch.from_numpy(packed)).double().numpy()
+        inputs = aligned_zeros((len(windows), *self._layout.shape))
+        self._layout.write(scaled.transpose(1, 0, 2), inputs)
+        outputs = predict(self._network, torch.from_numpy(inputs)).double().numpy()
         return np.asarray(centre + self._scaling["target_scale"] * outputs)

@@ -1,6 +1,7 @@
 """The paper's network (section III-D), on windows as they are or packed for speed."""
 
 from dataclasses import dataclass
+from functools import wraps
 
 from torch import Tensor, nn
 from torch.nn import functional
@@ -54,10 +55,19 @@ class CalibrationNetwork(nn.Module):
     without a copy. Neither changes the function the network computes.
     """
 
-    def __init__(self, architecture: Architecture) -> None:
+    def __init__(  # noqa: PLR0917 - what the paper leaves open
+        self,
+        gyroscopes: int,
+        window: int,
+        channels: int,
+        kernel: int,
+        stride: int,
+        pool: int,
+        hidden: int,
+    ) -> None:
         super().__init__()
-        a = architecture
-        self.architecture = architecture
+        a = Architecture(gyroscopes, window, channels, kernel, stride, pool, hidden)
+        self.architecture = a
         self.convolution = nn.Conv1d(a.gyroscopes, a.channels, a.kernel, a.stride)
         self.hidden = nn.Linear(a.pooled * a.channels, a.hidden)
         self.output = nn.Linear(a.hidden, a.gyroscopes)
@@ -99,3 +109,21 @@ class CalibrationNetwork(nn.Module):
     def _head(self, pooled: Tensor) -> Tensor:
         features = functional.leaky_relu(pooled, SLOPE).flatten(1)  # (n, pooled * channels)
         return self.output(functional.leaky_relu(self.hidden(features), SLOPE))
+
+
+class SingleGyroscope(nn.Module):
+    """The paper's network with one channel in and one bias out, the same for every gyroscope.
+
+    The paper compares itself with such a predecessor (Engelsman & Klein, arXiv 2210.04568), whose
+    layers are not known to us, so here they are the paper's.
+    """
+
+    @wraps(CalibrationNetwork.__init__)  # type: ignore[misc]
+    def __init__(self, gyroscopes: int, window: int, **sizes: int) -> None:
+        super().__init__()
+        self.network = CalibrationNetwork(1, window, **sizes)
+
+    def forward(self, windows: Tensor) -> Tensor:
+        """Biases of windows (n, gyroscopes, window), each gyroscope's from its own samples."""
+        alone = windows.flatten(0, 1).unsqueeze(1)
+        return self.network(alone).reshape(windows.shape[:2])

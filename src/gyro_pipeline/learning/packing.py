@@ -6,6 +6,7 @@ padded with zeros, and is faster the more the kernel overlaps itself.
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -49,6 +50,39 @@ def pack(
         rest = windows[:, :, full * a.stride :]
         cells[:, full, :, : rest.shape[2]] = rest.transpose(1, 0, 2)
     return out
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a network's windows lie in memory: packed for the paper's network, else as they are.
+
+    Attributes:
+        gyroscopes: Channels of a window.
+        window: Samples.
+        packed: Sizes of the paper's network; None of any other.
+    """
+
+    gyroscopes: int
+    window: int
+    packed: Architecture | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Of one window."""
+        return packed_shape(self.packed) if self.packed else (self.gyroscopes, self.window)
+
+    @property
+    def samples(self) -> int:
+        """How many of a window's samples the network sees, of all gyroscopes."""
+        seen = self.shape[0] * self.packed.stride if self.packed else self.window
+        return self.gyroscopes * min(self.window, seen)
+
+    def write(self, windows: np.ndarray, out: np.ndarray) -> None:
+        """Write windows (gyroscopes, n, window) into zeros of shape (n, *shape)."""
+        if self.packed:
+            pack(windows, self.packed, out)
+        else:
+            out[...] = windows.transpose(1, 0, 2)
 
 
 def aligned_zeros(shape: tuple[int, ...]) -> np.ndarray:

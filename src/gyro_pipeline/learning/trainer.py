@@ -15,6 +15,11 @@ from gyro_pipeline.parameters import Training
 
 StateDict = dict[str, Tensor]
 
+
+def nothing() -> None:
+    """What is done after an epoch where nobody counts them."""
+
+
 _VALIDATION_BATCH = 1024
 
 
@@ -80,7 +85,7 @@ class TorchEngine:
 
     Args:
         network: Trained in place.
-        inputs: Packed windows, shape (n, blocks, width), scaled; on the device for good.
+        inputs: Scaled windows as the network's layout has them; on the device for good.
         targets: Shape (n, gyroscopes), scaled.
         batch_size: Examples per step; the last one of an epoch may be smaller.
     """
@@ -97,6 +102,7 @@ class TorchEngine:
         """See :class:`Engine`."""
         for group in self._optimizer.param_groups:
             group["lr"] = learning_rate
+        self._network.train()
         total = torch.zeros((), device=self._inputs.device)
         for batch in torch.from_numpy(order).to(self._inputs.device).split(self._batch_size):
             outputs = self._forward(self._inputs.index_select(0, batch))
@@ -118,7 +124,7 @@ def train(
     validation: Examples | None,
     schedule: Training,
     shuffling: torch.Generator,
-    after_epoch: Callable[[], None],
+    after_epoch: Callable[[], None] = nothing,
     engine: Callable[..., Engine] = TorchEngine,
 ) -> Trained:
     """Train a network; equal inputs give equal weights.
@@ -153,8 +159,9 @@ def train(
 
 @torch.no_grad()
 def predict(network: nn.Module, inputs: Tensor) -> Tensor:
-    """Network outputs for packed inputs of any number, shape (n, gyroscopes)."""
-    return torch.cat([forward_of(network)(part) for part in inputs.split(_VALIDATION_BATCH)])
+    """A network's outputs for any number of inputs as its layout has them, (n, gyroscopes)."""
+    forward = forward_of(network.eval())
+    return torch.cat([forward(part) for part in inputs.split(_VALIDATION_BATCH)])
 
 
 def forward_of(network: nn.Module) -> Callable[[Tensor], Tensor]:

@@ -1,6 +1,5 @@
 """One recording, read once and judged; what a worker process does."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -47,12 +46,11 @@ class Inspection:
         return Recording(**place, **given, findings=findings)
 
 
-def judge(job: Inspection, report: Callable[[float], None]) -> Recording:
+def judge(job: Inspection) -> Recording:
     """Read a recording, judge it by its samples as they are stored, in float32, and keep them.
 
     Args:
         job: The recording.
-        report: Called with the work done.
 
     Returns:
         What is kept of it, and why. A file that cannot be used is a rejected recording; where the
@@ -62,11 +60,8 @@ def judge(job: Inspection, report: Callable[[float], None]) -> Recording:
         log = job.entry.read()
     except InputError as error:
         key = "" if _of_the_system(error.__cause__) else job.key
-        recording = job.recording(Finding("file", REJECTED, printable(str(error))), key=key)
-    else:
-        recording = _judged(log, job)
-    report(job.work)
-    return recording
+        return job.recording(Finding("file", REJECTED, printable(str(error))), key=key)
+    return _judged(log, job)
 
 
 def _of_the_system(cause: BaseException | None) -> bool:

@@ -61,7 +61,7 @@ def inspect_logs(
         logger.info("%s: %d of %d recordings were read before", files.sensor, before, len(jobs))
     sizes = [job.entry.size for job in missing]
     if sum(sizes) < _WORTH_PROCESSES:
-        yield from (judge(job, lambda work: None) for job in missing)
+        yield from map(judge, missing)
     else:
         at_once = int(np.clip(_BYTES_AT_ONCE // max(sizes), 1, _AT_ONCE))
         read = run_jobs(missing, judge, execution, files.sensor, "recordings", at_once)

@@ -63,6 +63,8 @@ def _compared(kind: str) -> dict[str, Caption]:
     for study, whose, more in (
         ("estimators", "estimators", ""),
         ("unseen_devices", "estimators on unseen devices", f" {_UNSEEN}"),
+        ("networks", "networks", ""),
+        ("sweep", "a sweep", ""),
     ):
         text = _RATIOS.format(study=study) if kind == "tables" else _ESTIMATORS
         for sensor, name in _NAMES.items():

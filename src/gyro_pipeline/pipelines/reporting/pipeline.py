@@ -30,6 +30,8 @@ TABLES: _Makers = {
     "real2real": {tables.generalization: ["results", "measured_elsewhere", "published"]},
     "estimators": {tables.comparison: ["results", "measured_elsewhere"]},
     "unseen_devices": {tables.comparison: ["results", "measured_elsewhere"]},
+    "networks": {tables.comparison: ["results", "measured_elsewhere"]},
+    "sweep": {tables.comparison: ["results", "measured_elsewhere"]},
 }
 FIGURES: _Makers = {
     "augmentation": {
@@ -50,7 +52,7 @@ FIGURES: _Makers = {
 OF_EACH_SENSOR = {"tables": tables.ratios, "figures": figures.estimators}
 """What studies that compare estimators have for each of their sensors, named after it."""
 
-COMPARED = ("estimators", "unseen_devices")
+COMPARED = ("estimators", "unseen_devices", "networks", "sweep")
 
 _SHOWN = "sparkfun"
 """Whose signals the figures of signals show."""

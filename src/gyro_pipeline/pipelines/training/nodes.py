@@ -20,7 +20,13 @@ from gyro_pipeline.conventions import (
     UNSEEN,
     InputError,
 )
-from gyro_pipeline.estimators import ESTIMATORS, entry, estimator_class, make_estimator
+from gyro_pipeline.estimators import (
+    entry,
+    estimator_class,
+    make_estimator,
+    own_classes,
+    settings_of,
+)
 from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.estimators.fitting import FitJob, run_fits
 from gyro_pipeline.estimators.training import TrainingSet
@@ -181,14 +187,15 @@ def _content(spec: RunSpec, sets: TrainingSets, settings: Training) -> list[Any]
     estimator = estimator_class(spec.estimator)
     used = [sets.recordings, *([sets.virtual] if spec.virtual_imus and sets.virtual else [])]
     # an estimator of one's own may use any of ours by its name
-    ours = [] if spec.estimator in ESTIMATORS else ["gyro_pipeline.estimators"]
+    ours = ["gyro_pipeline.estimators"] if own_classes([spec.estimator]) else []
+    fitting = ["gyro_pipeline.estimators.fitting", estimator.__module__, *ours]
     return [
-        code_hash(__name__, "gyro_pipeline.estimators.fitting", entry(spec.estimator), *ours),
+        code_hash(__name__, *fitting, entry(spec.estimator)),
         {name: value for name, value in vars(spec).items() if name not in ("study", "seed")},
         [(data.attrs["data_hash"], _labels_hash(data)) for data in used],
         {fold: _hash(training.windows) for fold, training in sets.of(spec).items()},
         _hash(_tests(sets.table_of(spec))),
-        [spec.seed, settings.model_dump()] if estimator.seeded else [],
+        [spec.seed, settings_of(spec.estimator, settings)] if estimator.seeded else [],
     ]
 
 
@@ -292,15 +299,13 @@ def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
             now = time.time()
             yield fitted(key, fold, _loaded(elsewhere[key], fold), now, now)
     jobs = [
-        FitJob(
-            key, fold, specs[key].estimator, settings, specs[key].seed, sets.of(specs[key])[fold]
-        )
-        for key in missing
-        if key not in shared
+        FitJob(key, _name(spec), fold, spec.estimator, settings, spec.seed, sets.of(spec)[fold])
+        for key, spec in specs.items()
+        if key in missing and key not in shared
         for fold in missing[key]
     ]
     for job, fit in run_fits(jobs, execution, label):
-        yield fitted(job.name, job.fold, fit.estimator, fit.started, fit.ended)
+        yield fitted(job.key, job.fold, fit.estimator, fit.started, fit.ended)
 
 
 def _loaded(run: StoredRun, fold: str) -> Estimator:

@@ -1,7 +1,7 @@
-"""The paper's network as an estimator."""
+"""A network, any ``nn.Module`` of PyTorch, as an estimator."""
 
 import copy
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Hashable, Mapping
 from typing import Any, Self
 
 import numpy as np
@@ -17,25 +17,31 @@ from gyro_pipeline.conventions import (
     VALIDATION,
     InputError,
 )
-from gyro_pipeline.estimators.base import Estimator, Windows, unheard
+from gyro_pipeline.estimators.base import Estimator, Windows
 from gyro_pipeline.estimators.training import TrainingSet
+from gyro_pipeline.learning.design import Design, network_class, options_of
 from gyro_pipeline.learning.examples import Device, with_shuffled_labels
 from gyro_pipeline.learning.jobs import StoredNetwork, TrainedNetwork, TrainingJob, run_training
 from gyro_pipeline.parameters import Training
 
 
-class PaperNetwork(Estimator):
-    """The paper's network (section III-D), the same estimate for every target; it has no sigma.
+class ModuleEstimator(Estimator):
+    """A network trained as the paper's is (section III-D); it has no sigma.
 
-    Where the training set names IMUs side by side (method 1) they are one input, and a window is
-    used if all of them have it; else every IMU is a device of its own. The device validates, with
-    its windows of that role, and the others do not.
+    It gives the same estimate for every target. Where the training set names IMUs side by side
+    (method 1) they are one input, and a window is used if all of them have it; else every IMU is a
+    device of its own. The device validates, with its windows of that role, and the others do not.
 
     Args:
-        training: Sizes and schedule.
+        network: ``package.module:Class``, see :class:`gyro_pipeline.learning.design.Design`.
+        training: Schedule, and the sizes of a network whose options have no defaults.
         seed: Of the initial weights and the order of the examples.
         shuffled: Whether biases are permuted between training recordings, by the same seed: a leak
             detector, see :func:`gyro_pipeline.learning.examples.with_shuffled_labels`.
+        **options: Of the network.
+
+    Raises:
+        InputError: The network has no such option.
     """
 
     uses = ALL
@@ -43,8 +49,12 @@ class PaperNetwork(Estimator):
     side_by_side = True
     uses_prior = True  # the centres, and what it learned of the biases' spread
 
-    def __init__(self, training: Training, seed: int, shuffled: bool = False) -> None:
-        self._settings, self._seed, self._shuffled = training, seed, shuffled
+    def __init__(
+        self, network: str, training: Training, seed: int, shuffled: bool = False, **options: Any
+    ) -> None:
+        self._path, self._settings, self._seed, self._shuffled = network, training, seed, shuffled
+        self._options = options_of(network, training, options)
+        self.settings = training.schedule | self._options
         self._weights = LAST
         self._artifact: Mapping[str, Any] = {}
         self._network: StoredNetwork | None = None
@@ -52,6 +62,11 @@ class PaperNetwork(Estimator):
     def __getstate__(self) -> dict[str, Any]:
         """Without the network that the weights were put into."""
         return vars(self) | {"_network": None}
+
+    @property
+    def source(self) -> type:
+        """The network's class, whose file is stored with it where it is not of this package."""
+        return network_class(self._path)
 
     @property
     def best_epoch(self) -> int | None:
@@ -73,11 +88,7 @@ class PaperNetwork(Estimator):
             raise InputError(
                 "with centring per_device a device needs at least two training recordings, got one"
             )
-
-    def fit(self, training: TrainingSet, report: Callable[[float], None] = unheard) -> Self:
-        """See :meth:`Estimator.fit`; on one thread of the processor."""
-        self.check(training)
-        return self.trained(run_training(self.job(training), report))
+        self.job(training).design.check()
 
     def work(self, training: TrainingSet) -> float:
         """See :meth:`Estimator.work`."""
@@ -92,11 +103,12 @@ class PaperNetwork(Estimator):
             generator = np.random.default_rng(self._seed)
             devices = [with_shuffled_labels(device, generator) for device in devices]
             cell = training.key, self._seed  # a seed has labels of its own
+        gyroscopes = devices[0].biases.shape[1]
+        options = options_of(self._path, self._settings, self._options, training.rate_hz)
         return TrainingJob(
-            name="",
+            design=Design(self._path, gyroscopes, training.size, options),
             devices=devices,
             validation=watched[0] if watched else None,
-            window=training.size,
             settings=self._settings,
             seed=self._seed,
             cell=cell,
@@ -119,8 +131,11 @@ class PaperNetwork(Estimator):
         best._weights, best._network = BEST, None
         return {LAST: self, BEST: best}
 
+    def _fit(self, training: TrainingSet) -> None:
+        self.trained(run_training(self.job(training)))
+
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
-        self._demand_size(windows, self._artifact["architecture"]["window"])
+        self._demand_size(windows, self._artifact["network"]["window"])
         if self._network is None:
             self._network = StoredNetwork(self._artifact, self._weights)
         return self._network.biases(windows.samples), np.nan
@@ -131,8 +146,8 @@ def _devices(training: TrainingSet, role: str, only_device: bool = False) -> lis
     windows = training.windows[(training.windows.role == role).to_numpy()]
     inputs = windows[["origin", "imu"]].drop_duplicates().to_numpy().tolist()
     together = training.side_by_side or (training.device,)
-    own = _windows_of_all(windows, together)
-    devices = [_device(training.real, together, own)] if len(own) else []
+    shared = _windows_of_all(windows, together)
+    devices = [_device(training.real, together, shared)] if len(shared) else []
     if only_device or training.side_by_side:
         return devices
     for origin, imu in inputs:

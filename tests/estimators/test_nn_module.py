@@ -1,13 +1,13 @@
-"""The paper's network as an estimator: which windows train and validate it, and as what."""
+"""A network as an estimator: which windows train and validate it, and as what."""
 
 import numpy as np
 import pytest
 
 from gyro_pipeline.conventions import BEST, BIAS, LAST, MDPS, RECORDING_MEAN, TRAIN, InputError
 from gyro_pipeline.conventions import VALIDATION as VALIDATE
-from gyro_pipeline.estimators import make_estimator
+from gyro_pipeline.estimators import make_estimator, settings_of
 from gyro_pipeline.estimators.base import Estimator
-from gyro_pipeline.estimators.paper_network import PaperNetwork
+from gyro_pipeline.estimators.nn_module import ModuleEstimator
 from gyro_pipeline.estimators.training import TrainingSet
 from gyro_pipeline.parameters import Training
 from gyro_pipeline.physics.allan import NoiseFigures
@@ -32,8 +32,11 @@ def training(training_set, recordings):
     return training_set(recordings, roles=ROLES)
 
 
-def network(**changes):
-    return PaperNetwork(SETTINGS.model_copy(update=changes), seed=0)
+PAPER = "gyro_pipeline.learning.network:CalibrationNetwork"
+
+
+def network(seed=0, shuffled=False, **changes):
+    return ModuleEstimator(PAPER, SETTINGS.model_copy(update=changes), seed, shuffled)
 
 
 def side_by_side(training, windows=None, imus=(1, 2, 3)):
@@ -59,7 +62,7 @@ def test_side_by_side_a_window_is_used_if_all_have_it(training):
     (device,) = job.devices
     assert device.imus == (1, 2, 3)
     assert [len(starts) for starts in device.starts] == [3, 3, 3, 2, 3, 3, 3, 3]
-    assert job.architecture.gyroscopes == 9
+    assert job.design.gyroscopes == 9
     assert device.biases.shape == (8, 9)
 
 
@@ -92,27 +95,16 @@ def test_a_saved_one_has_the_weights_of_both_epochs(training, recordings, tmp_pa
     assert fitted.history is not None
 
 
-def test_without_validation_there_is_one_variant(training_set, recordings):
-    fitted = network().fit(training_set(recordings))
-    assert list(fitted.variants()) == [LAST]
-    assert fitted.best_epoch is None
-
-
-def test_asked_for_steps_it_makes_at_least_so_many(training):
-    fitted = network(steps=100).fit(training)  # 72 windows are 9 batches
-    assert len(fitted.history) == 12
-
-
 def test_shuffled_labels_are_those_of_the_recordings(training):
     plain = network().job(training)
-    shuffled = PaperNetwork(SETTINGS, seed=0, shuffled=True).job(training)
-    other = PaperNetwork(SETTINGS, seed=1, shuffled=True).job(training)
+    shuffled = network(shuffled=True).job(training)
+    other = network(1, shuffled=True).job(training)
     for one, two in zip(plain.devices, shuffled.devices, strict=True):
         assert not np.array_equal(one.biases, two.biases)
         np.testing.assert_array_equal(np.sort(one.biases, axis=0), np.sort(two.biases, axis=0))
     np.testing.assert_array_equal(plain.validation.biases, shuffled.validation.biases)
     assert len({plain.cell, shuffled.cell, other.cell}) == 3
-    assert plain.cell == PaperNetwork(SETTINGS, seed=5).job(training).cell
+    assert plain.cell == network(5).job(training).cell
 
 
 def test_what_it_cannot_be_fitted_to_is_refused_before(training, training_set, recordings):
@@ -131,6 +123,52 @@ def test_windows_of_another_length_are_refused(training, recordings):
         fitted.estimate(recordings.angular_rate.to_numpy()[0, :, :, :150])
 
 
-def test_the_names_of_both_are_those_of_the_list():
-    assert isinstance(make_estimator("cnn", SETTINGS, 0), PaperNetwork)
+def test_a_name_says_what_is_made_and_settings_that_follow_it_change_that(training):
+    plain = make_estimator("cnn", SETTINGS, 0)
+    assert plain.settings == {
+        **{name: getattr(SETTINGS, name) for name in SETTINGS.schedule},
+        **{"channels": 4, "kernel": 6, "stride": 5, "pool": 2, "hidden": 8},
+    }
     assert make_estimator("cnn_shuffled", SETTINGS, 0)._shuffled
+    wide = make_estimator("cnn learning_rate=1e-2 channels=6", SETTINGS, 0)
+    changes = {"learning_rate": 0.01, "channels": 6}
+    assert wide.settings == settings_of("cnn learning_rate=1e-2 channels=6", SETTINGS)
+    assert wide.settings == plain.settings | changes
+    assert wide.job(training).design.options["channels"] == 6
+    lstm = make_estimator("lstm units=5 centring=global", SETTINGS, 0)
+    assert lstm.settings == SETTINGS.schedule | {
+        **{"units": 5, "layers": 1, "block_s": 0.1, "centring": "global"}
+    }
+    assert lstm.job(training).design.options["rate_hz"] == RATE
+    assert make_estimator("best_linear warm_up=true", SETTINGS, 0)._warm_up is True
+    assert settings_of("best_linear", SETTINGS) == {}
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("cnn channels", "'cnn channels': expected key=value once, got 'channels'"),
+        ("cnn hidden=1 hidden=2", "expected key=value once, got 'hidden=2'"),
+        ("cnn width=3", "has no option 'width'; it has channels, kernel, stride, pool, hidden"),
+        ("cnn epochs=0", "epochs Input should be greater than or equal to 1"),
+        ("ridge epochs=3", "unexpected keyword argument 'epochs'"),
+    ],
+)
+def test_settings_that_nothing_takes_are_refused(name, told):
+    with pytest.raises(InputError, match=told):
+        make_estimator(name, SETTINGS, 0)
+
+
+def test_every_network_learns_is_saved_and_estimates_again(training, recordings, tmp_path):
+    windows = recordings.angular_rate.to_numpy()[0, :, :, :SIZE]
+    estimates = {}
+    for name in ("cnn", "single_gyroscope", "lstm", "tcn"):
+        settings = SETTINGS.model_copy(update={"epochs": 3})
+        fitted = make_estimator(name, settings, 0).fit(training)
+        fitted.save(tmp_path / name)
+        estimates[name] = fitted.estimate(windows)[0]
+        np.testing.assert_array_equal(
+            Estimator.load(tmp_path / name).estimate(windows)[0], estimates[name]
+        )
+    distinct = {values.tobytes() for values in estimates.values()}
+    assert len(distinct) == len(estimates)
