@@ -133,9 +133,10 @@ class Bench:
         Raises:
             InputError: There is no estimate for some window.
         """
+        told = {fold: self._told(str(fold), fit) for fold, fit in estimators.items()}
         parts = []
         for recording, truths in zip(self.tested, self._truths, strict=True):
-            estimates = self._estimates(estimators, recording, imus)
+            estimates = self._estimates(told, recording, imus)
             parts += [
                 error_columns(recording, truth, value, *estimates[TARGET_OF[truth]])
                 for truth, value in truths.items()
@@ -148,6 +149,14 @@ class Bench:
                 "leave the estimator out of the study"
             )
         return errors
+
+    def _told(self, fold: str, estimator: Estimator) -> Estimator:
+        """The fit of a fold, told of the recordings that test there: past ones to later ones."""
+        numbers = np.unique(self.tests.recording[self.tests.fold == fold])
+        if len(self.device.imus) > 1:
+            return estimator
+        means = {recording.number: recording.mean for recording in self.tested}
+        return estimator.with_calibrations(numbers, np.stack([means[n] for n in numbers.tolist()]))
 
     def _estimates(
         self, estimators: Mapping[str, Estimator], recording: TestRecording, imus: int

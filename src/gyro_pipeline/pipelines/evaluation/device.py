@@ -195,11 +195,10 @@ def _history(
     models: Sequence[RecordingModel], means: pd.DataFrame, tested: pd.DataFrame
 ) -> np.ndarray:
     """Variance of a bias given the calibrations before it, mean over the tested ones, (axes,)."""
-    known = pd.concat([means, tested[~tested.index.isin(means.index)]]).sort_index()
-    numbers, variances = known.index.to_numpy(), []
+    variances = []
     for model, axis in zip(models, AXES, strict=True):
         fitted = BiasHistory.fit(means.index.to_numpy(), means[axis].to_numpy(), model)
-        history = replace(fitted, numbers=numbers, labels=known[axis].to_numpy())
+        history = fitted.extended(tested.index.to_numpy(), tested[axis].to_numpy())
         priors = [history.prior(model, number) for number in tested.index.tolist()]
         variances.append(np.mean([prior.covariance[0, 0] for prior in priors]))
     return np.array(variances)
