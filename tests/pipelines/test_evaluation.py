@@ -31,7 +31,7 @@ from gyro_pipeline.physics.recording_model import (
 )
 from gyro_pipeline.pipelines.evaluation.bench import SCORES, Bench
 from gyro_pipeline.pipelines.evaluation.device import describe_devices, training_labels
-from gyro_pipeline.pipelines.evaluation.nodes import evaluate
+from gyro_pipeline.pipelines.evaluation.nodes import below_the_ceiling, evaluate
 from gyro_pipeline.pipelines.ground_truth.nodes import measure_allan_variance
 from gyro_pipeline.protocol.scores import squared_errors
 from gyro_pipeline.studies import CNN, MEAN
@@ -538,6 +538,43 @@ def test_only_the_tested_imus_outputs_of_method_1_count(world, make_study):
     errors = run.artifacts[ERRORS]
     assert errors.groupby(["weights", "truth", "recording", "start"]).size().eq(3).all()
     assert run.metrics["rmse_mdps"] < 50  # IMU 2's biases are off by more
+
+
+# priors, history, and results beyond a ceiling
+
+
+def test_a_sensor_that_was_turned_is_told_from_others_and_history_follows_it(
+    world, make_world, make_study
+):
+    raw = world.raw.copy(deep=True)
+    raw.angular_rate[0, 10:, 0] += 0.05  # x of the recordings that test
+    names = ["training_mean", "last_calibration"]
+    judged = make_world(raw, study=make_study("some", names)).judged()
+    conflict = judged["training_mean"].tags["prior_conflict"]
+    assert conflict.startswith("test recordings contradict the prior on x (p = ")
+    assert f"the running mean gives {judged[MEAN].metrics['rmse_mdps']:.3g}" in conflict
+    assert "prior_conflict" not in judged[MEAN].tags  # which uses none
+    scores = by_name(judged["training_mean"].artifacts[TABLE])[PAPER, ALL]
+    assert scores["prior_p_x"] < 1e-6
+    assert scores["prior_p_z"] > 1e-2
+    assert scores["constant_rmse_dps"] == pytest.approx(scores["test_rmse_dps"])
+    means = raw.angular_rate.sel(imu=1).mean("sample", dtype=np.float64).to_numpy()
+    errors = judged["last_calibration"].artifacts[ERRORS].query("truth == 'paper' and start == 0")
+    np.testing.assert_allclose(errors.error_dps, np.ravel(means[9:13] - means[10:]), atol=1e-12)
+    own = make_world(world.raw, study=make_study("some", names[:1])).judged()["training_mean"]
+    assert "prior_conflict" not in own.tags
+
+
+def test_an_interval_wholly_beyond_the_ceiling_is_flagged(bench):
+    beyond = bench.scores(bench.errors({"hold-out": Off(bench, 1e-5)}), LAST)
+    assert "all windows, truth paper" in below_the_ceiling(beyond)["below_ceiling"]
+    assert not below_the_ceiling(bench.scores(bench.mean_errors, LAST))
+    scores = by_name(beyond)[PAPER, ALL]
+    for name in ("joint", "history"):
+        assert -20 < scores[f"ceiling_{name}_accuracy_gain_pct"] < 90
+    assert -1 <= scores["turn_on_correlation_xz"] <= 1
+    by_axis = [1 - scores[f"accuracy_gain_pct_{axis}"] / 100 for axis in "xyz"]
+    assert 0 < min(by_axis) <= 1 - scores["accuracy_gain_pct"] / 100 <= max(by_axis)
 
 
 # folds and devices

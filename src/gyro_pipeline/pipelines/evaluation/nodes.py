@@ -164,7 +164,7 @@ def _judge(run: StoredRun, spec: RunSpec, bench: Bench, judged_with: str) -> Eva
         artifacts[CURVE] = bench.curve
     tags = {EVALUATED_WITH: judged_with, "ceiling": bench.ceilings.basis}
     tags |= {"recommended": str(first.recommended)} | _off_the_curve(metrics)
-    tags |= _below_the_ceiling(table)
+    tags |= below_the_ceiling(table)
     if first.uses_prior:
         tags |= {"uses_prior": ORIENTATION_NOTE} | _conflict(table, run)
     logger.info(
@@ -195,8 +195,15 @@ def _value(scores: pd.DataFrame, score: str, windows: str, column: str = "value"
     return float(chosen[column].iloc[0]) if chosen[column].notna().any() else np.nan
 
 
-def _below_the_ceiling(scores: pd.DataFrame) -> dict[str, str]:
-    """In words, where a result's interval lies wholly below the ceiling's."""
+def below_the_ceiling(scores: pd.DataFrame) -> dict[str, str]:
+    """In words, where a result's interval lies wholly beyond the ceiling's.
+
+    Args:
+        scores: From :meth:`gyro_pipeline.pipelines.evaluation.bench.Bench.scores`.
+
+    Returns:
+        The tag ``below_ceiling``, or none.
+    """
     gains = scores[scores.weights == LAST].set_index(["truth", "windows", "score"])
     below = []
     for truth, windows in product((PAPER, TRUE), (FIRST, ALL)):
