@@ -73,9 +73,9 @@ def table_of(roles, window_s):
 def benches(recordings, parameters):
     def made(window_s):
         table = table_of(HONEST, window_s)
-        device = describe_devices(recordings, None, None, table, seed=1)
+        device = describe_devices(recordings, None, None, table)
         tests = table[table.role == TEST]
-        return Bench(recordings, device, tests, window_s, parameters().evaluation)
+        return Bench(recordings, device, tests, window_s)
 
     return {window_s: made(window_s) for window_s in (10.0, 30.0)}
 

@@ -499,6 +499,9 @@ class Study(Parameter):
         None, ge=2, description="of the first IMU; the first so many; null: the split decides"
     )
     folds: int | None = Field(None, ge=2, description="its own; null: those of splits")
+    training_windows: Literal["all", "first"] | Seconds | None = Field(
+        None, description="its own; null: those of splits"
+    )
     training: dict[str, Any] = Field({}, description="settings of training that it changes")
     sweep: dict[str, list[str | float | int | bool]] = Field(
         {},
@@ -557,7 +560,8 @@ class Study(Parameter):
 
         Where windows of all roles are at a stride, this is the one at which they train.
         """
-        windows = "all" if self.strides_s else base.training_windows
+        windows = self.training_windows or base.training_windows
+        windows = "all" if self.strides_s else windows
         changed = {"folds": self.folds or base.folds, "training_windows": windows}
         return base.model_copy(update=changed)
 

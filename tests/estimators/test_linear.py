@@ -112,6 +112,46 @@ def test_history_follows_a_bias_that_walks(simulate, judged, training_set):
     assert history < 0.5 * constant
 
 
+def test_history_goes_on_with_calibrations_made_since_the_fit(simulate, training_set):
+    recordings = simulate(WHITE, 12)
+    walk = np.random.default_rng(1).normal(0, 2 * MDPS, (1, 12, 3)).cumsum(axis=1)
+    recordings["angular_rate"] = recordings.angular_rate + walk[..., None]
+    labels = recordings.angular_rate.mean("sample", dtype=np.float64).to_numpy()[0]
+    windows = recordings.angular_rate.to_numpy()[0, 11:, :, :SIZE]
+    for estimator in (BestLinear(history=True), LastCalibration()):
+        fitted = estimator.fit(training_set(recordings.isel(recording=slice(8))))
+        told = fitted.with_calibrations(np.arange(9, 13), labels[8:])
+        stale, current = (one.estimate(windows, recording=12)[0] for one in (fitted, told))
+        assert np.abs(current - labels[10]).max() < np.abs(stale - labels[10]).max()
+        # its own calibration and later ones do not count
+        other = fitted.with_calibrations(np.arange(9, 13), labels[8:] + [[0], [0], [0], [9]])
+        np.testing.assert_array_equal(other.estimate(windows, recording=12)[0], current)
+        np.testing.assert_array_equal(
+            told.estimate(windows, recording=5)[0], fitted.estimate(windows, recording=5)[0]
+        )
+    mean = TrainingMean().fit(training_set(recordings))
+    assert mean.with_calibrations(np.arange(9, 13), labels[8:]) is mean
+
+
+def test_a_fallback_costs_little_where_the_prior_holds_and_saves_where_it_does_not(
+    simulate, judged, training_set
+):
+    recordings = simulate(WHITE, 80, seed=4)
+    training, tested = (
+        recordings.isel(recording=slice(40)),
+        recordings.isel(recording=slice(40, 80)),
+    )
+    turned = tested.copy(deep=True)
+    turned["angular_rate"] = turned.angular_rate + np.float32(15 * MDPS)
+    plain, fallback = (BestLinear(fallback=f).fit(training_set(training)) for f in (False, True))
+    assert rms(judged(fallback, tested, 10)[0]) < 1.03 * rms(judged(plain, tested, 10)[0])
+    errors, sigma = judged(fallback, turned, 10)
+    assert rms(errors) < 0.3 * rms(judged(plain, turned, 10)[0])
+    assert np.mean(np.abs(errors) < 1.96 * sigma) > 0.85
+    with pytest.raises(InputError, match="expected no history"):
+        BestLinear(history=True, fallback=True)
+
+
 def test_an_unknown_noise_is_refused():
     with pytest.raises(InputError, match="expected 'reml' or 'allan', got 'white'"):
         BestLinear(noise="white")

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from gyro_pipeline.conventions import DISJOINT, MDPS, PAPER, TRUE, InputError
 from gyro_pipeline.physics.allan import NoiseFigures
@@ -13,6 +14,7 @@ from gyro_pipeline.physics.recording_model import (
     block_edges,
     block_means,
     constant_bias,
+    joint_squares,
     mean_squares,
     noise_covariances,
 )
@@ -120,26 +122,6 @@ def test_on_white_noise_it_is_the_oracle_of_the_closed_form(truth, start):
     np.testing.assert_allclose(best_linear(WHITE, start, size, truth)(windows), expected)
 
 
-@pytest.mark.parametrize("name", ["coloured", "warming"])
-@pytest.mark.parametrize("start", [0, 600])
-@pytest.mark.parametrize("truth", TRUTHS)
-def test_monte_carlo_has_the_expected_errors(name, start, truth):
-    model, size, count = MODELS[name], 200, 8000
-    rates, bias = simulated(model, count, seed=2)
-    aim = truth_of(rates, bias, start, size, truth)
-    windows = rates[:, start : start + size]
-    line = best_linear(model, start, size, truth)
-    error = line(windows) - aim
-    assert abs(error.mean()) < 4 * error.std() / np.sqrt(count)
-    assert np.mean(error**2) == pytest.approx(line.variance, rel=0.06)
-    own = np.mean((windows.mean(axis=1) - aim) ** 2)
-    best, mean = mean_squares(model, start, size, truth)
-    noise = line.variance - best  # of the truth itself
-    assert (noise > 0) == (truth == DISJOINT)
-    assert own == pytest.approx(mean + noise, rel=0.06)
-    assert best < mean
-
-
 @pytest.fixture(scope="module")
 def many():
     """20,000 recordings of flicker, random walk and warm-up, at two samples a second."""
@@ -177,28 +159,35 @@ def test_squares_of_many_priors_are_those_of_each(name, truth):
         np.testing.assert_allclose([squares[i] for squares in together], alone)
 
 
+@pytest.mark.parametrize("truth", [PAPER, TRUE])
+def test_jointly_over_axes_it_is_the_dense_solution_of_all_of_them(truth):
+    """Biases correlated over axes, one of which warms up as well."""
+    models = [COLOURED, WARMING, WHITE]
+    prior = TAU**2 * (0.8 + 0.2 * np.eye(3))
+    edges = np.arange(0, SAMPLES + 1, 10)
+    inside = np.tile((edges[:-1] >= 200) & (edges[1:] <= 400), 3)
+    noise = block_diag(*[model.noise_covariance(edges) for model in models])
+    decay = np.zeros_like(noise)
+    own = slice(120, 240)
+    decay[own, own] = np.outer(*2 * [WARMING.profiles(edges)[:, 1]]) * WARMING.covariance[1, 1]
+    joint = noise + decay + np.kron(prior, np.ones((120, 120)))
+    aims = np.kron(np.eye(3), np.ones((1, 120)) / 120)
+    shared, variance = aims @ joint, aims @ joint @ aims.T
+    if truth == TRUE:
+        shared, variance = np.kron(prior, np.ones((1, 120))), prior
+    seen = np.linalg.solve(joint[np.ix_(inside, inside)], shared[:, inside].T)
+    expected = np.trace(variance - shared[:, inside] @ seen) / 3
+    found = joint_squares(models, 200, 200, truth, np.stack([prior, np.diag(np.diag(prior))]))
+    assert found[0] == pytest.approx(expected, rel=1e-9)
+    alone = [mean_squares(one, 200, 200, truth)[0] for one in models]
+    assert found[1] == pytest.approx(np.mean(alone))
+    assert found[0] < found[1]
+
+
 def test_the_mean_of_a_recording_scatters_about_the_bias_as_simulated(many):
     model, rates, bias = many
     assert (rates.mean(axis=1) - bias).var() == pytest.approx(model.averaging_variance(), rel=0.03)
     assert WHITE.averaging_variance() == pytest.approx(N**2 / (SAMPLES / RATE))
-
-
-def test_the_averaging_noise_of_the_disjoint_truth_is_that_of_the_model():
-    edges = np.array([0, 200, SAMPLES])
-    own = COLOURED.noise_covariance(edges)[1, 1]
-    best, _ = mean_squares(COLOURED, 0, 200, DISJOINT)
-    assert best_linear(COLOURED, 0, 200, DISJOINT).variance - best == pytest.approx(own)
-
-
-def test_coloured_noise_lowers_what_a_window_can_gain():
-    def ratio(model):
-        best, mean = mean_squares(model, 0, 200, PAPER)
-        return best / mean
-
-    known = constant_bias(SAMPLES, RATE, COLOURED.noise, 0.0, 1e-9)
-    bias_known = constant_bias(SAMPLES, RATE, WHITE.noise, 0.0, 1e-9)
-    assert ratio(bias_known) == pytest.approx(200 / SAMPLES, rel=1e-3)  # r
-    assert ratio(known) > 2 * ratio(bias_known)
 
 
 def test_a_window_of_the_whole_recording_knows_its_mean():

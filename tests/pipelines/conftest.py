@@ -102,7 +102,7 @@ class World:
 
     def evaluate(self, runs: Sequence[StoredRun]) -> list[EvaluatedRun]:
         given = self.plan, list(runs), self.recordings, self.windows, self.bias
-        return list(evaluate(*given, self.allan, self.evaluation))
+        return list(evaluate(*given, self.allan))
 
     def judged(self) -> dict[str, EvaluatedRun]:
         """All runs, trained and evaluated, by estimator, the last of each."""

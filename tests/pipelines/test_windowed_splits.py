@@ -16,6 +16,7 @@ from gyro_pipeline.pipelines.ground_truth.nodes import measure_allan_variance
 from gyro_pipeline.pipelines.virtual_gyros.nodes import synthesise
 from gyro_pipeline.pipelines.windowed_splits.nodes import cut_to_common_length, split_windows
 from gyro_pipeline.pipelines.windowed_splits.protocols import check_table
+from gyro_pipeline.protocol.copies import near_copies
 from gyro_pipeline.protocol.splits import split_recordings
 
 RATE_HZ = 20.0
@@ -205,14 +206,34 @@ def test_all_windows_train_and_test_where_the_test_set_is_in_training(make, tabl
 # what is refused
 
 
-def test_a_copy_with_another_role_is_refused(make, table_of):
+KINDS = {
+    "exact": lambda rates: rates,
+    "a little noise": lambda rates: rates + np.random.default_rng(3).normal(0, 1e-5, rates.shape),
+    "an offset": lambda rates: rates + 0.1,
+    "a shift": lambda rates: np.roll(rates, 1, axis=-1),
+    "resampled": lambda rates: (rates + np.roll(rates, 1, axis=-1)) / 2,
+    "a factor": lambda rates: rates * (1 + 1e-9),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_copy_with_another_role_is_refused(make, table_of, kind):
     recordings = make(100).copy(deep=True)
-    copied = recordings.angular_rate.sel(imu=1, recording=90)
+    copied = KINDS[kind](recordings.angular_rate.sel(imu=1, recording=90).to_numpy())
+    recordings.angular_rate.loc[{"imu": 2, "recording": 91}] = copied
+    table_of(recordings)  # both test
     recordings.angular_rate.loc[{"imu": 2, "recording": 3}] = copied
-    with pytest.raises(
-        InputError, match=r"(90 \(test\)|3 \(train\)) holds the same samples as IMU"
-    ):
+    message = r"IMU 2 recording 3 \(train\) is a copy of IMU 1 recording 90 \(test\)"
+    with pytest.raises(InputError, match=message):
         table_of(recordings)
+
+
+def test_a_hum_and_a_drift_that_recordings_share_make_no_copies():
+    generator, time_s = np.random.default_rng(0), np.arange(4096) / 150
+    rates = generator.normal(0, 0.04, (40, 1, 4096)) + 0.5
+    phases = generator.uniform(0, 0.1, (40, 1, 1))
+    rates += 0.4 * np.sin(2 * np.pi * 50.3 * time_s + phases) + 0.2 * np.exp(-time_s / 30)
+    assert near_copies(rates) == []
 
 
 ROWS = [
@@ -237,7 +258,7 @@ ROWS = [
 )
 def test_what_has_two_roles_in_a_fold_is_refused(apart, row, message):
     rows = [one for one in ROWS if apart == "recording" or one[3] != 1 or one[1] == TEST]
-    contents = {(imu, number): f"{imu} {number}" for imu in (1, 2) for number in (1, 2, 3)}
+    contents = pd.DataFrame(columns=["imu", "recording", "copies"])
 
     def check(rows):
         columns = ["fold", "role", "origin", "imu", "recording"]

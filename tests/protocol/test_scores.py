@@ -1,19 +1,24 @@
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import stats
 
 from gyro_pipeline.conventions import ALL, DISJOINT, FIRST, MDPS, PAPER, TRUE
 from gyro_pipeline.physics.ceiling import best_gain, best_saving, ceiling_rmse, running_mean_rmse
 from gyro_pipeline.protocol.scores import (
     Curve,
     SquaredErrors,
+    WeightedCurve,
     beats_oracle,
     coverage,
     curve_errors,
-    equivalent_time,
+    gain_difference,
     holm,
+    leave_one_out,
     paired_difference,
-    resampled_weights,
+    prior_conflict,
     rmse_difference,
     score,
     squared_errors,
@@ -108,44 +113,35 @@ def test_curve_errors_choose_truth_and_windows():
 # intervals
 
 
-def test_resamples_redraw_whole_recordings():
-    weights = resampled_weights(20, 300, seed=4)
-    assert weights.shape == (301, 20)
-    assert (weights[0] == 1).all()
-    assert (weights.sum(axis=1) == 20).all()
-    assert weights[1:].std() == pytest.approx(np.sqrt(0.95), rel=0.05)  # multinomial
-    np.testing.assert_array_equal(weights, resampled_weights(20, 300, seed=4))
-    assert not np.array_equal(weights, resampled_weights(20, 300, seed=5))
+def test_an_interval_is_that_of_students_t_where_recordings_weigh_alike():
+    values = np.random.default_rng(0).normal(3, 1, 12)
+    weights = leave_one_out(12)
+    found = with_interval(SquaredErrors(values, np.ones(12)).mean(weights))
+    expected = stats.ttest_1samp(values, 0).confidence_interval(0.95)
+    np.testing.assert_allclose([found.value, found.lo, found.hi], [values.mean(), *expected])
+    squares_of = np.exp(SquaredErrors(values, np.ones(12)).mean(weights))
+    of_logarithm = with_interval(squares_of, positive=True)
+    np.testing.assert_allclose([of_logarithm.lo, of_logarithm.hi], np.exp([found.lo, found.hi]))
+    wide, narrow = with_interval(squares_of, 99), with_interval(squares_of, 90)
+    assert wide.lo < narrow.lo < narrow.hi < wide.hi
 
 
-def test_an_interval_holds_the_central_95_percent_of_the_resamples():
-    found = with_interval(np.array([500.5, *np.random.default_rng(0).permutation(999)]))
-    assert found.value == 500.5
-    assert (found.lo, found.hi) == (24, 974)  # 24 of the 999 lie below, and 24 above
+def test_what_is_not_finite_and_a_single_recording_carry_no_interval():
+    assert leave_one_out(1).tolist() == [[1]]
+    single = with_interval(squares([[3.0, 4.0]]).mean(leave_one_out(1)))
+    assert (single.value, single.lo, single.hi) == (12.5, None, None)
+    for values in ([1.0, np.inf, 2.0], [1.0, 0.0, 2.0]):
+        assert with_interval(np.array(values), positive=True).lo is None
 
 
-def test_infinite_resamples_are_ends_of_the_interval():
-    found = with_interval(np.array([1.0, *[-np.inf] * 10, *range(80), *[np.inf] * 10]))
-    assert (found.lo, found.hi) == (-np.inf, np.inf)
-
-
-def test_a_single_recording_carries_no_interval():
-    weights = resampled_weights(1, 500, seed=0)
-    assert weights.tolist() == [[1]]
-    found = with_interval(squares([[3.0, 4.0]]).mean(weights))
-    assert (found.value, found.lo, found.hi) == (12.5, None, None)
-
-
-def test_the_interval_covers_although_windows_of_a_recording_are_alike():
-    # 10 windows repeat their recording's error: an interval over windows would cover about 45 %.
+def test_intervals_cover_although_windows_of_a_recording_are_alike():
+    """Ten windows repeat their recording's error: an interval over windows would cover 45 %."""
     generator, covered, studies = np.random.default_rng(8), 0, 400
-    weights = resampled_weights(30, 400, seed=2)
     for _ in range(studies):
-        errors = np.repeat(generator.normal(size=(30, 1)), 10, axis=1)
-        found = with_interval(np.sqrt(squares(errors).mean(weights)))
+        errors = np.repeat(generator.normal(size=(20, 1)), 10, axis=1)
+        found = with_interval(np.sqrt(squares(errors).mean(leave_one_out(20))), positive=True)
         covered += found.lo <= 1 <= found.hi
-    # The percentile bootstrap of 30 recordings falls a little short of 95 %.
-    assert 0.82 < covered / studies < 0.98
+    assert 0.92 < covered / studies < 0.98  # 91 % by the percentile bootstrap
 
 
 # equivalent time
@@ -162,32 +158,27 @@ TIMES = np.array([1.0, 2.0, 4.0])
         (1.0, 4.0),
         (0.9, np.inf),  # never reached
         (8.0, -np.inf),  # as good from the start: the curve cannot tell since when
-        (9.0, -np.inf),
     ],
 )
 def test_equivalent_time_by_hand(level, time_s):
-    curve = np.array([[8.0, 4.0, 1.0]])
-    assert equivalent_time(TIMES, curve, np.array([level])).tolist() == pytest.approx([time_s])
+    curve = curve_of(TIMES, [8.0, 4.0, 1.0]).of(PLAIN)
+    assert curve.equivalent_time(2.0, np.array([level / 4])).value == pytest.approx(time_s)
 
 
-def test_equivalent_time_is_the_first_of_several():
-    curve = np.array([[8.0, 2.0, 5.0, 1.0]])
-    times = np.array([1.0, 2.0, 3.0, 4.0])
-    assert equivalent_time(times, curve, np.array([5.0])).tolist() == [1.5]
-
-
-def test_equivalent_times_of_several_curves_do_not_mix():
-    curves = np.array([[8.0, 4.0, 1.0], [1.0, 1.0, 1.0], [3.0, 3.0, 2.0], [9.0, 9.0, 9.0]])
-    levels = np.array([6.0, 2.0, 2.5, 2.0])
-    expected = [1.5, -np.inf, 3.0, np.inf]
-    assert equivalent_time(TIMES, curves, levels).tolist() == expected
+def test_a_rough_curve_is_made_to_fall_so_that_the_mean_saves_no_time_on_itself():
+    rough = WeightedCurve(np.arange(1.0, 7), np.array([[9, 3, 5, 6, 2, 1.0]]), np.ones(6))
+    assert (np.diff(rough.falling) < 0).all()
+    pooled = np.sqrt((9 + 25 + 36) / 3)  # of the second to the fourth, in whose middle it stands
+    np.testing.assert_allclose(rough.falling[[0, 2, 4, 5]], [9, pooled, 2, 1])
+    for window_s in (2.0, 3.0, 4.0):
+        assert rough.equivalent_time(window_s, np.ones(1)).value == pytest.approx(window_s)
 
 
 # figures of merit
 
 
 def test_one_recording_by_hand():
-    curve = curve_of([1, 2, 5, 10, 20], [8, 4, 2, 1, 0.5])
+    curve = curve_of([1, 2, 5, 10, 20], [8, 5**0.5, 2, 1, 0.5])
     scores = scored(squares([[0.6, 0.8, 0.5**0.5, 0.5**0.5]]), squares([[3, 1]]), curve, 2.0, PLAIN)
     # RMSE sqrt(2 / 4) against sqrt(10 / 2); the curve falls from 1 to 0.5 between 10 and 20 s
     rmse, mean = np.sqrt(0.5), np.sqrt(5)
@@ -229,11 +220,11 @@ def test_intervals_hold_the_value_and_pair_the_estimator_with_the_mean():
         squares(mean),
         curve_of([1, 2, 5, 10], [9, 3, 1, 0.1], recordings=25),
         2.0,
-        resampled_weights(25, 400, seed=0),
+        leave_one_out(25),
     )
     rmse = scores["test_rmse_dps"]
     assert rmse.lo < 0.8 * rmse.value < 1.2 * rmse.value < rmse.hi
-    # Half the error in every recording is half of it in every resample of them.
+    # Half the error in every recording is half of it whichever are left out.
     gain = scores["accuracy_gain_pct"]
     np.testing.assert_allclose([gain.lo, gain.value, gain.hi], 50)
     saving, time = scores["time_saving_pct"], scores["equivalent_time_s"]
@@ -258,27 +249,20 @@ def test_on_the_closed_form_curve_the_ceiling_scores_its_closed_form():
     assert scores["accuracy_gain_pct"].value == pytest.approx(100 * best_gain(RHO))
 
 
-def test_a_negative_mean_square_is_reported_not_clipped():
+def test_without_a_positive_square_there_is_no_root_and_nothing_is_clipped():
     table = errors_table(*((r, 0, DISJOINT, 0.1 * r, 0.2) for r in range(1, 6)))
-    negative = squared_errors(table, DISJOINT, ALL)
-    curve = curve_of([1, 2], [2, 1], recordings=5)
-    weights = resampled_weights(5, 300, seed=0)
-    scores = scored(negative, squares(np.ones((5, 1))), curve, 1.0, weights)
+    negative, sure = squared_errors(table, DISJOINT, ALL), squares(np.ones((5, 1)))
+    uncertain = SquaredErrors(np.array([1.0, -0.9, 1.0, -0.9, 0]), np.ones(5), exact=False)
+    curve, weights = curve_of([1, 2], [2, 1], recordings=5), leave_one_out(5)
+    scores = scored(negative, replace(sure, exact=False), curve, 1.0, weights)
     assert set(scores) == {"test_mse_dps2"}
     mse = scores["test_mse_dps2"]
     assert mse.value == pytest.approx(np.mean([0.01, 0.04, 0.09, 0.16, 0.25]) - 0.2)
     assert mse.lo < mse.value < mse.hi
-    assert mse.lo > -0.2  # no square can be less than zero before its truth's variance
-
-
-def test_there_is_no_root_where_the_lower_end_is_negative():
-    uncertain = SquaredErrors(np.array([1.0, -0.9, 1.0, -0.9]), np.ones(4))
-    sure = squares(np.ones((4, 1)))
-    curve, weights = curve_of([1, 2], [2, 1], 4), resampled_weights(4, 300, seed=0)
-    scores = scored(uncertain, sure, curve, 1.0, weights)
-    assert set(scores) == {"test_mse_dps2"}
-    assert scores["test_mse_dps2"].lo < 0 < scores["test_mse_dps2"].value
-    assert set(scored(sure, uncertain, curve, 1.0, weights)) == {"test_mse_dps2"}
+    assert set(scored(uncertain, sure, curve, 1.0, weights)) == {"test_mse_dps2"}
+    assert set(scored(replace(sure, exact=False), uncertain, curve, 1.0, weights)) == {
+        "test_mse_dps2"
+    }
     assert "test_rmse_dps" in scored(sure, sure, curve, 1.0, weights)
 
 
@@ -311,15 +295,31 @@ def test_a_difference_is_paired_over_recordings():
     generator = np.random.default_rng(3)
     hard = generator.uniform(0.1, 10, (30, 1))  # what makes a recording hard for both
     worse = squares(hard * [1.1, -1.1])
-    less = rmse_difference(squares(hard * [1, -1]), worse, resampled_weights(30, 500, 1))
+    better, weights = squares(hard * [1, -1]), leave_one_out(30)
+    less = rmse_difference(better, worse, weights)
     whole = np.sqrt((hard**2).mean())
     assert less.value == pytest.approx(-0.1 * whole)
     assert -0.15 * whole < less.lo < less.value < less.hi < -0.05 * whole
-    own = rmse_difference(worse, worse, resampled_weights(30, 500, 1))
+    own = rmse_difference(worse, worse, weights)
     assert own.value == own.lo == own.hi == 0
-    square = paired_difference(squares(hard * [1, -1]), worse, resampled_weights(30, 500, 1), 99)
+    square = paired_difference(better, worse, weights, 99)
     assert square.value == pytest.approx((1 - 1.1**2) * (hard**2).mean())
     assert square.lo < square.value < square.hi < 0
+    gain = gain_difference(better, worse, squares(2 * hard), weights)
+    np.testing.assert_allclose([gain.lo, gain.value, gain.hi], 5)  # points, of each recording alike
+
+
+def test_a_prior_that_test_recordings_contradict_is_found_and_others_are_not():
+    generator = np.random.default_rng(5)
+    trained, tested = generator.normal(0, 1, (2000, 12, 3)), generator.normal(0, 1, (2000, 6, 3))
+    chances = np.array([prior_conflict(*pair) for pair in zip(trained, tested, strict=True)])
+    np.testing.assert_allclose(
+        (chances < [[[0.01]], [[0.05]], [[0.5]]]).mean(axis=(1, 2)), [0.01, 0.05, 0.5], atol=0.01
+    )
+    turned = prior_conflict(trained[0], tested[0] + [-6, 6, 0])
+    assert (turned[:2] < 1e-3).all()
+    assert turned[2] == chances[0, 2]
+    assert (prior_conflict(trained[0, :1], tested[0]) == 1).all()  # one recording has no scatter
 
 
 def test_coverage_counts_the_errors_within_the_stated_deviations():

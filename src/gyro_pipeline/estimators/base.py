@@ -141,6 +141,22 @@ class Estimator:
         shape = windows.shape[:2]
         return np.broadcast_to(biases, shape), np.broadcast_to(sigma, shape)
 
+    def with_calibrations(
+        self, numbers: NDArray[np.integer], labels: NDArray[np.float64]
+    ) -> "Estimator":
+        """The estimator, told of calibrations of the device made since it was fitted.
+
+        For a recording only those before it count; so it may be told of all that are judged.
+
+        Args:
+            numbers: Of the recordings, (n,), increasing.
+            labels: Their means, (n, axes), deg/s.
+
+        Returns:
+            Itself, if it does not use past calibrations in their order; else a copy.
+        """
+        return self
+
     def variants(self) -> Mapping[str, "Estimator"]:
         """What is judged: itself, and of a validated network the weights of the best epoch too."""
         return {LAST: self}

@@ -1,5 +1,6 @@
 """Linear estimators on block means: the best linear predictor, and ridge regression."""
 
+import copy
 from dataclasses import replace
 from itertools import product
 from typing import Any, ClassVar
@@ -12,6 +13,7 @@ from gyro_pipeline.estimators.base import Estimator, Windows
 from gyro_pipeline.estimators.training import TrainingSet
 from gyro_pipeline.physics.bias import windows_at
 from gyro_pipeline.physics.history import BiasHistory
+from gyro_pipeline.physics.mixture import mixture_posterior
 from gyro_pipeline.physics.recording_model import (
     BLOCK_S,
     LinearEstimate,
@@ -22,8 +24,11 @@ from gyro_pipeline.physics.recording_model import (
 )
 from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, fit_recording_model
 
-_FLAT = 1e6
-"""Prior standard deviation that tells nothing, in units of the noise of a whole recording."""
+_FLAT = 1e3
+"""Prior standard deviation that tells nothing, deg/s."""
+
+WIDE = 5e-3
+"""Standard deviation of the prior of a fallback, deg/s: the Earth's rate and some more."""
 
 _PENALTIES, _FOLDS = 41, 10
 
@@ -92,6 +97,10 @@ class BestLinear(_Linear):
     For an unseen device the model is fitted to the recordings of all known ones, whose spread is
     then that from unit to unit. Where fewer than three devices are known, the prior is flat.
 
+    With a fallback, the prior may be wrong: with a probability of 5 % it is wide on some axes, as
+    of a device that was turned or knocked (:mod:`gyro_pipeline.physics.mixture`). Each window then
+    weighs the estimates under both.
+
     Args:
         warm_up: Whether the sensor warms up; None: if its recordings say so.
         noise: ``"reml"``: N, B and K fitted together with the prior; ``"allan"``: from the Allan
@@ -99,20 +108,27 @@ class BestLinear(_Linear):
         history: Whether the prior of a recording follows from the device's calibrations before
             it, in their order (:mod:`gyro_pipeline.physics.history`). For a bias that drifts from
             one recording to the next.
-
+        fallback: Whether the prior may be wrong; not together with ``history``.
     """
 
     uses_prior = True
     fewest_recordings = FEWEST_RECORDINGS
-    _memories = ("_lines", "_priors", "_windows")
+    _memories = ("_lines", "_priors", "_windows", "_others")
 
     def __init__(
-        self, warm_up: bool | None = False, noise: str = "reml", history: bool = False
+        self,
+        warm_up: bool | None = False,
+        noise: str = "reml",
+        history: bool = False,
+        fallback: bool = False,
     ) -> None:
+        if history and fallback:
+            raise InputError("fallback: expected no history; a prior that follows it is not tested")
         if noise not in ("reml", "allan"):
             raise InputError(f"noise: expected 'reml' or 'allan', got {noise!r}")
         self.recommended = noise == "reml"  # the Allan fit knows nothing of warm-up
         self._warm_up, self._allan, self._by_recording = warm_up, noise == "allan", history
+        self._fallback = fallback
 
     def _fit(self, training: TrainingSet) -> None:
         super()._fit(training)
@@ -130,8 +146,58 @@ class BestLinear(_Linear):
             numbers, labels = training.labels
             of_axes = zip(labels.T, self.models, strict=True)
             self._histories = [BiasHistory.fit(numbers, *one) for one in of_axes]
-        self._priors: dict[tuple[int, int | None], RecordingModel] = {}
         self._windows: dict[tuple[int, int, int, str], WindowModel] = {}
+        self._forget()
+
+    def _forget(self) -> None:
+        """Forget what was worked out from the priors."""
+        self._lines = {}
+        self._priors: dict[tuple[int, int | None], RecordingModel] = {}
+        self._others: dict[float, BestLinear] = {}
+
+    def with_calibrations(
+        self, numbers: NDArray[np.integer], labels: NDArray[np.float64]
+    ) -> Estimator:
+        """See :meth:`Estimator.with_calibrations`."""
+        if not self._histories:
+            return self
+        told = copy.copy(self)
+        of_axes = zip(self._histories, labels.T, strict=True)
+        told._histories = [history.extended(numbers, own) for history, own in of_axes]
+        told._forget()
+        return told
+
+    def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
+        if not self._fallback:
+            return super()._estimate(windows)
+        narrow, wide, alone = (
+            tuple(map(np.asarray, self._widened(spread)._estimate(asked)))
+            for spread, asked in (
+                (0.0, windows),
+                (WIDE, windows),
+                (_FLAT, replace(windows, target=BIAS)),
+            )
+        )
+        means = np.array([model.mean[0] for model in self.models])
+        variances = np.array([model.covariance[0, 0] for model in self.models])
+        posterior = mixture_posterior(
+            alone[0], alone[1] ** 2, means, variances, variances + WIDE**2
+        )
+        weight = posterior.wide
+        biases = (1 - weight) * narrow[0] + weight * wide[0]
+        squares = [sigma**2 + (bias - biases) ** 2 for bias, sigma in (narrow, wide)]
+        return biases, np.sqrt((1 - weight) * squares[0] + weight * squares[1])
+
+    def _widened(self, spread: float) -> "BestLinear":
+        """The estimator without fallback, of a prior with a further spread, deg/s."""
+        if spread not in self._others:
+            other = copy.copy(self)
+            other._fallback = False
+            other.models = [_with_further(model, spread) for model in self.models]
+            other._windows = self._windows  # which do not depend on the prior
+            other._forget()
+            self._others[spread] = other
+        return self._others[spread]
 
     def _line(
         self, axis: int, start: int, size: int, target: str, recording: int | None
@@ -157,7 +223,14 @@ def _of_unseen(model: RecordingModel, devices: int) -> RecordingModel:
     """The model of a new device, from one fitted to the recordings of so many others."""
     covariance = model.covariance * (1 + 1 / devices)
     if devices < FEWEST_RECORDINGS:
-        covariance[0, 0] = _FLAT**2 * model.noise_covariance(np.array([0, model.samples]))[0, 0]
+        covariance[0, 0] = _FLAT**2
+    return replace(model, covariance=covariance)
+
+
+def _with_further(model: RecordingModel, spread: float) -> RecordingModel:
+    """A model whose bias has a further spread, deg/s."""
+    covariance = model.covariance.copy()
+    covariance[0, 0] += spread**2
     return replace(model, covariance=covariance)
 
 

@@ -1,11 +1,14 @@
 """Estimators that know the device's past: a constant, the last calibration, empirical Bayes."""
 
+import copy
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gyro_pipeline.conventions import BIAS, REAL, RECORDING_MEAN
 from gyro_pipeline.estimators.base import Estimator, Windows
 from gyro_pipeline.estimators.training import TrainingSet, fitted_noise
+from gyro_pipeline.physics.history import merged_calibrations
 from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, guarded_spread
 
 
@@ -19,7 +22,7 @@ class TrainingMean(Estimator):
 
     def _fit(self, training: TrainingSet) -> None:
         self._noise = training.white_noise
-        self._numbers, self._labels = training.labels
+        self._labels = training.labels[1]
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
         biases, of_estimate = self.constant(windows.recording)
@@ -33,24 +36,34 @@ class TrainingMean(Estimator):
 
 
 class LastCalibration(TrainingMean):
-    """The mean of the device's preceding training recording: the calibration it has stored.
+    """The mean of the device's preceding recording: the calibration it has stored.
 
-    Before the first training recording nothing is stored, and it is the training mean. Sigma
-    assumes that power-ons are independent. A device that was never seen has no calibration: the
-    training mean of the others.
+    Before the first one nothing is stored, and it is the training mean. Sigma assumes that
+    power-ons are independent. A device that was never seen has no calibration: the training mean of
+    the others.
     """
 
     def _fit(self, training: TrainingSet) -> None:
         super()._fit(training)
-        if not training.seen:
-            self._numbers = np.full(self._numbers.shape, np.inf)
+        self._calibrations = training.labels if training.seen else None
+
+    def with_calibrations(
+        self, numbers: NDArray[np.integer], labels: NDArray[np.float64]
+    ) -> Estimator:
+        """See :meth:`Estimator.with_calibrations`."""
+        told = copy.copy(self)
+        if self._calibrations is not None:
+            told._calibrations = merged_calibrations(*self._calibrations, numbers, labels)
+        return told
 
     def constant(self, recording: int | None) -> tuple[NDArray[np.float64], float]:
         """See :meth:`TrainingMean.constant`."""
-        past = self._numbers < (np.inf if recording is None else recording)
-        if not past.any():
-            return super().constant(recording)
-        return self._labels[past][-1], 1.0
+        if self._calibrations is not None:
+            numbers, labels = self._calibrations
+            past = numbers < (np.inf if recording is None else recording)
+            if past.any():
+                return labels[past][-1], 1.0
+        return super().constant(recording)
 
 
 class EmpiricalBayes(Estimator):

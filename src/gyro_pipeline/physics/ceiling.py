@@ -171,6 +171,54 @@ def turn_on_spread(
     return np.asarray(np.sqrt(np.maximum(0.0, scatter - np.asarray(averaging, np.float64))))
 
 
+def spread_draws(
+    recording_means: NDArray[np.floating], averaging: ArrayLike, draws: int
+) -> NDArray[np.float64]:
+    """Turn-on spreads that recordings allow, whose quantiles make intervals.
+
+    If all is normal, the scatter of n means is their variance times a chi-square of n - 1 degrees
+    of freedom over n - 1. So its inverse is drawn (a generalised pivot; Weerahandi 1993, Journal of
+    the American Statistical Association 88), and the averaging noise taken off.
+
+    Args:
+        recording_means: As for :func:`turn_on_spread`.
+        averaging: Likewise.
+        draws: How many; always the same ones.
+
+    Returns:
+        (draws, ...), deg/s.
+    """
+    freedom = np.isfinite(recording_means).sum(axis=0) - 1
+    scatter = np.nanvar(recording_means, axis=0, ddof=1, dtype=np.float64)
+    generator = np.random.default_rng(0)
+    pivots = freedom / generator.chisquare(freedom, (draws, *scatter.shape))
+    left = scatter * pivots - np.asarray(averaging, np.float64)
+    return np.asarray(np.sqrt(np.maximum(0.0, left)))
+
+
+def joint_draws(
+    recording_means: NDArray[np.floating], averaging: ArrayLike, draws: int
+) -> NDArray[np.float64]:
+    """Covariance of the turn-on bias of all axes: the estimate, then what recordings allow.
+
+    Args:
+        recording_means: (n, axes), deg/s, of more recordings than axes.
+        averaging: Variance of their averaging noise, (axes,), (deg/s)^2.
+        draws: How many, as by :func:`spread_draws`, of a Wishart distribution.
+
+    Returns:
+        (1 + draws, axes, axes), (deg/s)^2; positive semidefinite.
+    """
+    from scipy import stats  # noqa: PLC0415 - it starts slowly
+
+    scatter, freedom = np.cov(recording_means.T), len(recording_means) - 1
+    pivots = stats.wishart.rvs(freedom, np.eye(len(scatter)) / freedom, draws, random_state=0)
+    root = np.linalg.cholesky(scatter)
+    drawn = root @ np.linalg.inv(pivots) @ root.T
+    values, vectors = np.linalg.eigh(np.concatenate([scatter[None], drawn]) - np.diag(averaging))
+    return np.asarray((vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.swapaxes(1, 2))
+
+
 def pooled(rmse_per_axis: ArrayLike) -> NDArray[np.float64]:
     """Pool the RMSE of axes: the root of the mean of their squares.
 

@@ -22,6 +22,24 @@ from gyro_pipeline.physics.recording_model import RecordingModel
 _FEWEST_PAST = 3  # with fewer calibrations before it, a recording has the prior of all
 
 
+def merged_calibrations(
+    numbers: NDArray[np.integer],
+    labels: NDArray[np.float64],
+    more_numbers: NDArray[np.integer],
+    more_labels: NDArray[np.float64],
+) -> tuple[NDArray[np.integer], NDArray[np.float64]]:
+    """Calibrations and further ones in their order, each once.
+
+    Args:
+        numbers: Of recordings, (n,).
+        labels: Their means, (n, ...), deg/s.
+        more_numbers: Of further ones.
+        more_labels: Likewise.
+    """
+    both, first = np.unique(np.concatenate([numbers, more_numbers]), return_index=True)
+    return both, np.concatenate([labels, more_labels])[first]
+
+
 @dataclass(frozen=True)
 class BiasHistory:
     """Calibrations of one gyroscope, in order, and how its bias walks.
@@ -71,6 +89,11 @@ class BiasHistory:
         found = [optimize.minimize(deviance, x, bounds=bounds, method="L-BFGS-B") for x in starts]
         best = min(found, key=lambda result: result.fun)
         return cls(numbers, labels, averaging, *map(float, np.exp(best.x)))
+
+    def extended(self, numbers: NDArray[np.integer], labels: NDArray[np.float64]) -> Self:
+        """The history with further calibrations, (n,) each; D and tau stay as they are."""
+        both = merged_calibrations(self.numbers, self.labels, numbers, labels)
+        return replace(self, numbers=both[0], labels=both[1])
 
     def _covariance(self, numbers: NDArray[np.integer]) -> NDArray[np.float64]:
         """Of labels, about a level that is unknown at the first recording."""

@@ -16,6 +16,7 @@ means lose nothing of white noise and random walk that matters, as long as a blo
 than the time at which flicker equals white noise, 2 pi N^2 / B^2 (20 s for N = 5.4, B = 3 mdps).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -187,6 +188,43 @@ def mean_squares(  # noqa: PLR0917 - those of best_linear, and other priors
     return window.variance(priors) - averaging, np.asarray(mean - averaging)
 
 
+def joint_squares(
+    models: Sequence[RecordingModel],
+    start: int,
+    size: int,
+    truth: str,
+    covariances: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Expected squared error, mean over axes, of who sees the windows of all axes together.
+
+    That is less than axis by axis where biases of a power-on are correlated between axes.
+
+    Args:
+        models: Of each axis; their priors of the bias are not used.
+        start: First sample of the window, counted from power-on.
+        size: Samples of the window.
+        truth: PAPER or TRUE.
+        covariances: Priors of the biases of all axes, (n, axes, axes), (deg/s)^2.
+
+    Returns:
+        (n,), (deg/s)^2.
+    """
+    windows = [WindowModel.of(model, start, size, truth) for model in models]
+    firsts = np.concatenate([[0], np.cumsum([model.mean.size for model in models])])
+    priors = np.zeros((len(covariances), firsts[-1], firsts[-1]))
+    for model, first in zip(models, firsts[:-1], strict=True):
+        own = slice(first, first + model.mean.size)
+        priors[:, own, own] = np.diag(np.diag(model.covariance))
+    priors[:, firsts[:-1, None], firsts[:-1]] = covariances
+    information = linalg.block_diag(*(window.information for window in windows))
+    posterior = np.linalg.solve(np.eye(firsts[-1]) + priors @ information, priors)
+    of_axes = [
+        window.error_variance(posterior[:, first:stop, first:stop])
+        for window, first, stop in zip(windows, firsts[:-1], firsts[1:], strict=True)
+    ]
+    return np.asarray(np.mean(of_axes, axis=0))
+
+
 @lru_cache(maxsize=1 << 16)  # a curve asks for the same in every recording
 def outside_noise(
     noise: NoiseFigures, samples: int, rate_hz: float, start: int, size: int
@@ -269,7 +307,7 @@ class WindowModel:
         return solved[:, 0], solved[:, 1:]
 
     @cached_property
-    def _information(self) -> NDArray[np.float64]:
+    def information(self) -> NDArray[np.float64]:
         """What y tells of c."""
         return np.asarray(self.design.T @ self._solved[1])
 
@@ -280,14 +318,15 @@ class WindowModel:
 
     def _posterior(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
         """Covariance of c, given y; of (..., k, k) as well."""
-        shrinking = np.eye(self._rest.size) + covariance @ self._information
+        shrinking = np.eye(self._rest.size) + covariance @ self.information
         return np.asarray(np.linalg.solve(shrinking, covariance))
 
     def variance(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
         """Of the error of :meth:`best`, (...), under each of the priors (..., k, k)."""
-        return self._variance(self._posterior(covariance))
+        return self.error_variance(self._posterior(covariance))
 
-    def _variance(self, posterior: NDArray[np.float64]) -> NDArray[np.float64]:
+    def error_variance(self, posterior: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Of the error, (...), where c is known with the covariance (..., k, k)."""
         foretold = self._solved[0] @ self.shared
         return np.asarray(self.own - foretold + posterior @ self._rest @ self._rest)
 
@@ -301,8 +340,8 @@ class WindowModel:
         of_noise, of_design = self._solved
         posterior, rest = self._posterior(covariance), self._rest
         weights = of_noise + of_design @ (posterior @ rest)
-        constant = rest @ (mean - posterior @ self._information @ mean)
-        variance = self._variance(posterior)
+        constant = rest @ (mean - posterior @ self.information @ mean)
+        variance = self.error_variance(posterior)
         return LinearEstimate(self.edges, weights, float(constant), float(variance))
 
 

@@ -1,9 +1,9 @@
 """The test bench: windows of a sensor that test, on which every estimator is judged alike."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import product
+from itertools import combinations, product
 
 import numpy as np
 import pandas as pd
@@ -23,33 +23,22 @@ from gyro_pipeline.conventions import (
 )
 from gyro_pipeline.estimators.averages import RunningMean
 from gyro_pipeline.estimators.base import Estimator
-from gyro_pipeline.parameters import Evaluation
 from gyro_pipeline.physics.bias import windows_at
-from gyro_pipeline.physics.ceiling import (
-    best_gain,
-    best_saving,
-    ceiling_rmse,
-    oracle,
-    pooled,
-    running_mean_rmse,
-)
-from gyro_pipeline.physics.recording_model import (
-    LinearEstimate,
-    RecordingModel,
-    best_linear,
-    mean_squares,
-)
+from gyro_pipeline.physics.ceiling import oracle
+from gyro_pipeline.physics.recording_model import LinearEstimate, RecordingModel, best_linear
+from gyro_pipeline.pipelines.evaluation.ceilings import Ceilings
 from gyro_pipeline.pipelines.evaluation.device import TestDevice
 from gyro_pipeline.protocol.scores import (
     Estimate,
-    ResampledCurve,
     SquaredErrors,
+    WeightedCurve,
     beats_oracle,
     clusters,
     coverage,
     curve_errors,
-    equivalent_time,
-    resampled_weights,
+    gain_pct,
+    leave_one_out,
+    prior_conflict,
     score,
     squared_errors,
     with_interval,
@@ -69,7 +58,7 @@ SIGMAS = {"coverage_1sigma_pct": 1.0, "coverage_2sigma_pct": 2.0, "coverage_95_p
 """Of stated standard deviations, within how many an error is counted."""
 
 TARGETS = (RECORDING_MEAN, BIAS)
-_CURVE_POINTS = 30  # of the expected running mean, to interpolate between
+_FEWEST_CORRELATED = 5
 
 
 @dataclass(frozen=True)
@@ -81,14 +70,15 @@ class Bench:
         device: What is known of the IMUs that test, from :func:`describe_devices`.
         tests: The rows of the windows table that test: ``fold, imu, recording, start``.
         window_s: Calibration time T0, seconds.
-        evaluation: Resamples and seed of the intervals.
+        labels: Means of the device's training recordings in each fold, (n, axes), deg/s; none of
+            unseen devices.
     """
 
     recordings: xr.Dataset
     device: TestDevice
     tests: pd.DataFrame
     window_s: float
-    evaluation: Evaluation
+    labels: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @cached_property
     def size(self) -> int:
@@ -143,9 +133,10 @@ class Bench:
         Raises:
             InputError: There is no estimate for some window.
         """
+        told = {fold: self._told(str(fold), fit) for fold, fit in estimators.items()}
         parts = []
         for recording, truths in zip(self.tested, self._truths, strict=True):
-            estimates = self._estimates(estimators, recording, imus)
+            estimates = self._estimates(told, recording, imus)
             parts += [
                 error_columns(recording, truth, value, *estimates[TARGET_OF[truth]])
                 for truth, value in truths.items()
@@ -159,6 +150,14 @@ class Bench:
             )
         return errors
 
+    def _told(self, fold: str, estimator: Estimator) -> Estimator:
+        """The fit of a fold, told of the recordings that test there: past ones to later ones."""
+        numbers = np.unique(self.tests.recording[self.tests.fold == fold])
+        if len(self.device.imus) > 1:
+            return estimator
+        means = {recording.number: recording.mean for recording in self.tested}
+        return estimator.with_calibrations(numbers, np.stack([means[n] for n in numbers.tolist()]))
+
     def _estimates(
         self, estimators: Mapping[str, Estimator], recording: TestRecording, imus: int
     ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -167,9 +166,7 @@ class Bench:
         if imus > 1:
             seen = self.recordings.angular_rate.isel(imu=slice(imus))
             samples = np.concatenate(seen.sel(recording=recording.number).to_numpy())
-        rows = self.tests[
-            (self.tests.imu == recording.imu) & (self.tests.recording == recording.number)
-        ]
+        rows = self._rows(recording)
         shape = (len(recording.tested), len(AXES))
         estimates = {t: (np.full(shape, np.nan), np.full(shape, np.nan)) for t in TARGETS}
         for fold, own in rows.groupby("fold", observed=True):
@@ -196,19 +193,15 @@ class Bench:
         return _by_view(self.mean_errors)
 
     @cached_property
-    def _oracles(self) -> dict[tuple[str, str], SquaredErrors]:
-        """The same of the best possible estimator; empty where it is not known."""
-        return {} if self.oracle_errors is None else _by_view(self.oracle_errors)
+    def _references(self) -> dict[str, dict[tuple[str, str], SquaredErrors]]:
+        """Squares of the oracle's and the constant's errors on these windows, if they are known."""
+        known = {"oracle": self.oracle_errors, "constant": self.constant_errors}
+        return {name: _by_view(errors) for name, errors in known.items() if errors is not None}
 
     @cached_property
-    def _resampled(self) -> np.ndarray:
-        """Weights of the recordings in each resample."""
-        drawn = self.evaluation.resamples, self.evaluation.bootstrap_seed
-        return resampled_weights(self._clusters, *drawn)
-
-    @cached_property
-    def _clusters(self) -> int:
-        return int(clusters(self.mean_errors).nunique())
+    def _weights(self) -> np.ndarray:
+        """Of the recordings, leaving one out in turn."""
+        return leave_one_out(int(clusters(self.mean_errors).nunique()))
 
     @cached_property
     def curve(self) -> pd.DataFrame:
@@ -217,10 +210,10 @@ class Bench:
         return pd.concat(curves, ignore_index=True)
 
     @cached_property
-    def curves(self) -> dict[tuple[str, str], ResampledCurve]:
-        """The same by truth and windows, for every resample."""
+    def curves(self) -> dict[tuple[str, str], WeightedCurve]:
+        """The same by truth and windows, leaving one recording out in turn."""
         views = product(self.curve.truth.unique(), (FIRST, ALL))
-        return {view: curve_errors(self.curve, *view).of(self._resampled) for view in views}
+        return {view: curve_errors(self.curve, *view).of(self._weights) for view in views}
 
     @cached_property
     def oracle_errors(self) -> pd.DataFrame | None:
@@ -235,6 +228,44 @@ class Bench:
                 parts.append(error_columns(recording, truth, known, best, sigma))
         return stacked(parts)
 
+    @cached_property
+    def constant_errors(self) -> pd.DataFrame | None:
+        """Errors of the mean of the training recordings; None of devices that none is of."""
+        if not self.labels:
+            return None
+        parts = []
+        for recording, truths in zip(self.tested, self._truths, strict=True):
+            rows = self._rows(recording).sort_values("start").drop_duplicates("start")
+            constants = np.stack([self.labels[fold].mean(axis=0) for fold in rows.fold])
+            none = np.full(constants.shape, np.nan)
+            parts += [
+                error_columns(recording, truth, known, constants, none)
+                for truth, known in truths.items()
+            ]
+        return stacked(parts)
+
+    @cached_property
+    def prior_p(self) -> dict[str, float]:
+        """How probable the tested recordings are, by axis, if they are like those that train.
+
+        The least of all folds, corrected for their number.
+        """
+        if not self.labels:
+            return {}
+        means = {(one.imu, one.number): one.mean for one in self.tested}
+        chances = []
+        for fold, rows in self.tests.groupby("fold", observed=True):
+            places = rows[["imu", "recording"]].drop_duplicates().itertuples(index=False, name=None)
+            tested = np.stack([means[place] for place in places])
+            chances.append(prior_conflict(self.labels[str(fold)], tested))
+        least = np.minimum(len(chances) * np.min(chances, axis=0), 1.0)
+        return dict(zip(AXES, least.tolist(), strict=True))
+
+    def _rows(self, recording: TestRecording) -> pd.DataFrame:
+        """Windows of a recording that test."""
+        own = (self.tests.imu == recording.imu) & (self.tests.recording == recording.number)
+        return self.tests[own]
+
     def _best(self, recording: TestRecording, truth: str) -> np.ndarray:
         """Estimates by one who knows what was drawn, (windows, 3), deg/s."""
         device, size = self.device, self.size
@@ -242,7 +273,7 @@ class Bench:
             assert device.unit_bias is not None
             means = recording.window_means(recording.tested, size)
             axes = self._axes(recording.imu)
-            known = (device.unit_bias[axes], device.spread[0, axes], device.noise[0, axes])
+            known = (device.unit_bias[axes], device.spread[0, axes], device.noise[axes])
             return oracle(means, *known, self.window_s, self.recording_s, truth)
         starts = recording.tested
         windows = cut_windows(recording.samples, size, starts)
@@ -273,6 +304,8 @@ class Bench:
     @cached_property
     def _distinct(self) -> dict[tuple[int, float], RecordingModel]:
         """All models that differ, by axis and time constant."""
+        if self.device.models is None:
+            return {}
         return {
             (axis, model.time_constant_s): model
             for recording in self.tested
@@ -290,79 +323,12 @@ class Bench:
             self._lines[key] = best_linear(model, start, self.size, truth)
         return self._lines[key]
 
-    @property
-    def ceiling_basis(self) -> str:
-        """In words, what the ceilings are computed from."""
-        if self.device.unit_bias is None:
-            noise = "white noise" if self.device.models is None else "fitted N, B and K"
-            return f"estimated from recordings, {noise}"
-        if self.device.models is not None and len(self._distinct) > len(self.device.models):
-            return (
-                "drawn values, the time constant of each warm-up among them: nobody who must learn "
-                "it from the window can come this far"
-            )
-        return "drawn values"
-
-    def ceilings(self, truth: str, windows: str) -> dict[str, Estimate]:
-        """What no estimator can be better than; exact, without an interval, on simulated data.
-
-        On measured data the interval is that of the turn-on spread (if noise is white that of N,
-        too). Nothing is returned for a truth whose own noise, taken off, leaves no square to take
-        the root of.
-        """
-        if (truth, windows) not in self._ceilings:
-            self._ceilings[truth, windows] = self._limits(truth, windows)
-        return self._ceilings[truth, windows]
-
     @cached_property
-    def _ceilings(self) -> dict[tuple[str, str], dict[str, Estimate]]:
-        return {}
-
-    def _limits(self, truth: str, windows: str) -> dict[str, Estimate]:
-        best, mean = self._expected(truth, windows, self.size)
-        lowest = with_interval(best)
-        if (lowest.value if lowest.lo is None else lowest.lo) < 0 or mean.min() <= 0:
-            return {}
-        limit = np.sqrt(np.maximum(best, 0.0))
-        ratio = limit / np.sqrt(mean)
-        limits = {
-            "ceiling_rmse_dps": with_interval(limit),
-            "ceiling_accuracy_gain_pct": with_interval(100 * best_gain(ratio)),
-        }
-        if truth == PAPER:
-            saving = self._expected_saving(windows, ratio, limit)
-            limits["ceiling_time_saving_pct"] = with_interval(100 * saving)
-        return limits
-
-    def _expected(self, truth: str, windows: str, size: int) -> tuple[np.ndarray, np.ndarray]:
-        """Mean squares of the best estimate and the running mean over axes and windows.
-
-        For each of the device's resamples, (deg/s)^2.
-        """
-        device, attrs = self.device, self.recordings.attrs
-        if device.models is None:
-            times = size / attrs["rate_hz"], self.recording_s
-            best = pooled(ceiling_rmse(device.noise, device.spread, *times, truth))
-            return best**2, pooled(running_mean_rmse(device.noise, *times, truth)) ** 2
-        starts = range(0, self.recordings.sizes["sample"] - size + 1, size)
-        squares = [
-            mean_squares(model, start, size, truth, covariances=device.priors(axis))
-            for (axis, _), model in self._distinct.items()
-            for start in (starts[:1] if windows == FIRST else starts)
-        ]
-        best, mean = np.mean(squares, axis=0)
-        return best, mean
-
-    def _expected_saving(self, windows: str, ratio: np.ndarray, limit: np.ndarray) -> np.ndarray:
-        """1 - T0 / t*, where the running mean of t* is expected to be as good as the limit."""
-        if self.device.models is None:
-            return best_saving(ratio, self.window_s / self.recording_s)
-        samples = self.recordings.sizes["sample"]
-        sizes = np.unique(np.geomspace(self.size, samples, _CURVE_POINTS).astype(int))
-        # of the whole recording it is 0, but for rounding
-        curve = [np.maximum(self._expected(PAPER, windows, int(n))[1], 0.0) for n in sizes]
-        reached = equivalent_time(sizes, np.sqrt(curve).T, limit)
-        return np.where(np.isfinite(reached), 1 - self.size / reached, 0.0)
+    def ceilings(self) -> Ceilings:
+        """What can be expected of the best."""
+        distinct = [(axis, model) for (axis, _), model in self._distinct.items()]
+        samples, rate_hz = self.recordings.sizes["sample"], self.recordings.attrs["rate_hz"]
+        return Ceilings(self.device, distinct, self.size, samples, rate_hz)
 
     def scores(self, errors: pd.DataFrame, weights: str) -> pd.DataFrame:
         """All figures of merit of one set of errors; only finite ones.
@@ -379,21 +345,61 @@ class Bench:
         for truth, windows in product(errors.truth.unique(), (FIRST, ALL)):
             own, mean = squared_errors(errors, truth, windows), self._means[truth, windows]
             curve = self.curves[truth, windows]
-            scores = score(own, mean, curve, self.window_s, self._resampled)
+            scores = score(own, mean, curve, self.window_s, self._weights)
             if weights == LAST:
-                scores |= self.ceilings(truth, windows)
+                scores |= self.ceilings.of(truth, windows) | self._realised(truth, windows)
+            if truth != DISJOINT:
+                scores |= self._gains_by_axis(errors, truth, windows)
             if windows == ALL and truth != DISJOINT and errors.sigma_dps.notna().any():
                 for name, sigmas in SIGMAS.items():
                     scores[name] = Estimate(100 * coverage(errors, truth, sigmas))
-            if self._oracles and self._clusters > 1:
-                p = beats_oracle(own, self._oracles[truth, windows])
+            if "oracle" in self._references and len(self._weights) > 1:
+                p = beats_oracle(own, self._references["oracle"][truth, windows])
                 scores["beats_oracle_p"] = Estimate(p)
+            if (truth, windows) == (PAPER, ALL):
+                scores |= {f"prior_p_{axis}": Estimate(p) for axis, p in self.prior_p.items()}
+                scores |= self._turn_on_correlations()
             rows += [
                 (weights, truth, windows, name, *_finite(estimate))
                 for name, estimate in scores.items()
                 if np.isfinite(estimate.value)
             ]
         return pd.DataFrame(rows, columns=SCORES)
+
+    def _realised(self, truth: str, windows: str) -> dict[str, Estimate]:
+        """What the oracle and the constant reach on the same windows."""
+        scores, mean = {}, self._means[truth, windows].mean(self._weights)
+        for name, squares in self._references.items() if truth != DISJOINT else ():
+            square = squares[truth, windows].mean(self._weights)
+            ratio = with_interval(np.sqrt(square / mean), positive=True)
+            scores[f"{name}_rmse_dps"] = with_interval(np.sqrt(square), positive=True)
+            scores[f"{name}_accuracy_gain_pct"] = gain_pct(ratio)
+        return scores
+
+    def _gains_by_axis(self, errors: pd.DataFrame, truth: str, windows: str) -> dict[str, Estimate]:
+        """A of each axis."""
+        scores = {}
+        for axis in AXES:
+            own, mean = (
+                squared_errors(table[table.axis == axis], truth, windows).mean(self._weights)
+                for table in (errors, self.mean_errors)
+            )
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ratio = with_interval(np.sqrt(own / mean), positive=True)
+            scores[f"accuracy_gain_pct_{axis}"] = gain_pct(ratio)
+        return scores
+
+    def _turn_on_correlations(self) -> dict[str, Estimate]:
+        """Of the means of training recordings, between axes, with intervals (Fisher 1915)."""
+        labels = max(self.labels.values(), key=len, default=np.empty(0))
+        if len(labels) < _FEWEST_CORRELATED:
+            return {}
+        scores, half = {}, 1.96 / np.sqrt(len(labels) - 3)
+        for (i, first), (j, second) in combinations(enumerate(AXES), 2):
+            value = float(np.corrcoef(labels[:, i], labels[:, j])[0, 1])
+            lo, hi = np.tanh(np.arctanh(value) + half * np.array([-1, 1]))
+            scores[f"turn_on_correlation_{first}{second}"] = Estimate(value, float(lo), float(hi))
+        return scores
 
 
 def _finite(estimate: Estimate) -> list[float | None]:

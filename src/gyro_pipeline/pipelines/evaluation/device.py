@@ -10,14 +10,15 @@ import xarray as xr
 from gyro_pipeline.conventions import AXES, ORIGIN_REAL, TEST
 from gyro_pipeline.physics.allan import SHORTEST_FIT_SAMPLES, NoiseFigures, fit_noise, mean_variance
 from gyro_pipeline.physics.bias import fill_masked
-from gyro_pipeline.physics.ceiling import turn_on_spread
+from gyro_pipeline.physics.ceiling import joint_draws, spread_draws, turn_on_spread
+from gyro_pipeline.physics.history import BiasHistory
 from gyro_pipeline.physics.recording_model import RecordingModel
 from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, fit_recording_model
 
 UNIT_SPREAD = 1.0
 """Standard deviation of the bias from unit to unit, deg/s: 0.7 to 1.9 on the public DOT files."""
 
-_CEILING_RESAMPLES = 400
+_DRAWS = 400
 _PLACE = ["imu", "recording"]
 
 
@@ -29,11 +30,16 @@ class TestDevice:
 
     Attributes:
         imus: The IMUs that test, in order.
-        noise: N, shape (resamples, axes), deg/s sqrt(s); the first row is the estimate itself.
-        spread: Turn-on spread tau, same shape, deg/s; of an unseen device, that of units.
+        noise: N, shape (axes,), deg/s sqrt(s).
+        spread: Turn-on spread tau, shape (1 + draws, axes), deg/s: the estimate, then what the
+            recordings allow; of an unseen device, that of units.
         unit_bias: Drawn prior mean, shape (axes,), deg/s; None on measured data.
         models: Of each axis, where its noise is not white or its bias warms up; drawn if simulated
             (a time constant is then that of the recording at hand), else fitted.
+        joint: Covariance of the turn-on bias of all axes, (1 + draws, axes, axes), (deg/s)^2; None
+            where few recordings do not tell, and of drawn values, where axes are independent.
+        history: Variance of the next bias given the calibrations before it, (axes,), mean over
+            the recordings that test, (deg/s)^2; None likewise.
     """
 
     imus: tuple[int, ...]
@@ -41,24 +47,19 @@ class TestDevice:
     spread: np.ndarray
     unit_bias: np.ndarray | None
     models: tuple[RecordingModel, ...] | None = None
+    joint: np.ndarray | None = None
+    history: np.ndarray | None = None
 
     @property
     def figures(self) -> tuple[NoiseFigures, ...]:
         """N, B and K of each axis."""
         if self.models is not None:
             return tuple(model.noise for model in self.models)
-        return tuple(NoiseFigures(float(white), 0.0, 0.0) for white in self.noise[0])
-
-    def priors(self, axis: int) -> np.ndarray:
-        """Covariances of the model's prior for each of ``spread``, (resamples, k, k)."""
-        assert self.models is not None
-        covariances = np.repeat(self.models[axis].covariance[None], len(self.spread), axis=0)
-        covariances[:, 0, 0] = self.spread[:, axis] ** 2
-        return covariances
+        return tuple(NoiseFigures(float(white), 0.0, 0.0) for white in self.noise)
 
 
 def describe_devices(
-    recordings: xr.Dataset, bias: pd.DataFrame, allan: xr.Dataset, table: pd.DataFrame, seed: int
+    recordings: xr.Dataset, bias: pd.DataFrame, allan: xr.Dataset, table: pd.DataFrame
 ) -> TestDevice:
     """What is known of the devices that test, from the recordings that do not test with them.
 
@@ -67,7 +68,6 @@ def describe_devices(
         bias: Ground truth.
         allan: Allan variances.
         table: A windows table. A device is known if some fold in which it tests trains on it.
-        seed: Of the bootstrap.
     """
     imus = sorted(table.imu[table.role == TEST].unique().tolist())
     places = table[table.origin == ORIGIN_REAL].drop_duplicates(["fold", "role", *_PLACE])
@@ -75,10 +75,38 @@ def describe_devices(
     tests = places[places.role == TEST].groupby("imu").fold.unique()
     own = [learned[(learned.imu == imu) & learned.fold.isin(tests[imu])] for imu in imus]
     if len(imus) == 1 and len(own[0]):
-        numbers = sorted(own[0].recording.unique().tolist())
-        return _describe_known(recordings, bias, allan, numbers, seed, imus[0])
+        if recordings.attrs["simulated"]:
+            return _describe_drawn(recordings, imus[0])
+        of_imu = bias[bias.imu == imus[0]]
+        means = of_imu.pivot(index="recording", columns="axis", values="bias_dps")
+        tested = places.recording[places.role == TEST].unique()
+        trained = means.loc[means.index.isin(own[0].recording)]
+        return _describe_known(recordings, trained, means.loc[sorted(tested)], allan, imus[0])
     others = learned[learned.fold.isin(tests.explode())][_PLACE].drop_duplicates()
     return _describe_unseen(recordings, allan, sorted(map(tuple, others.to_numpy().tolist())), imus)
+
+
+def training_labels(bias: pd.DataFrame, table: pd.DataFrame) -> dict[str, np.ndarray]:
+    """Means of the tested device's training recordings in each fold, (n, axes), deg/s.
+
+    Args:
+        bias: Ground truth.
+        table: A windows table.
+
+    Returns:
+        By fold, of those that test; empty where a fold has none, or several devices test.
+    """
+    places = table[table.origin == ORIGIN_REAL].drop_duplicates(["fold", "role", *_PLACE])
+    tested = places.imu[places.role == TEST].unique().tolist()
+    if len(tested) > 1:
+        return {}
+    means = bias[bias.imu == tested[0]].pivot(index="recording", columns="axis", values="bias_dps")
+    own = places[(places.imu == tested[0]) & (places.role != TEST)]
+    labels = {
+        str(fold): means.loc[sorted(own.recording[own.fold == fold].unique())].to_numpy()
+        for fold in places.fold[places.role == TEST].unique()
+    }
+    return labels if all(map(len, labels.values())) else {}
 
 
 def _describe_unseen(
@@ -112,9 +140,10 @@ def _describe_unseen(
         fitted = _fitted_models(recordings, places) or ()
         own = tuple(_with_prior(model, float(model.mean[0]), UNIT_SPREAD) for model in fitted)
         models = own * len(imus)
-    axes = np.tile(noise, len(imus))[None]
+    axes = np.tile(noise, len(imus))
     bias = np.zeros(axes.size) if recordings.attrs["simulated"] else None
-    return TestDevice(tuple(imus), axes, np.full(axes.shape, UNIT_SPREAD), bias, models or None)
+    spread = np.full((1, axes.size), UNIT_SPREAD)
+    return TestDevice(tuple(imus), axes, spread, bias, models or None)
 
 
 def _with_prior(model: RecordingModel, mean: float, spread: float) -> RecordingModel:
@@ -124,49 +153,55 @@ def _with_prior(model: RecordingModel, mean: float, spread: float) -> RecordingM
     return replace(model, mean=means, covariance=covariance)
 
 
-def _describe_known(  # noqa: PLR0913, PLR0917 - what a device is described by
-    recordings: xr.Dataset,
-    bias: pd.DataFrame,
-    allan: xr.Dataset,
-    numbers: Sequence[int],
-    seed: int,
-    imu: int,
+def _describe_drawn(recordings: xr.Dataset, imu: int) -> TestDevice:
+    """A simulated IMU, of which everything is known."""
+    return TestDevice(
+        imus=(imu,),
+        noise=recordings.true_noise.to_numpy(),
+        spread=recordings.true_turn_on_spread.to_numpy()[None],
+        unit_bias=recordings.true_unit_bias.sel(imu=imu).to_numpy(),
+        models=_drawn_models(recordings.sel(imu=imu)),
+    )
+
+
+def _describe_known(
+    recordings: xr.Dataset, means: pd.DataFrame, tested: pd.DataFrame, allan: xr.Dataset, imu: int
 ) -> TestDevice:
-    """Noise and turn-on spread of an IMU, with a bootstrap over the recordings used.
+    """Noise and turn-on spread of an IMU.
 
     Args:
-        recordings: With the drawn values on simulated data.
-        bias: Ground truth.
+        recordings: Measured ones.
+        means: Of the recordings to learn from, a row each; none of a hold-out's test ones.
+        tested: Of those that test.
         allan: Allan variances.
-        numbers: Recordings to learn from, if the IMU has them; none of a hold-out's test ones.
-        seed: Of the bootstrap.
         imu: Which.
     """
-    if recordings.attrs["simulated"]:
-        return TestDevice(
-            imus=(imu,),
-            noise=recordings.true_noise.to_numpy()[None],
-            spread=recordings.true_turn_on_spread.to_numpy()[None],
-            unit_bias=recordings.true_unit_bias.sel(imu=imu).to_numpy(),
-            models=_drawn_models(recordings.sel(imu=imu)),
-        )
+    labels = means.to_numpy()
     duration_s = recordings.sizes["sample"] / recordings.attrs["rate_hz"]
-    means = bias[bias.imu == imu].pivot(index="recording", columns="axis", values="bias_dps")
-    numbers = [number for number in numbers if number in means.index]
-    allan = allan.sel(imu=imu, recording=numbers).load()
-    variances = [allan.sel(recording=number) for number in numbers]
+    numbers = means.index.tolist()
+    variances = allan.sel(imu=imu, recording=numbers).load()
+    fits = _allan_fits(recordings, allan, [variances.sel(recording=n) for n in numbers])
+    noise = np.array([fit.white for fit in fits])
     models = _fitted_models(recordings, [(imu, number) for number in numbers])
-    beyond_white = _beyond_white(models, duration_s)
-    generator = np.random.default_rng(seed)
-    draws = generator.integers(len(numbers), size=(_CEILING_RESAMPLES, len(numbers)))
-    noise, spread = [], []
-    for chosen in [np.arange(len(numbers)), *draws]:
-        fits = _allan_fits(recordings, allan, [variances[place] for place in chosen])
-        noise.append([fit.white for fit in fits])
-        values = means.loc[numbers].to_numpy()[chosen]
-        averaging = np.square(noise[-1]) / duration_s + beyond_white
-        spread.append(turn_on_spread(values, averaging))
-    return TestDevice((imu,), np.array(noise), np.array(spread), None, models)
+    averaging = np.square(noise) / duration_s + _beyond_white(models, duration_s)
+    spread = np.vstack([turn_on_spread(labels, averaging), spread_draws(labels, averaging, _DRAWS)])
+    further = {} if models is None else {"history": _history(models, means, tested)}
+    if len(labels) > len(AXES) and models is not None:
+        further["joint"] = joint_draws(labels, averaging, _DRAWS)
+    return TestDevice((imu,), noise, spread, None, models, **further)
+
+
+def _history(
+    models: Sequence[RecordingModel], means: pd.DataFrame, tested: pd.DataFrame
+) -> np.ndarray:
+    """Variance of a bias given the calibrations before it, mean over the tested ones, (axes,)."""
+    variances = []
+    for model, axis in zip(models, AXES, strict=True):
+        fitted = BiasHistory.fit(means.index.to_numpy(), means[axis].to_numpy(), model)
+        history = fitted.extended(tested.index.to_numpy(), tested[axis].to_numpy())
+        priors = [history.prior(model, number) for number in tested.index.tolist()]
+        variances.append(np.mean([prior.covariance[0, 0] for prior in priors]))
+    return np.array(variances)
 
 
 def _allan_fits(

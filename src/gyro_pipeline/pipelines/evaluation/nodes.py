@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Iterator, Mapping
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -15,13 +16,18 @@ from gyro_pipeline.conventions import (
     MDPS,
     PAPER,
     TEST,
+    TRUE,
 )
 from gyro_pipeline.estimators import ORIENTATION_NOTE
 from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.fingerprints import code_hash, data_hash, fingerprint
-from gyro_pipeline.parameters import Evaluation
 from gyro_pipeline.pipelines.evaluation.bench import Bench
-from gyro_pipeline.pipelines.evaluation.device import TestDevice, describe_devices
+from gyro_pipeline.pipelines.evaluation.ceilings import PREMISE
+from gyro_pipeline.pipelines.evaluation.device import (
+    TestDevice,
+    describe_devices,
+    training_labels,
+)
 from gyro_pipeline.protocol.truths import CURVE_STEP_S
 from gyro_pipeline.studies import MEAN, RunSpec, planned
 from gyro_pipeline.tracking import (
@@ -34,6 +40,8 @@ from gyro_pipeline.tracking import (
 )
 
 logger = logging.getLogger(__name__)
+
+_CONFLICT = 1e-3  # of a p value: axes of a few sensors and lengths are looked at
 
 METRICS = {
     "rmse_mdps": ("test_rmse_dps", "value", ALL),
@@ -58,7 +66,6 @@ def evaluate(
     windows: pd.DataFrame,
     bias: pd.DataFrame,
     allan: xr.Dataset,
-    evaluation: Evaluation,
 ) -> Iterator[EvaluatedRun]:
     """Judge every run of the plan that was not judged this way before.
 
@@ -69,7 +76,6 @@ def evaluate(
         windows: The windows table.
         bias: Ground truth.
         allan: Allan variances.
-        evaluation: Resamples and seed of the intervals.
 
     Yields:
         Metrics, scores and the errors of each window, to be added to each run.
@@ -78,9 +84,9 @@ def evaluate(
         data_hash(pd.util.hash_pandas_object(bias, index=False).to_numpy(), None),
         data_hash(allan.allan_variance.load().to_numpy(), None),
     ]
-    judged_with = fingerprint([code_hash(__name__), evaluation.model_dump(), truths])
+    judged_with = fingerprint([code_hash(__name__), truths])
     specs, stored = planned(plan), {run.fingerprint: run for run in reversed(runs)}
-    benches = Benches(recordings, windows, bias, allan, evaluation)
+    benches = Benches(recordings, windows, bias, allan)
     judged = 0
     for key, spec in sorted(specs.items(), key=lambda item: _bench_key(item[1])):
         run = stored[key]
@@ -100,7 +106,7 @@ class Benches:
     """The benches of a study on a sensor, of which the last one is kept.
 
     Args:
-        recordings, windows, bias, allan, evaluation: As :func:`evaluate` takes them.
+        recordings, windows, bias, allan: As :func:`evaluate` takes them.
     """
 
     def __init__(
@@ -109,10 +115,8 @@ class Benches:
         windows: pd.DataFrame,
         bias: pd.DataFrame,
         allan: xr.Dataset,
-        evaluation: Evaluation,
     ) -> None:
         self._recordings, self._bias, self._allan = recordings, bias, allan
-        self._evaluation = evaluation
         key = ["protocol", "window_s", "window_stride_s"]
         self._tables = dict(iter(windows.groupby(key, observed=True)))
         self._devices: dict[str, TestDevice] = {}
@@ -125,11 +129,10 @@ class Benches:
             table = self._tables[key]
             columns = ["fold", "imu", "recording", "start"]
             tests = table[table.role == TEST][columns].astype({"fold": str})
-            self._made = {
-                key: Bench(
-                    self._recordings, self._device(table), tests, spec.window_s, self._evaluation
-                )
-            }
+            device = self._device(table)
+            labels = training_labels(self._bias, table)
+            bench = Bench(self._recordings, device, tests, spec.window_s, labels)
+            self._made = {key: bench}
         return self._made[key]
 
     def _device(self, table: pd.DataFrame) -> TestDevice:
@@ -137,9 +140,8 @@ class Benches:
         places = table[["fold", "role", "origin", "imu", "recording"]].drop_duplicates()
         key = fingerprint(places.astype(str).to_numpy().tolist())
         if key not in self._devices:
-            self._devices[key] = describe_devices(
-                self._recordings, self._bias, self._allan, table, self._evaluation.bootstrap_seed
-            )
+            given = self._recordings, self._bias, self._allan
+            self._devices[key] = describe_devices(*given, table)
         return self._devices[key]
 
 
@@ -160,10 +162,11 @@ def _judge(run: StoredRun, spec: RunSpec, bench: Bench, judged_with: str) -> Eva
     artifacts = {ERRORS: pd.concat(errors, ignore_index=True), SCORES: table}
     if spec.estimator == MEAN:
         artifacts[CURVE] = bench.curve
-    tags = {EVALUATED_WITH: judged_with, "ceiling": bench.ceiling_basis}
+    tags = {EVALUATED_WITH: judged_with, "ceiling": bench.ceilings.basis}
     tags |= {"recommended": str(first.recommended)} | _off_the_curve(metrics)
+    tags |= below_the_ceiling(table)
     if first.uses_prior:
-        tags["uses_prior"] = ORIENTATION_NOTE
+        tags |= {"uses_prior": ORIENTATION_NOTE} | _conflict(table, run)
     logger.info(
         "%s %s: RMSE %.4f mdps in all windows, %.4f in the first",
         *(run.study, run.tags["mlflow.runName"], metrics["rmse_mdps"]),
@@ -190,6 +193,49 @@ def _value(scores: pd.DataFrame, score: str, windows: str, column: str = "value"
         & (scores.weights == LAST)
     ]
     return float(chosen[column].iloc[0]) if chosen[column].notna().any() else np.nan
+
+
+def below_the_ceiling(scores: pd.DataFrame) -> dict[str, str]:
+    """In words, where a result's interval lies wholly beyond the ceiling's.
+
+    Args:
+        scores: From :meth:`gyro_pipeline.pipelines.evaluation.bench.Bench.scores`.
+
+    Returns:
+        The tag ``below_ceiling``, or none.
+    """
+    gains = scores[scores.weights == LAST].set_index(["truth", "windows", "score"])
+    below = []
+    for truth, windows in product((PAPER, TRUE), (FIRST, ALL)):
+        own = (truth, windows, "accuracy_gain_pct")
+        limit = (truth, windows, "ceiling_accuracy_gain_pct")
+        if {own, limit} <= set(gains.index):
+            highest = gains.hi[limit] if pd.notna(gains.hi[limit]) else gains.value[limit]
+            if gains.lo[own] > highest:
+                below.append(f"{windows} windows, truth {truth}")
+    if not below:
+        return {}
+    return {
+        "below_ceiling": f"{'; '.join(below)}: the interval of A lies wholly beyond the ceiling. "
+        f"Its premise does not hold ({PREMISE}), or test information has reached the training"
+    }
+
+
+def _conflict(scores: pd.DataFrame, run: StoredRun) -> dict[str, str]:
+    """In words, where tested recordings contradict the prior, and what the mean gives."""
+    chances = scores[scores.score.str.startswith("prior_p_") & (scores.weights == LAST)]
+    names = chances.score.str[-1].tolist()
+    axes = {axis: p for axis, p in zip(names, chances.value, strict=True) if p < _CONFLICT}
+    if not axes:
+        return {}
+    shown = ", ".join(f"{axis} (p = {p:.1g})" for axis, p in axes.items())
+    own, mean = (_value(scores, f"{name}_rmse_dps", ALL) / MDPS for name in ("test", "mean"))
+    text = (
+        f"test recordings contradict the prior on {shown}: turned, or a bias that moved on. RMSE "
+        f"{own:.3g} mdps; the running mean gives {mean:.3g}"
+    )
+    logger.warning("%s %s: %s", run.study, run.tags["mlflow.runName"], text)
+    return {"prior_conflict": text}
 
 
 def _off_the_curve(metrics: Mapping[str, float]) -> dict[str, str]:

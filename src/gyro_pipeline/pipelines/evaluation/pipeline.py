@@ -18,7 +18,6 @@ def create_pipeline(study: str, sensor: str) -> Pipeline:
                     "windows": f"{study}.{sensor}.windowed_splits.windows",
                     "bias": f"{sensor}.windowed_splits.bias",
                     "allan": f"{sensor}.ground_truth.allan",
-                    "evaluation": "params:evaluation",
                 },
                 f"{study}.{sensor}.evaluation.runs",
                 name=f"evaluate_{study}_{sensor}",

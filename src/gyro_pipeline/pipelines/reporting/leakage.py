@@ -33,8 +33,8 @@ from gyro_pipeline.pipelines.reporting.tables import percent, source_of
 from gyro_pipeline.protocol.scores import (
     curve_errors,
     holm,
+    leave_one_out,
     paired_difference,
-    resampled_weights,
     score,
     squared_errors,
 )
@@ -141,7 +141,7 @@ def _pooled(
     """All seeds of one way of training at one stride."""
     errors = pd.concat([_errors(run, weights_of) for run in runs], ignore_index=True)
     recordings, first = errors.recording.nunique(), runs[0]
-    weights = resampled_weights(recordings, evaluation.resamples, evaluation.bootstrap_seed)
+    weights = leave_one_out(recordings)
     row: dict[str, Any] = {
         "simulated": first.tags["simulated"] == "1",
         "windows": len(errors.groupby(["recording", "start"])),

@@ -14,12 +14,12 @@ from gyro_pipeline.estimators import DEFAULT, estimator_class
 from gyro_pipeline.parameters import Evaluation, Splits, Study, Training, VirtualGyros
 from gyro_pipeline.protocol.scores import (
     Estimate,
-    ResampledCurve,
     SquaredErrors,
+    WeightedCurve,
     clusters,
     curve_errors,
+    leave_one_out,
     paired_difference,
-    resampled_weights,
     rmse_difference,
     score,
     squared_errors,
@@ -285,7 +285,7 @@ class RunningMeans:
         return {windows: squared_errors(self.errors, PAPER, windows) for windows in (ALL, FIRST)}
 
     @cached_property
-    def curves(self) -> dict[str, ResampledCurve]:
+    def curves(self) -> dict[str, WeightedCurve]:
         """Its RMSE against its length, likewise."""
         curve = self.run.load(CURVE)
         curves = {windows: curve_errors(curve, PAPER, windows) for windows in (ALL, FIRST)}
@@ -298,8 +298,7 @@ class RunningMeans:
 
 
 def _resampled(errors: pd.DataFrame, evaluation: Evaluation) -> np.ndarray:
-    drawn = evaluation.resamples, evaluation.bootstrap_seed
-    return resampled_weights(clusters(errors).nunique(), *drawn)
+    return leave_one_out(clusters(errors).nunique())
 
 
 def network_row(runs: Sequence[StoredRun], mean: RunningMeans, window_s: float) -> dict[str, Any]:

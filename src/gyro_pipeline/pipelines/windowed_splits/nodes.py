@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -18,13 +19,14 @@ from gyro_pipeline.conventions import (
     UNUSED,
     InputError,
 )
-from gyro_pipeline.fingerprints import data_hash
 from gyro_pipeline.parameters import Only, Splits, Study
 from gyro_pipeline.pipelines.windowed_splits.protocols import (
     PROTOCOLS,
     Candidates,
     check_table,
 )
+from gyro_pipeline.protocol.copies import SAMPLES as COMPARED
+from gyro_pipeline.protocol.copies import near_copies
 from gyro_pipeline.protocol.recordings import (
     bias_rows,
     common_length,
@@ -74,8 +76,9 @@ def cut_to_common_length(
     Returns:
         Recordings of the length that keeps most samples, with their means: the truth of a study is
         the mean of recordings of the study's length. Their ground truth, measured again where they
-        were cut. And a row for each: ``imu, recording``; ``content``, a hash of its samples; and
-        ``masked``, the numbers of its masked samples.
+        were cut. And a row for each: ``imu, recording``; ``masked``, the numbers of its masked
+        samples; and ``copies``, the rows of those before it that are its copies, with their
+        correlation.
     """
     length, lengths = common_length(recordings), recordings["samples"].to_numpy()
     lengths, rate_hz = lengths[lengths > 0], recordings.attrs["rate_hz"]
@@ -87,11 +90,14 @@ def cut_to_common_length(
         logger.info("%s: all recordings are %.1f s", recordings.attrs["sensor"], length / rate_hz)
     means = bias.set_index([*_PLACE, "axis"]).bias_dps.to_xarray()
     alike = alike.assign(recording_mean=means.reindex_like(alike[[*_PLACE, "axis"]]))
-    rows = [
-        (imu, number, data_hash(rates, None), np.flatnonzero(np.isnan(rates).any(axis=0)))
-        for imu, number, rates in one_by_one(alike)
-    ]
-    return alike, bias, pd.DataFrame(rows, columns=[*_PLACE, "content", "masked"])
+    rows: list[tuple[Any, ...]] = []
+    starts = []
+    for imu, number, rates in one_by_one(alike):
+        rows.append((imu, number, np.flatnonzero(np.isnan(rates).any(axis=0)), []))
+        starts.append(rates[:, :COMPARED])
+    for pair in near_copies(np.stack(starts)):
+        rows[pair.second][-1].append((pair.first, pair.correlation))
+    return alike, bias, pd.DataFrame(rows, columns=[*_PLACE, "masked", "copies"])
 
 
 def _log_lengths(sensor: str, quality: pd.DataFrame, length: int, rate_hz: float) -> None:
@@ -140,8 +146,6 @@ def split_windows(  # noqa: PLR0917 - a node's arguments are its datasets
     """
     sensor, source = recordings.attrs["sensor"], recordings.attrs["source"]
     rows = study_rows(study, sensor, source, windows_s, [only.seed or 0], only)
-    places = zip(contents.imu.tolist(), contents.recording.tolist(), strict=True)
-    hashes = dict(zip(places, contents.content.tolist(), strict=True))
     drawn_from = [] if virtual is None else np.atleast_1d(virtual.attrs["drawn_from"]).tolist()
     splits = study.splits(splits)
     tables = []
@@ -154,7 +158,7 @@ def split_windows(  # noqa: PLR0917 - a node's arguments are its datasets
             drawn = _virtual_windows(virtual, size, splits)
             table = pd.concat([table, drawn.merge(table[["fold"]].drop_duplicates(), how="cross")])
         if protocol in APART:
-            check_table(table, APART[protocol], hashes, drawn_from)
+            check_table(table, APART[protocol], contents, drawn_from)
         place = table.assign(protocol=protocol, window_s=window_s, window_stride_s=stride_s)
         tables.append(place)
     return pd.concat(tables, ignore_index=True)[WINDOWS_TABLE].astype(_COMPACT)

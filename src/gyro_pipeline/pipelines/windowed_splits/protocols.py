@@ -157,7 +157,7 @@ PROTOCOLS: Mapping[str, Callable[[Candidates], Folds]] = {
 def check_table(
     table: pd.DataFrame,
     apart: str,
-    contents: Mapping[tuple[int, int], str],
+    contents: pd.DataFrame,
     drawn_from: Sequence[int],
 ) -> None:
     """Refuse what an honest windows table may not have.
@@ -165,13 +165,15 @@ def check_table(
     Args:
         table: Columns ``fold, role, origin, imu, recording`` and more.
         apart: What has one role in a fold: ``recording``, of all IMUs together, or ``imu``.
-        contents: A hash of the samples of each real recording, by IMU and number.
+        contents: A row per real recording: ``imu, recording, copies``, from
+            :func:`gyro_pipeline.pipelines.windowed_splits.nodes.cut_to_common_length`.
         drawn_from: Real recordings from which the virtual ones were drawn.
 
     Raises:
-        InputError: A recording or device has two roles in a fold; a recording is there twice, with
-            two roles; a virtual recording that trains was drawn from one that tests; or a fold that
-            tests has nothing to train on. It names the fold and the recordings.
+        InputError: A recording or device has two roles in a fold; a recording and a copy of it,
+            exact or nearly so, have two roles; a virtual recording that trains was drawn from one
+            that tests; or a fold that tests has nothing to train on. It names the fold and the
+            recordings.
     """
     places = table.drop_duplicates(["fold", "role", "origin", "imu", "recording"])
     for fold, rows in places.groupby("fold", observed=True, sort=False):
@@ -207,13 +209,17 @@ def _refuse_two_roles(fold: str, rows: pd.DataFrame, apart: str) -> None:
             )
 
 
-def _refuse_copies(fold: str, rows: pd.DataFrame, contents: Mapping[tuple[int, int], str]) -> None:
-    first: dict[str, tuple[int, int, str]] = {}
-    for imu, number, role in rows[["imu", "recording", "role"]].itertuples(index=False):
-        twin = first.setdefault(contents[imu, number], (imu, number, role))
-        if twin[2] != role and twin[:2] != (imu, number):
-            raise InputError(
-                f"{fold}: IMU {imu} recording {number} ({role}) holds the same samples as IMU "
-                f"{twin[0]} recording {twin[1]} ({twin[2]}); leave one of them out, or give both "
-                "the same role"
-            )
+def _refuse_copies(fold: str, rows: pd.DataFrame, contents: pd.DataFrame) -> None:
+    roles = rows.groupby(["imu", "recording"]).role.agg(set).to_dict()
+    places = list(zip(contents.imu, contents.recording, strict=True))
+    for place, copies in zip(places, contents.copies, strict=True):
+        for other, correlation in copies:
+            own, twin = roles.get(place, set()), roles.get(places[other], set())
+            if own and twin and own | twin != own & twin:
+                (imu, number), (imu_2, number_2) = place, places[other]
+                raise InputError(
+                    f"{fold}: IMU {imu} recording {number} ({', '.join(sorted(own))}) is a copy of "
+                    f"IMU {imu_2} recording {number_2} ({', '.join(sorted(twin))}): their noise "
+                    f"has a correlation of {correlation:.2f}, where two recordings have less than "
+                    "0.1; leave one of them out, or give both the same role"
+                )

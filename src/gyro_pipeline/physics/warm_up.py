@@ -1,0 +1,134 @@
+"""A bias that settles after power-on: what recordings show of it, and what it would explain.
+
+The bias is b + a exp(-t / time constant), with an amplitude a that is much the same at every
+power-on. The running mean of the first T0 seconds is then off from the mean of the recording by a
+times
+
+    d = w(T0) - w(T),    w(t) = (time constant / t) (1 - exp(-t / time constant))
+
+and whoever knows the device, even by a constant, knows that in advance.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+from gyro_pipeline.conventions import PAPER
+from gyro_pipeline.physics.ceiling import ceiling_rmse, pooled, running_mean_rmse
+from gyro_pipeline.physics.recording_model import block_edges, block_means, profiles
+
+Array = NDArray[np.float64]
+
+_BLOCK_S = 1.0
+_LAST = 0.25  # of a recording, by whose mean it is centred
+
+
+@dataclass(frozen=True)
+class Settling:
+    """Mean rate against time after power-on, less that of each recording's last part.
+
+    Attributes:
+        time_s: (m,), middles of the blocks.
+        rate: (axes, m), deg/s, mean over the recordings.
+        half: Half of its 95 % interval over recordings, the same shape; NaN for a single one.
+    """
+
+    time_s: Array
+    rate: Array
+    half: Array
+
+
+def settling(recordings: NDArray[np.floating], rate_hz: float) -> Settling:
+    """What all recordings together show of a warm-up.
+
+    Args:
+        recordings: (n, axes, samples), deg/s, from power-on; no NaN.
+        rate_hz: Samples per second.
+    """
+    edges = block_edges(recordings.shape[-1], round(_BLOCK_S * rate_hz))
+    means = block_means(recordings, edges)
+    last = means.shape[-1] - max(1, round(_LAST * means.shape[-1]))
+    centred = means - means[..., last:].mean(axis=-1, keepdims=True)
+    time_s = (edges[:-1] + edges[1:]) / 2 / rate_hz
+    return Settling(time_s, centred.mean(axis=0), _half(centred))
+
+
+@dataclass(frozen=True)
+class CommonWarmUp:
+    """The amplitude that recordings have in common, for a time constant.
+
+    Attributes:
+        amplitude: (axes,), deg/s.
+        half: Half of its 95 % interval over recordings, (axes,), deg/s.
+    """
+
+    amplitude: Array
+    half: Array
+
+    @property
+    def bound(self) -> Array:
+        """The largest amplitude, of either sign, that the interval holds, (axes,), deg/s."""
+        return np.asarray(np.abs(self.amplitude) + self.half)
+
+
+def fit_common_warm_up(
+    recordings: NDArray[np.floating], rate_hz: float, time_constant_s: float
+) -> CommonWarmUp:
+    """Fit each recording's amplitude beside its level, by least squares, and average them.
+
+    Args:
+        recordings: (n, axes, samples), deg/s, from power-on; no NaN.
+        rate_hz: Samples per second.
+        time_constant_s: Of all recordings.
+    """
+    edges = block_edges(recordings.shape[-1], round(_BLOCK_S * rate_hz))
+    decay = profiles(edges, rate_hz, time_constant_s)[:, 1]
+    shape = decay - decay.mean()
+    amplitudes = block_means(recordings, edges) @ shape / (shape @ shape)
+    return CommonWarmUp(amplitudes.mean(axis=0), _half(amplitudes))
+
+
+def amplitude_needed(
+    gain: float,
+    noise: ArrayLike,
+    turn_on_spread: ArrayLike,
+    window_s: float,
+    recording_s: float,
+    time_constant_s: ArrayLike,
+) -> Array:
+    """Amplitude of a warm-up with which an accuracy gain in first windows is the ceiling.
+
+    The best estimator knows the amplitude, so its error is that without a warm-up. The running
+    mean's is larger by a d.
+
+    Args:
+        gain: A, a fraction.
+        noise: N of each axis, deg/s sqrt(s).
+        turn_on_spread: tau of each axis, deg/s.
+        window_s: T0.
+        recording_s: T.
+        time_constant_s: Of the warm-up, of any shape.
+
+    Returns:
+        deg/s, of the shape of ``time_constant_s``; 0 where the gain needs none.
+    """
+    given = window_s, recording_s, PAPER
+    best = pooled(ceiling_rmse(noise, turn_on_spread, *given))
+    mean = pooled(running_mean_rmse(noise, *given))
+    off = np.sqrt(np.maximum((best / (1 - gain)) ** 2 - mean**2, 0.0))
+    time = np.asarray(time_constant_s, np.float64)
+    of_window, of_recording = (
+        time / length * -np.expm1(-length / time) for length in (window_s, recording_s)
+    )
+    return np.asarray(off / (of_window - of_recording))
+
+
+def _half(values: Array) -> Array:
+    """Half of the 95 % interval of a mean over the first axis."""
+    n = len(values)
+    if n == 1:
+        return np.full(values.shape[1:], np.nan)
+    error = values.std(axis=0, ddof=1) / np.sqrt(n)
+    return np.asarray(stats.t.ppf(0.975, n - 1) * error)

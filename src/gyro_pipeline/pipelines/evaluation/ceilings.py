@@ -1,0 +1,167 @@
+"""What can be expected of the best estimator on a device, by the premise that it rests on."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from gyro_pipeline.conventions import DISJOINT, FIRST, PAPER
+from gyro_pipeline.physics.ceiling import (
+    best_gain,
+    best_saving,
+    ceiling_rmse,
+    pooled,
+    running_mean_rmse,
+)
+from gyro_pipeline.physics.recording_model import RecordingModel, joint_squares, mean_squares
+from gyro_pipeline.pipelines.evaluation.device import TestDevice
+from gyro_pipeline.protocol.scores import CONFIDENCE_PCT, Estimate, WeightedCurve
+
+PREMISE = "linear, axis by axis, recordings exchangeable, no history"
+"""What the ceiling of measured data is: honest estimators can be better where it does not hold."""
+
+_CURVE_POINTS = 30  # of the expected running mean, to interpolate between
+
+
+@dataclass(frozen=True)
+class Ceilings:
+    """Least expected errors on a device, for windows of one length.
+
+    Attributes:
+        device: What is known of the device that tests.
+        distinct: Its models, by axis and time constant, where noise is not white or a bias warms
+            up.
+        size: Samples of a window.
+        samples: Of a recording.
+        rate_hz: Samples per second.
+    """
+
+    device: TestDevice
+    distinct: Sequence[tuple[int, RecordingModel]]
+    size: int
+    samples: int
+    rate_hz: float
+
+    @property
+    def basis(self) -> str:
+        """In words, what the ceilings are computed from."""
+        if self.device.unit_bias is None:
+            noise = "white noise" if self.device.models is None else "fitted N, B and K"
+            return f"estimated from recordings, {noise}; {PREMISE}"
+        if self.device.models is not None and len(self.distinct) > len(self.device.models):
+            return (
+                "drawn values, the time constant of each warm-up among them: nobody who must learn "
+                "it from the window can come this far"
+            )
+        return "drawn values"
+
+    def of(self, truth: str, windows: str) -> dict[str, Estimate]:
+        """RMSE, A and, for the paper's truth, S of the best; also jointly over axes, with history.
+
+        On measured data each has the interval that what is not known of the turn-on spread leaves.
+        Nothing is returned for the mean outside the window where noise is coloured or a bias warms
+        up: estimators are asked for the bias, which is something else there.
+
+        Args:
+            truth: PAPER, DISJOINT or TRUE.
+            windows: ``first`` or ``all``.
+        """
+        if truth == DISJOINT and self.device.models is not None:
+            return {}
+        if (truth, windows) not in self._made:
+            self._made[truth, windows] = self._of(truth, windows)
+        return self._made[truth, windows]
+
+    @cached_property
+    def _made(self) -> dict[tuple[str, str], dict[str, Estimate]]:
+        return {}
+
+    def _of(self, truth: str, windows: str) -> dict[str, Estimate]:
+        device = self.device
+        best, mean = self._expected(truth, windows, self.size, device.spread**2)
+        if mean.min() <= 0:
+            return {}
+        ratio = np.sqrt(best / mean)
+        limits = {
+            "ceiling_rmse_dps": with_draws(np.sqrt(best)),
+            "ceiling_accuracy_gain_pct": with_draws(100 * best_gain(ratio)),
+        }
+        if truth == PAPER:
+            saving = 100 * self._saving(windows, ratio, np.sqrt(best))
+            limits["ceiling_time_saving_pct"] = with_draws(saving)
+        others = {}
+        if device.joint is not None:
+            assert device.models is not None
+            starts = self._starts(windows, self.size)
+            squares = [
+                joint_squares(device.models, start, self.size, truth, device.joint)
+                for start in starts
+            ]
+            others["joint"] = np.mean(squares, axis=0), mean[0]
+        if device.history is not None:
+            others["history"] = self._expected(truth, windows, self.size, device.history[None])
+        for name, (square, of_mean) in others.items():
+            limits[f"ceiling_{name}_rmse_dps"] = with_draws(np.sqrt(square))
+            gain = 100 * best_gain(np.sqrt(square / of_mean))
+            limits[f"ceiling_{name}_accuracy_gain_pct"] = with_draws(gain)
+        return limits
+
+    def _starts(self, windows: str, size: int) -> range:
+        starts = range(0, self.samples - size + 1, size)
+        return starts[:1] if windows == FIRST else starts
+
+    def _expected(
+        self, truth: str, windows: str, size: int, variances: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Mean squares of the best estimate and the running mean over axes and windows.
+
+        Args:
+            truth: PAPER, DISJOINT or TRUE.
+            windows: ``first`` or ``all``.
+            size: Samples of the window.
+            variances: Of the prior of the bias, (n, axes), (deg/s)^2.
+
+        Returns:
+            Two of (n,), (deg/s)^2.
+        """
+        device = self.device
+        if device.models is None:
+            times = size / self.rate_hz, self.samples / self.rate_hz
+            best = pooled(ceiling_rmse(device.noise, np.sqrt(variances), *times, truth)) ** 2
+            mean = pooled(running_mean_rmse(device.noise, *times, truth)) ** 2
+            return best, np.full(best.shape, mean)
+        squares = [
+            mean_squares(model, start, size, truth, covariances=_priors(model, variances[:, axis]))
+            for axis, model in self.distinct
+            for start in self._starts(windows, size)
+        ]
+        best, mean = np.mean(squares, axis=0)
+        return best, mean
+
+    def _saving(self, windows: str, ratio: np.ndarray, limit: np.ndarray) -> np.ndarray:
+        """1 - T0 / t*, where the running mean of t* is expected to be as good as the limit."""
+        if self.device.models is None:
+            return best_saving(ratio, self.size / self.samples)
+        sizes = np.unique(np.geomspace(self.size, self.samples, _CURVE_POINTS).astype(int))
+        first = self.device.spread[:1] ** 2
+        # of the whole recording it is 0, but for rounding
+        curve = [max(self._expected(PAPER, windows, int(n), first)[1][0], 0.0) for n in sizes]
+        falling = WeightedCurve(sizes.astype(float), np.sqrt([curve]), np.ones(sizes.size)).falling
+        reached = np.interp(-limit, -falling, sizes)
+        return 1 - self.size / reached
+
+
+def _priors(model: RecordingModel, variances: np.ndarray) -> np.ndarray:
+    """Covariances of a model's prior with each of the variances of the bias, (n, k, k)."""
+    covariances = np.repeat(model.covariance[None], len(variances), axis=0)
+    covariances[:, 0, 0] = variances
+    return covariances
+
+
+def with_draws(values: np.ndarray) -> Estimate:
+    """The first value, with the central 95 % of the others as its interval, if there are any."""
+    if len(values) == 1:
+        return Estimate(float(values[0]))
+    tails = 50 + np.array([-CONFIDENCE_PCT, CONFIDENCE_PCT]) / 2
+    return Estimate(float(values[0]), *map(float, np.percentile(values[1:], tails)))
