@@ -74,8 +74,8 @@ def test_before_any_sample_the_answer_is_the_history():
 def test_with_history_it_is_the_posterior_mean():
     """One calibration, N known: weights by the inverse variances, tau twice, the mixture aside."""
     state = finished(still(10), history=history(), now=DECLARED)
-    own, past = state.own_sigma_dps**-2, state.history_sigma_dps**-2
-    expected = (own * state.own_dps + past * state.history_dps) / (own + past)
+    own, past = 1 / state.stretch.estimate.variance, 1 / state.stretch.prior.narrow
+    expected = (own * state.stretch.estimate.bias + past * state.stretch.prior.mean) / (own + past)
     np.testing.assert_allclose(state.bias_dps, expected, atol=5e-5)
     np.testing.assert_allclose(state.sigma_dps, (own + past) ** -0.5, rtol=0.03)
 
@@ -83,7 +83,7 @@ def test_with_history_it_is_the_posterior_mean():
 def test_a_heading_that_is_not_declared_costs_the_earths_rate_twice():
     known = DECLARED, Circumstances(latitude_deg=60.0)
     declared, not_declared = (Calibrator(KIND, RATE, history(), now).state() for now in known)
-    added = not_declared.history_sigma_dps**2 - declared.history_sigma_dps**2
+    added = not_declared.stretch.prior.narrow - declared.stretch.prior.narrow
     np.testing.assert_allclose(added, (4.178e-3 * 0.5) ** 2, rtol=1e-6)
     assert "heading" in codes(not_declared)
     assert "heading" not in codes(declared)
@@ -93,7 +93,7 @@ def test_with_an_accelerometer_the_vertical_axis_is_free_of_it():
     up, samples = np.array([0.0, 0, 1]), still(5)
     past = [replace(c, gravity=(0.0, 0.0, 1.0)) for c in history()]
     gravity = np.tile(up, (len(samples), 1))
-    sigma = finished(samples, history=past, gravity=gravity).history_sigma_dps
+    sigma = finished(samples, history=past, gravity=gravity).stretch.prior.narrow ** 0.5
     assert np.all(sigma[:2] > 4e-3)
     assert sigma[2] < 0.5e-3
 
@@ -117,7 +117,7 @@ def test_how_a_recording_is_cut_changes_no_bit(seed):
         part = slice(first, last)
         parts.update(time_s[part], samples[part], gravity[part], warmth[part])
     one, other = whole.finish(), parts.finish()
-    for name in ("bias_dps", "sigma_dps", "history_dps", "history_sigma_dps", "seconds_left"):
+    for name in ("bias_dps", "sigma_dps", "seconds_left"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
     assert one.reasons == other.reasons
     assert (one.rest, one.seconds_at_rest) == (other.rest, other.seconds_at_rest)
@@ -206,7 +206,7 @@ def test_a_wrong_history_is_dropped_where_it_is_wrong():
     ]
     state = finished(still(10), history=past, now=DECLARED, gravity=np.tile(up, (1000, 1)))
     assert state.history == ("used", "used", "dropped")
-    assert state.bias_dps[2] == state.own_dps[2]
+    assert state.bias_dps[2] == state.stretch.estimate.bias[2]
     assert [r.axis for r in state.reasons if r.code == "conflict"] == ["z"]
 
 

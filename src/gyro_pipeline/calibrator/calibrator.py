@@ -4,8 +4,9 @@ Samples are cut into blocks of 0.5 s by their number, and a stretch in one attit
 (:mod:`.stretch`). Nothing here reads a clock, starts a thread or knows of files.
 """
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -20,7 +21,7 @@ from gyro_pipeline.calibrator.history import MOVING, STILL, UNSURE, Calibration,
 from gyro_pipeline.calibrator.reasons import Reason, reason, reasons_of, unit_reason
 from gyro_pipeline.calibrator.rest import ATTITUDE, MOTION, NOISE, Alarm, Blocks
 from gyro_pipeline.calibrator.stretch import BLOCK_S, Mask, Setup, Stretch
-from gyro_pipeline.conventions import MDPS, InputError
+from gyro_pipeline.conventions import AXES, MDPS, InputError
 
 LEAST_S, LEAST_UNKNOWN_S = 1.0, 10.0
 """Seconds at rest before a target counts as reached: where the noise is known, and where not."""
@@ -36,27 +37,13 @@ _PATIENCE = 20  # blocks of motion after which rest is looked for anew
 _TURN_DEG = 1.0  # the attitude is the same after a motion that turned the device by less
 
 
-@dataclass(frozen=True)
-class Counts:
-    """What was noticed of the samples so far."""
-
-    samples: int = 0
-    not_finite: int = 0
-    zero: int = 0
-    gaps: int = 0
-    gap_s: float = 0.0
-    jumps: int = 0
-    constant: Array = field(default_factory=lambda: np.zeros(3))  # blocks in a row of one value
-    dead: Mask = field(default_factory=lambda: np.zeros(3, bool))
-    ended: dict[str, Reason] = field(default_factory=dict)  # why stretches ended, the last of each
-
-
 @dataclass(frozen=True, eq=False)
 class State:
     """The answer so far; NaN and infinity stand where there is no number. Arrays are (3,)."""
 
     stretch: Stretch  # that the answer is from
-    counts: Counts
+    counts: Counter[str]  # of samples, gaps and what else was noticed
+    ended: dict[str, Reason]  # why stretches ended, the last of each; dead axes
     rest: str  # STILL, MOVING or UNSURE
     time_s: float  # since the first sample
     least_s: float  # at rest, for a target to count as reached
@@ -73,26 +60,6 @@ class State:
         return np.sqrt(self.stretch.variance)
 
     @property
-    def own_dps(self) -> Array:
-        """The bias by this log alone."""
-        return self.stretch.estimate.bias
-
-    @property
-    def own_sigma_dps(self) -> Array:
-        """Its standard deviation."""
-        return np.sqrt(self.stretch.estimate.variance)
-
-    @property
-    def history_dps(self) -> Array:
-        """The bias by the history alone."""
-        return self.stretch.prior.mean
-
-    @property
-    def history_sigma_dps(self) -> Array:
-        """Its standard deviation."""
-        return np.sqrt(self.stretch.prior.narrow)
-
-    @property
     def seconds_at_rest(self) -> float:
         """Of the stretch that the answer is from."""
         return self.stretch.seconds
@@ -104,11 +71,10 @@ class State:
 
     @property
     def reached(self) -> bool:
-        """Whether all axes are at the target, after the least time; true where none is given."""
-        if self.target_dps is None:
-            return self.seconds_at_rest >= self.least_s
+        """Whether all axes are at the target, where one is given, after the least time."""
+        target_dps = np.inf if self.target_dps is None else self.target_dps
         long = self.seconds_at_rest >= self.least_s
-        return long and bool(self.stretch.reached(self.target_dps).all())
+        return long and bool(self.stretch.reached(target_dps).all())
 
     @property
     def done(self) -> bool:
@@ -126,7 +92,7 @@ class State:
     @cached_property
     def reasons(self) -> tuple[Reason, ...]:
         """What should be known about the answer, the most important first."""
-        return tuple(reasons_of(self.counts, self.stretch, self.target_dps))
+        return tuple(reasons_of(self.counts, self.ended, self.stretch, self.target_dps))
 
 
 class Calibrator:
@@ -148,7 +114,9 @@ class Calibrator:
             raise InputError(f"rate_hz: expected at least 2 samples a second, got {rate_hz}")
         now = now or Circumstances()
         self.setup = Setup(device_type, float(rate_hz), tuple(history), now)
-        self.target_dps, self.counts = target_dps, Counts()
+        self.target_dps, self.counts = target_dps, Counter[str]()
+        self.ended = dict[str, Reason]()
+        self._constant = np.zeros(3)  # blocks in a row of one value
         self.least_s = LEAST_S if np.all(self.setup.known[1] > 0) else LEAST_UNKNOWN_S
         self._pending = np.empty((0, _COLUMNS))  # samples of a block that is not full
         self._last_time: float | None = None
@@ -244,7 +212,8 @@ class Calibrator:
         rest = self._rest(stretch, finished)
         if finished and rest == MOVING:
             stretch = Stretch.start(self.setup, self.time_s)
-        return State(stretch, self.counts, rest, self.time_s, self.least_s, self.target_dps)
+        noticed = self.counts.copy(), self.ended
+        return State(stretch, *noticed, rest, self.time_s, self.least_s, self.target_dps)
 
     @property
     def best(self) -> Stretch:
@@ -300,18 +269,12 @@ class Calibrator:
         # a sum is finite where all are, and rates of 0 have one
         finite = np.isfinite(rows[:, 0] + rows[:, 1] + rows[:, 2] + rows[:, 3])
         zero = (rows[:, 1] == 0) & (rows[:, 2] == 0) & (rows[:, 3] == 0)
-        self._count(
-            samples=len(rows), not_finite=int(np.sum(~finite)), zero=int(np.count_nonzero(zero))
-        )
+        bad = {"not_finite": int(np.sum(~finite)), "zero": int(np.sum(zero))}
+        self.counts.update(samples=len(rows), **bad)
         if len(rows) and np.isfinite(rows[-1, 0]):
             self._last_time = float(rows[-1, 0])
         good = finite & ~zero
         return rows if good.all() else rows[good]
-
-    def _count(self, **more: Any) -> None:
-        """Add to what was noticed."""
-        sums = {name: getattr(self.counts, name) + value for name, value in more.items()}
-        self.counts = replace(self.counts, **sums)
 
     def _take_whole_blocks(self, rows: Array) -> Array:
         """Take the blocks of rows without a gap; returns the rows that are left."""
@@ -327,21 +290,20 @@ class Calibrator:
         return rows[used:]
 
     def _look_for_dead_axes(self, constant: Mask) -> None:
-        if not (constant.any() or self.counts.constant.any()):
-            return
-        for axes in constant:
-            in_a_row = np.where(axes, self.counts.constant + 1, 0)
-            dead = self.counts.dead | (in_a_row >= _DEAD_BLOCKS)
-            self.counts = replace(self.counts, constant=in_a_row, dead=dead)
+        for axes in constant if constant.any() or self._constant.any() else ():
+            self._constant = np.where(axes, self._constant + 1, 0)
+            for axis in np.flatnonzero(self._constant >= _DEAD_BLOCKS):
+                self.ended = {**self.ended, AXES[axis]: reason("dead", axis=axis)}
 
     def _cross_gap(self, start: float) -> None:
         """Move on to where rows start, if that is not where the last block ended."""
         gap = 0.0 if self._end is None else start - self._end
         if gap < -1 / self.setup.rate_hz or gap > _JUMP_S:
-            self._count(jumps=1)
+            self.counts["jumps"] += 1
             gap = self.setup.block_s
         elif gap > BLOCK_S / 2:
-            self._count(gaps=1, gap_s=gap)
+            self.counts["gaps"] += 1
+            self.counts["gap_ms"] += round(gap * 1e3)
         else:
             return
         self._skipped_s += gap
@@ -395,7 +357,7 @@ class Calibrator:
             told = unit_reason(alarm.value, name)
         words: dict[str, Any] = {"name": name, "factor": alarm.value, "rate": alarm.value / MDPS}
         told = told or reason(alarm.code, self.time_s, sigma=alarm.sigma / MDPS, **words)
-        self.counts = replace(self.counts, ended={**self.counts.ended, alarm.code: told})
+        self.ended = {**self.ended, alarm.code: told}
         shown = alarm.code == MOTION and self.stretch.blocks >= _REFERENCE
         if shown or alarm.code == ATTITUDE:  # what came before it was at rest
             self._rest_s += self.stretch.seconds
@@ -410,7 +372,7 @@ class Calibrator:
         if self.setup.now.known_still:
             return STILL if stretch.blocks else UNSURE
         enough = stretch.seconds >= max(min(self.least_s, 2 * LEAST_S), self._proof_s)
-        ended = bool(self.counts.ended.keys() - {ATTITUDE})
+        ended = bool(self.ended.keys() - {ATTITUDE, *AXES})
         if finished:
             half = self._rest_s + self.stretch.seconds >= self.time_s / 2
             cut = any(note.code == "cut" for note in stretch.notes)

@@ -88,7 +88,9 @@ def notes(state: State) -> Iterator[str]:
 def _from(state: State, axis: int) -> str:
     """What an axis's answer is made of."""
     if state.history[axis] == USED:
-        own, past = state.own_sigma_dps[axis] / MDPS, state.history_sigma_dps[axis] / MDPS
+        stretch = state.stretch
+        variances = stretch.estimate.variance[axis], stretch.prior.narrow[axis]
+        own, past = np.sqrt(variances) / MDPS
         return f"this log {own:.2f}, history {past:.2f}"
     conflicts = [r for r in state.reasons if r.code == "conflict" and r.axis == AXES[axis]]
     return f"this log alone: {conflicts[0].sentence}" if conflicts else "this log"
@@ -188,7 +190,8 @@ def _draw(panel: Any, states: Sequence[State], axis: int) -> None:
     panel.fill_between(times, bias - band, bias + band, alpha=0.25, label="95 %")
     panel.plot(times, bias, label="estimate")
     if last.history[axis] != NONE:
-        past, width = last.history_dps[axis] - centre, 1.96 * last.history_sigma_dps[axis]
+        prior = last.stretch.prior
+        past, width = prior.mean[axis] - centre, 1.96 * np.sqrt(prior.narrow[axis])
         low, high = (past - width) / MDPS, (past + width) / MDPS
         panel.axhspan(low, high, color="C1", alpha=0.2, label="history, 95 %")
     for reason in last.reasons:

@@ -1,5 +1,6 @@
 """What should be known about an answer: codes for programs, sentences for people."""
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, SupportsIndex
@@ -9,7 +10,6 @@ import numpy as np
 from gyro_pipeline.conventions import AXES, MDPS
 
 if TYPE_CHECKING:
-    from gyro_pipeline.calibrator.calibrator import Counts
     from gyro_pipeline.calibrator.stretch import Stretch
 
 UNUSABLE_CODES = {"dead", "unit"}
@@ -95,10 +95,16 @@ def unit_reason(factor: float, name: str) -> Reason | None:
     return reason("unit", factor, _FAR, unit=_UNITS[near], **words)
 
 
-def reasons_of(counts: "Counts", stretch: "Stretch", target_dps: float | None) -> Iterator[Reason]:
+def reasons_of(
+    counts: Counter[str], ended: dict[str, Reason], stretch: "Stretch", target_dps: float | None
+) -> Iterator[Reason]:
     """All that should be known, the most important first."""
-    yield from _of_data(counts)
-    yield from counts.ended.values()
+    yield from ended.values()
+    for code in ("zero", "not_finite"):
+        if 0 < counts[code] < counts["samples"]:
+            yield reason(code, counts[code], counts["samples"])
+        elif counts[code]:
+            yield reason(f"dead {code}")
     setup, (noise, freedom) = stretch.setup, stretch.log_noise()
     if noise is not None and freedom >= _ENOUGH and np.all(setup.known[1] > 0):
         factors = noise / (np.sqrt(setup.known[0]) * setup.noise.white)  # also too little noise
@@ -110,22 +116,12 @@ def reasons_of(counts: "Counts", stretch: "Stretch", target_dps: float | None) -
     if setup.now.attempt > 1:
         yield reason("attempt", setup.now.attempt)
     yield from _of_noise(stretch, target_dps)
-    if counts.gaps:
-        yield reason("gap", counts.gap_s, places=counts.gaps)
-    if counts.jumps:
-        yield reason("clock", counts.jumps)
+    if counts["gaps"]:
+        yield reason("gap", counts["gap_ms"] / 1e3, places=counts["gaps"])
+    if counts["jumps"]:
+        yield reason("clock", counts["jumps"])
     yield from _of_temperature(stretch)
     yield from _of_rotation(stretch)
-
-
-def _of_data(counts: "Counts") -> Iterator[Reason]:
-    for axis in np.flatnonzero(counts.dead):
-        yield reason("dead", axis=axis)
-    for code, number in (("zero", counts.zero), ("not_finite", counts.not_finite)):
-        if 0 < number < counts.samples:
-            yield reason(code, number, counts.samples)
-        elif number:
-            yield reason(f"dead {code}")
 
 
 def _of_noise(stretch: "Stretch", target_dps: float | None) -> Iterator[Reason]:
