@@ -135,9 +135,7 @@ class Filter(NamedTuple):
     def update(self, mean: Array | None) -> tuple[Self, Array]:
         """Take the mean of a block, (3,), deg/s; None looks ahead: all but the data moves on.
 
-        Returns:
-            The next filter, and the block's innovation (3,) in units of its standard deviation;
-            0 at the first block.
+        The second result is the innovation (3,) in its standard deviation; 0 at the first block.
         """
         reference = self.reference if self.blocks or mean is None else mean
         step = _step(self.noise, self.block_s)

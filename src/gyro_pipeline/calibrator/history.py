@@ -247,12 +247,9 @@ def _krige(
 ) -> tuple[Array, Array, Array]:
     """Restricted deviance, conditional means and variances of k targets at each point of a grid.
 
-    Args:
-        among: (g, n, n), covariance of the evidence.
-        cross: (g, n, k), of the evidence with the targets.
-        own: (g, k), variances of the targets.
-        y: (n,), the evidence, about an unknown level.
-        flat: (k,), by how much a target moves with the level.
+    ``among`` (g, n, n) is the covariance of the evidence y (n,) about an unknown level, ``cross``
+    (g, n, k) that with the targets, ``own`` (g, k) holds the targets' variances, and ``flat`` (k,)
+    by how much a target moves with the level.
     """
     reference = y.mean()
     columns = np.stack([np.ones(len(y)), y - reference], axis=-1)

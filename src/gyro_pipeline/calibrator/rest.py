@@ -52,11 +52,8 @@ class Alarm(NamedTuple):
 class RestMonitor:
     """The three tests over one stretch; :meth:`update` returns a new one.
 
-    Args:
-        size: Samples in a block.
-        block_s: Its length, seconds.
-        least_dps: Smaller changes of the rate are the bias's own.
-        freedom: (3,), degrees of freedom of the noise known beforehand; 0: unknown.
+    A block has ``size`` samples, changes of the rate below ``least_dps`` are the bias's own, and
+    ``freedom`` (3,) is that of the noise known beforehand, 0 where it is not known.
     """
 
     def __init__(self, size: int, block_s: float, least_dps: float, freedom: Array) -> None:
@@ -74,15 +71,10 @@ class RestMonitor:
     def update(
         self, innovations: Array, white: Array, blocks: Blocks
     ) -> tuple[Self, int, Alarm | None]:
-        """Take n blocks; how they are dealt to calls changes no bit.
+        """The monitor after n blocks, and the first alarm with the number of its block, or n.
 
-        Args:
-            innovations: (n, 3), in units of the standard deviation known beforehand.
-            white: (3,), deg/s, standard deviation of the white noise of a block's mean.
-            blocks: The blocks themselves.
-
-        Returns:
-            The monitor after all of them, and the first alarm with the number of its block, or n.
+        ``innovations`` (n, 3) are in units of the standard deviation known beforehand, ``white``
+        (3,) is that of the white noise of a block's mean, deg/s.
         """
         after, n = copy(self), len(innovations)
         after.detector = copy(self.detector)
@@ -102,8 +94,7 @@ class RestMonitor:
     def _noise(self, innovations: Array) -> Array:
         """The noise over the known one where it is too high, else NaN, (n, 3).
 
-        The mean square of the innovations is compared with 1 by its cube root, which is nearly
-        normal (Wilson and Hilferty).
+        The cube root of the mean square of innovations is nearly normal (Wilson and Hilferty).
         """
         self._squares = _summed(self._squares, innovations**2)
         count = self.blocks + 1 + np.arange(len(innovations))
@@ -151,11 +142,8 @@ def _rotation(sums: Array, n: NDArray[np.integer]) -> tuple[Array, Array]:
 
     Gravity turns in the axes of the device by -w x g, so w = g x slope / g^2 but for its part along
     g. The noise of a block is that of its samples, or more where neighbours differ by more.
-
-    Args:
-        sums: (m, 10), over n blocks, of t, t^2, g, g t, the variance of a block's mean and the
-            squared difference from the block before.
-        n: (m, 1), blocks so far.
+    ``sums`` (m, 10) are over n (m, 1) blocks, of t, t^2, g, g t, the variance of a block's mean and
+    the squared difference from the block before.
     """
     of_time = np.maximum(sums[:, 1:2] - sums[:, :1] ** 2 / n, 1e-12)
     mean, slope = sums[:, 2:5] / n, (sums[:, 5:8] - sums[:, :1] * sums[:, 2:5] / n) / of_time

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gyro_pipeline.calibrator.device_types import DeviceType
-from gyro_pipeline.calibrator.filter import Array, Estimate, Filter, Noise
+from gyro_pipeline.calibrator.filter import Array, Estimate, Filter
 from gyro_pipeline.calibrator.history import (
     DROPPED,
     NONE,
@@ -43,7 +43,7 @@ _AHEAD = 64  # blocks that are looked ahead at a time
 _TWO_SIDED = 1.959964
 
 
-@dataclass(frozen=True)
+@dataclass
 class Setup:
     """What is known before the first sample."""
 
@@ -52,39 +52,16 @@ class Setup:
     history: Sequence[Calibration]  # the oldest first
     now: Circumstances
 
-    @cached_property
-    def size(self) -> int:
-        """Samples in a block."""
-        return max(round(BLOCK_S * self.rate_hz), _LEAST_SAMPLES)
-
-    @cached_property
-    def block_s(self) -> float:
-        """Length of a block, seconds."""
-        return self.size / self.rate_hz
-
-    @cached_property
-    def noise(self) -> Noise:
-        """That of the type."""
-        return self.device_type.noise
-
-    @cached_property
-    def known(self) -> tuple[Array, Array]:
-        """N^2 over that of the type, (3,), and its degrees of freedom.
-
-        They are infinite where N is known, and 0 where it is not.
-        """
-        return noise_of(self.history, self.device_type)
-
-    @cached_property
-    def block_noise(self) -> tuple[Array, Array]:
-        """N over that of the type, and the standard deviation of white noise in a block, (3,)."""
-        factor = np.sqrt(self.known[0])
-        return factor, factor * self.noise.white / np.sqrt(self.block_s)
-
-    @cached_property
-    def unseen_prior(self) -> Prior:
-        """What the history says where neither attitude nor temperature is known."""
-        return prior_of(self.history, self.device_type, self.now)
+    def __post_init__(self) -> None:
+        size = max(round(BLOCK_S * self.rate_hz), _LEAST_SAMPLES)  # samples in a block
+        self.size, self.block_s, self.noise = size, size / self.rate_hz, self.device_type.noise
+        # N^2 over that of the type, (3,), and its degrees of freedom: infinite where it is known,
+        # 0 where it is not.
+        self.known = noise_of(self.history, self.device_type)
+        self.factor = np.sqrt(self.known[0])
+        self.white = self.factor * self.noise.white / np.sqrt(self.block_s)  # of a block's mean
+        # Where neither attitude nor temperature is known.
+        self.unseen_prior = prior_of(self.history, self.device_type, self.now)
 
     def prior(self, up: Array | None, celsius: float, believed: bool) -> Prior:
         """What the history says; ``believed``: that a declared heading repeats."""
@@ -169,12 +146,9 @@ class Stretch:
         return x, y, z
 
     def take(self, blocks: Blocks) -> tuple["Stretch", int, Alarm | None]:
-        """The stretch with blocks more, up to the first that is none at rest.
+        """The stretch after some of the blocks; how many; and if that is none, the alarm.
 
         How they are dealt to calls changes no bit.
-
-        Returns:
-            The stretch after some of the blocks; how many; and if there are none, the alarm.
         """
         before, blocks = self._prepared(blocks)
         filters, innovations, temperatures = [before.filter], [], [before.temperature]
@@ -185,9 +159,8 @@ class Stretch:
             temperatures.append(temperatures[-1].add(celsius))
         monitor, count, alarm = before.monitor, len(innovations), None
         if not self.setup.now.known_still:
-            factor, white = self.setup.block_noise
-            units = np.array(innovations) / factor
-            monitor, count, alarm = monitor.update(units, white, blocks)
+            units = np.array(innovations) / self.setup.factor
+            monitor, count, alarm = monitor.update(units, self.setup.white, blocks)
         if count == 0:
             return self, 0, alarm
         conflict = before._conflicts(filters[1 : count + 1], temperatures[1:])
@@ -243,10 +216,7 @@ class Stretch:
         return replace(self, prior=prior, prior_c=celsius, believed=believed)
 
     def _conflicts(self, filters: Sequence[Filter], temperatures: list[Temperature]) -> int | None:
-        """The number of the first filter at which the data contradict the history.
-
-        The e-value says it of all axes together.
-        """
+        """Number of the first filter at which the e-value says that the history is wrong."""
         if not self.usable.any():
             return None
         own = self.filter.stack(filters).estimate()
