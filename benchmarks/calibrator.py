@@ -17,14 +17,15 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
+from itertools import product
 
 import numpy as np
 from scipy import stats
 
 from gyro_pipeline.calibrator import Calibration, Calibrator, Circumstances
 from gyro_pipeline.calibrator.device_types import type_of
-from gyro_pipeline.calibrator.filter import FLICKER_S, Filter, estimates
+from gyro_pipeline.calibrator.filter import FLICKER_S, Filter
 from gyro_pipeline.conventions import MDPS
 from gyro_pipeline.physics.noise import simulate_noise, warm_up
 from gyro_pipeline.physics.recording_model import (
@@ -81,6 +82,7 @@ class Result:
     codes: tuple[str, ...] = ()
 
 
+@lru_cache
 def kind_of(world: World):
     """The type, as fitted to 30 devices of it: a little is left open."""
     content = {
@@ -106,7 +108,7 @@ def earth(heading: float) -> np.ndarray:
 
 def own_variance(world: World, seconds: float) -> np.ndarray:
     filter_ = Filter.start(kind_of(replace(world, known=True)).noise, 0.5)
-    return estimates(filter_.ahead(round(seconds / 0.5))).variance[-1] / MDPS**2
+    return filter_.ahead(round(seconds / 0.5))[0].estimate().variance / MDPS**2
 
 
 def noise(rng, world: World) -> np.ndarray:
@@ -120,7 +122,7 @@ def noise(rng, world: World) -> np.ndarray:
 def device(rng, world: World, variance: np.ndarray) -> tuple[list[Calibration], np.ndarray]:
     """The calibrations of a device, each of this variance, and its next bias, mdps."""
     level, heading = rng.uniform(-500, 500, 3), rng.uniform(0, 2 * np.pi)
-    up, past = np.array([0, 0, 1.0]) if world.accel_ug else None, []
+    up, past = (0.0, 0.0, 1.0) if world.accel_ug else None, []
     for _ in range(world.past):
         if world.turn is None:
             heading = rng.uniform(0, 2 * np.pi)
@@ -128,7 +130,9 @@ def device(rng, world: World, variance: np.ndarray) -> tuple[list[Calibration], 
         mean = bias + rng.normal(0, np.sqrt(variance))
         warmth = 25 + rng.normal(0, 0.5) if world.ramp else None
         mean = (mean + (SLOPE * (warmth - 25) if warmth else 0)) * MDPS
-        past.append(Calibration(mean, variance * MDPS**2, temperature_c=warmth, up=up))
+        temperature = warmth and (warmth, warmth, warmth)
+        own = mean, variance * MDPS**2
+        past.append(Calibration(*map(tuple, own), temperature_c=temperature, gravity=up))
     heading = rng.uniform(0, 2 * np.pi) if world.turn is None else heading + np.radians(world.turn)
     return past, level + rng.normal(0, world.tau, 3) + earth(heading) + world.step
 
@@ -138,9 +142,9 @@ def calibrate(world: World, history_variance: np.ndarray, seed: Sequence[int]) -
     rng = np.random.default_rng(seed)
     past, bias = device(rng, world, history_variance)
     time_s, samples, accel, warmth, truth = simulated(rng, world, bias)
-    now = Circumstances(same_heading=world.declared, latitude_deg=LATITUDE)
-    age = 0.0 if world.warm_up else None
-    calibrator = Calibrator(kind_of(world), world.rate, past, now, world.target * MDPS, age)
+    age_s = 0.0 if world.warm_up else None
+    now = Circumstances(None, age_s, world.declared, LATITUDE)
+    calibrator = Calibrator(kind_of(world), world.rate, past, now, world.target * MDPS)
     kept = rng.uniform(size=len(time_s)) >= world.lost
     kept &= np.abs(time_s - world.longest_s / 2) >= world.gap_s / 2
     stamps = time_s + world.jitter / world.rate * rng.uniform(-0.5, 0.5, len(time_s))
@@ -396,9 +400,9 @@ def against_exact(world: World, seconds: int, prior: float | None) -> float:
         current = filter_
         for block in range(blocks):
             current, _ = current.update(np.full(3, 1.0 if block == unit_block else 0.0))
-        last = estimates([current])
-        gain = 1.0 if prior is None else spread / (spread + last.start_variance[0, 0] / MDPS**2)
-        columns.append(last.bias[0, 0] + last.transfer[0, 0] * (gain - 1) * last.start[0, 0])
+        last = current.estimate()
+        gain = 1.0 if prior is None else spread / (spread + last.start_variance[0] / MDPS**2)
+        columns.append(last.bias[0] + last.transfer[0] * (gain - 1) * last.start[0])
     own_weights = np.array(columns[1:]) - columns[0]
     return float(np.sqrt(squares(own_weights) / squares(weights)))
 
@@ -436,16 +440,18 @@ def speed(pool, count: int) -> None:
     rng = np.random.default_rng(1)
     samples = rng.normal(0, 0.1, (120_000, 3))
     times = np.arange(len(samples)) / 1000
-    for seconds in (1, 10, 120):
+    past = [Calibration((0.0, 0.0, 0.0), (1e-6,) * 3)] * PAST
+    for seconds, history in product((1, 10, 120), ([], past)):
         best = np.inf
         for _ in range(3):
-            calibrator = Calibrator(kind_of(World()), 1000.0, target_dps=1e-3)
+            calibrator = Calibrator(kind_of(World()), 1000.0, history, target_dps=1e-3)
             start = time.process_time()
             for first in range(0, len(samples), seconds * 1000):
                 part = slice(first, first + seconds * 1000)
                 calibrator.update(times[part], samples[part])
             best = min(best, time.process_time() - start)
-        print(f"chunks of {seconds} s: {len(samples) / best:.3g} samples a second", flush=True)
+        told = f"{'history' if history else 'no history'}: {len(samples) / best:.3g}"
+        print(f"chunks of {seconds} s, {told} samples a second", flush=True)
 
 
 SECTIONS = {f.__name__: f for f in (filters, coverage, pairs, turned, drops, rest, speed)}

@@ -128,7 +128,7 @@ def simulated_windows(count: int) -> Iterable[Window]:
         level = rng.uniform(-500, 500, 3)
         biases = level + rng.normal(0, world.tau, (PAST + 1, 3)) + earth(rng.uniform(0, 2 * np.pi))
         means = biases[:-1] + rng.normal(0, np.sqrt(variance), (PAST, 3))
-        past = [Calibration(m * MDPS, variance * MDPS**2) for m in means]
+        past = [Calibration(tuple(m * MDPS), tuple(variance * MDPS**2)) for m in means]
         samples = (biases[-1] + noise(rng, replace(world, rate=rate))) * MDPS
         for seconds in (1, 30):
             part = samples[: round(seconds * rate)]
@@ -150,7 +150,7 @@ def memsense_windows() -> Iterable[Window]:
             yield Window(window, seconds, 250.0, rest.mean(axis=1), variance, list(past), kind)
         calibrator = Calibrator(kind, 250.0, past, Circumstances(same_heading=True))
         calibrator.update(None, recording.T)
-        past.append(calibrator.evidence())
+        past.append(calibrator.calibration())
 
 
 def state_of(window: Window, with_history: bool, target: float | None = None, seconds: float = 1e3):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gyro_pipeline.calibrator.filter import FLICKER_S, Filter, Noise, estimates
+from gyro_pipeline.calibrator.filter import FLICKER_S, Filter, Noise
 from gyro_pipeline.physics.recording_model import noise_covariances, profiles
 
 RATE, BLOCK = 100, 50
@@ -46,8 +46,8 @@ def run(world, means, age_s=0.0):
         filter_ = Filter.start(noise, BLOCK_S, age_s)
         for mean in three.T:
             filter_, _ = filter_.update(mean)
-        biases.append(estimates([filter_]).bias[0])
-    return np.concatenate(biases), estimates([filter_])
+        biases.append(filter_.estimate().bias)
+    return np.concatenate(biases), filter_.estimate()
 
 
 def best(world, seconds):
@@ -108,9 +108,9 @@ def test_a_gap_lets_the_flicker_be_forgotten():
     together = Filter.start(noise, BLOCK_S).update(block)[0]
     apart = together.skip(1000.0).update(block)[0]
     together = together.update(block)[0]
-    one = estimates([Filter.start(noise, BLOCK_S).update(block)[0]]).variance
-    np.testing.assert_allclose(estimates([apart]).variance, one / 2, rtol=1e-6)
-    assert np.all(estimates([together]).variance > 1.2 * estimates([apart]).variance)
+    one = Filter.start(noise, BLOCK_S).update(block)[0].estimate().variance
+    np.testing.assert_allclose(apart.estimate().variance, one / 2, rtol=1e-6)
+    assert np.all(together.estimate().variance > 1.2 * apart.estimate().variance)
 
 
 def test_the_variance_ahead_is_the_one_that_comes():
@@ -118,7 +118,7 @@ def test_the_variance_ahead_is_the_one_that_comes():
     filter_ = Filter.start(noise_of(*WORLDS["all"]), BLOCK_S, None)
     for mean in rng.normal(0, 5e-3, (6, 3)):
         filter_, _ = filter_.update(mean)
-    ahead = estimates(filter_.ahead(10)).variance
+    ahead = filter_.ahead(10)[1].estimate().variance
     for mean, variance in zip(rng.normal(0, 5e-3, (10, 3)), ahead, strict=True):
         filter_, _ = filter_.update(mean)
-        np.testing.assert_allclose(estimates([filter_]).variance[0], variance, rtol=1e-12)
+        np.testing.assert_allclose(filter_.estimate().variance, variance, rtol=1e-12)

@@ -23,7 +23,7 @@ def kind(**content):
 
 
 def past(*means, variance=1e-6, **more):
-    return [Calibration(np.full(3, m * 1e-3), np.full(3, variance), **more) for m in means]
+    return [Calibration((m * 1e-3,) * 3, (variance,) * 3, **more) for m in means]
 
 
 def test_without_calibrations_there_is_no_prior():
@@ -47,9 +47,11 @@ def test_many_are_weighted_by_their_variances():
 
 def test_a_walk_follows_the_latest_and_grows_with_age():
     kinds = kind(turn_on_mdps=0.001, walk_mdps_per_rtday=1.0)
-    made = [past(level, variance=1e-14, day=float(day))[0] for day, level in enumerate((0, 3, 9))]
+    made = [
+        past(level, variance=1e-14, time=day * 86400.0)[0] for day, level in enumerate((0, 3, 9))
+    ]
     for age in (1.0, 10.0):
-        now = Circumstances(day=2.0 + age, same_heading=True)
+        now = Circumstances(time=(2.0 + age) * 86400, same_heading=True)
         prior = prior_of(made, kinds, now)
         np.testing.assert_allclose(prior.mean, 9e-3, rtol=1e-3)
         np.testing.assert_allclose(prior.narrow, age * 1e-6, rtol=1e-2)
@@ -73,7 +75,9 @@ def test_the_fitted_tau_lies_between_the_types_and_the_scatter():
 
 def test_temperature_follows_a_slope_and_widens_beyond_the_range():
     kinds = kind(turn_on_mdps=0.01, temperature_spread_mdps_per_c=10.0)
-    made = [past(2.0 * t, variance=1e-12, temperature_c=20.0 + t)[0] for t in (0, 1, 2, 3, 4)]
+    made = [
+        past(2.0 * t, variance=1e-12, temperature_c=(20.0 + t,) * 3)[0] for t in (0, 1, 2, 3, 4)
+    ]
     inside, beyond = (
         prior_of(made, kinds, Circumstances(temperature_c=t, same_heading=True)) for t in (23.5, 27)
     )
@@ -90,7 +94,7 @@ def test_temperature_follows_a_slope_and_widens_beyond_the_range():
 )
 def test_the_earths_rate_of_an_unknown_heading_is_on_horizontal_axes(up, axes):
     direction = None if up is None else np.array(up, float)
-    made = past(0.0, up=direction)
+    made = past(0.0, gravity=up)
     now = Circumstances(up=direction, latitude_deg=32.0)
     added = prior_of(made, kind(), now).narrow - prior_of(made, kind(), DECLARED).narrow
     expected = np.array(axes) * (EARTH_DPS * np.cos(np.radians(32.0))) ** 2
@@ -100,7 +104,7 @@ def test_the_earths_rate_of_an_unknown_heading_is_on_horizontal_axes(up, axes):
 def test_a_device_on_its_side_is_corrected_for_the_earths_vertical_rate():
     up, side = np.array([0.0, 0, 1]), np.array([1.0, 0, 0])
     now = Circumstances(up=side, latitude_deg=90.0, same_heading=True)
-    prior = prior_of(past(0.0, up=up), kind(), now)
+    prior = prior_of(past(0.0, gravity=up), kind(), now)
     np.testing.assert_allclose(prior.mean, [EARTH_DPS, 0, -EARTH_DPS], atol=1e-12)
     assert {reason.code for reason in prior.reasons} == {"attitude"}
 
@@ -108,7 +112,7 @@ def test_a_device_on_its_side_is_corrected_for_the_earths_vertical_rate():
 def test_where_attitudes_differ_the_larger_of_tau_and_the_earth_counts():
     ups = [np.array([0.0, 0, 1]), np.array([0.0, 0.2, 0.98])]
     made = [
-        past(m, variance=1e-12, up=u / np.linalg.norm(u))[0]
+        past(m, variance=1e-12, gravity=tuple(u / np.linalg.norm(u)))[0]
         for m, u in zip((0, 1), ups, strict=True)
     ]
     large = kind(turn_on_mdps=10.0)
@@ -137,7 +141,7 @@ def test_two_at_a_new_level_restart_the_level(dropped, means, members):
 def test_noise_is_learned_from_past_logs_with_the_types():
     """Freedom 8 of the type (spread 0.25) and 92 of logs with 1.5 times its N."""
     spread = kind(noise_spread=0.25)
-    made = past(0.0, noise=np.full(3, 4.5e-3), freedom=92.0)
+    made = past(0.0, noise_mdps_rts=(4.5,) * 3, noise_freedom=92.0)
     scale, freedom = noise_of(made, spread)
     np.testing.assert_allclose(freedom, 100)
     np.testing.assert_allclose(scale, (8 + 92 * 2.25) / 100)

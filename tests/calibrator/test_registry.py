@@ -21,7 +21,8 @@ def opened(device, registry, **options):
 def line(number, **more):
     return {
         "event": "calibration", "hash": f"{number:04d}", "source": f"{number}.csv", "time": None,
-        "rest": "still", "mean_dps": [0.1, 1 / 3, number * 1e-3], "variance_dps2": [1e-6] * 3,
+        "rest": "still", "schema": 1, "mean_dps": [0.1, 1 / 3, number * 1e-3],
+        "variance_dps2": [1e-6] * 3,
         "temperature_c": None, "gravity": None, "outcome": ["none"] * 3, "noise_mdps_rts": None,
         "noise_freedom": 0, "seconds": 10.0, **more,
     }  # fmt: skip
@@ -39,19 +40,21 @@ def test_what_is_stored_comes_back_in_order(device, tmp_path):
         assert device.append(line(number))
     assert not device.append(line(1))  # the same log
     given = opened("B17", tmp_path)
-    assert [tuple(c.mean) for c in given.history] == [(0.1, 1 / 3, n * 1e-3) for n in range(3)]
-    assert given.device_type.name == "dot"
-    assert len(opened("B17", tmp_path, without="0002").history) == 2
+    assert [tuple(c.mean) for c in given.setup.history] == [
+        (0.1, 1 / 3, n * 1e-3) for n in range(3)
+    ]
+    assert given.setup.device_type.type == "dot"
+    assert len(opened("B17", tmp_path, without="0002").setup.history) == 2
 
 
 def test_rejected_and_forgotten_calibrations_stay_and_do_not_count(device, tmp_path):
     device.append(line(1))
     device.append(line(2, rest="moving", mean_dps=None, variance_dps2=None))
     device.append({"event": "forget", "time": 0.0, "of": "0001"})
-    assert opened("B17", tmp_path).history == ()
+    assert opened("B17", tmp_path).setup.history == ()
     assert len(device.lines()) == 3
     assert device.append(line(1))  # again, after it was forgotten
-    assert len(opened("B17", tmp_path).history) == 1
+    assert len(opened("B17", tmp_path).setup.history) == 1
 
 
 def test_a_line_that_was_cut_off_is_left_out_and_the_next_starts_anew(device):
@@ -140,7 +143,11 @@ def test_what_device_toml_says_and_what_options_overrule(device, tmp_path):
     options = {"device_type": "dot", "same_heading": False, "latitude_deg": 50.0}
     for given, expected in (({}, ("memsense", True, 32)), (options, ("dot", False, 50))):
         device = opened("B17", tmp_path, **given)
-        told = device.device_type.name, device.now.same_heading, device.now.latitude_deg
+        told = (
+            device.setup.device_type.type,
+            device.setup.now.same_heading,
+            device.setup.now.latitude_deg,
+        )
         assert told == expected
 
 

@@ -12,11 +12,10 @@ Importing it imports NumPy alone. ``docs/calibrator.md`` is the tutorial; the co
 ``gyro-calibrate``.
 """
 
-from gyro_pipeline.calibrator.calibrator import Calibrator
+from gyro_pipeline.calibrator.calibrator import Calibrator, State
 from gyro_pipeline.calibrator.device_types import DeviceType, read_type, type_of_models
 from gyro_pipeline.calibrator.history import Calibration, Circumstances
 from gyro_pipeline.calibrator.reasons import Reason
-from gyro_pipeline.calibrator.state import State
 
 __all__ = [
     "Calibration",

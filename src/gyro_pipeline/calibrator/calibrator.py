@@ -4,10 +4,10 @@ Samples are cut into blocks of 0.5 s by their number, and a stretch in one attit
 (:mod:`.stretch`). Nothing here reads a clock, starts a thread or knows of files.
 """
 
+from collections import Counter
 from collections.abc import Sequence
-from copy import copy
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -16,46 +16,83 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gyro_pipeline.calibrator.device_types import DeviceType, read_type
-from gyro_pipeline.calibrator.history import (
-    DAY_S,
-    Calibration,
-    Circumstances,
-    Prior,
-    noise_of,
-    prior_of,
-)
+from gyro_pipeline.calibrator.filter import Array
+from gyro_pipeline.calibrator.history import MOVING, STILL, UNSURE, Calibration, Circumstances
 from gyro_pipeline.calibrator.reasons import Reason, reason, reasons_of, unit_reason
-from gyro_pipeline.calibrator.rest import ATTITUDE, MOTION, NOISE, Alarm, Block
-from gyro_pipeline.calibrator.state import MOVING, STILL, UNSURE, Array, Mask, State
-from gyro_pipeline.calibrator.stretch import Stretch
-from gyro_pipeline.conventions import MDPS, InputError
+from gyro_pipeline.calibrator.rest import ATTITUDE, MOTION, NOISE, Alarm, Blocks
+from gyro_pipeline.calibrator.stretch import BLOCK_S, Mask, Setup, Stretch
+from gyro_pipeline.conventions import AXES, MDPS, InputError
 
-BLOCK_S = 0.5
 LEAST_S, LEAST_UNKNOWN_S = 1.0, 10.0
 """Seconds at rest before a target counts as reached: where the noise is known, and where not."""
 
 LONGEST_S = 3600.0
 """How far ahead seconds left are looked for."""
 
-_LEAST_SAMPLES = 5  # in a block: fewer do not tell the noise
 _JUMP_S = 3600.0  # a clock that moves by more has jumped
 _DEAD_BLOCKS = 4  # in a row in which an axis holds one value
 _COLUMNS = 8  # time, rates, accelerations, temperature
+_REFERENCE = 6  # blocks at rest that say what rest is like after a motion
+_PATIENCE = 20  # blocks of motion after which rest is looked for anew
+_TURN_DEG = 1.0  # the attitude is the same after a motion that turned the device by less
 
 
-@dataclass
-class Counts:
-    """What was noticed of the samples, counted while they come in."""
+@dataclass(frozen=True, eq=False)
+class State:
+    """The answer so far; NaN and infinity stand where there is no number. Arrays are (3,)."""
 
-    samples: int = 0
-    not_finite: int = 0
-    zero: int = 0
-    gaps: int = 0
-    gap_s: float = 0.0
-    jumps: int = 0
-    constant: Array = field(default_factory=lambda: np.zeros(3))  # blocks in a row of one value
-    dead: Mask = field(default_factory=lambda: np.zeros(3, bool))
-    ended: dict[str, Reason] = field(default_factory=dict)  # why stretches ended, the last of each
+    stretch: Stretch  # that the answer is from
+    counts: Counter[str]  # of samples, gaps and what else was noticed
+    ended: dict[str, Reason]  # why stretches ended, the last of each; dead axes
+    rest: str  # STILL, MOVING or UNSURE
+    time_s: float  # since the first sample
+    least_s: float  # at rest, for a target to count as reached
+    target_dps: float | None
+
+    @property
+    def bias_dps(self) -> Array:
+        """The bias now; what it settles to, where the device warms up."""
+        return self.stretch.bias
+
+    @cached_property
+    def sigma_dps(self) -> Array:
+        """Its standard deviation: the bias is within 1.96 of it in 95 % of cases."""
+        return np.sqrt(self.stretch.variance)
+
+    @property
+    def seconds_at_rest(self) -> float:
+        """Of the stretch that the answer is from."""
+        return self.stretch.seconds
+
+    @property
+    def history(self) -> tuple[str, str, str]:
+        """What became of the history on each axis: USED, DROPPED or NONE."""
+        return self.stretch.outcome
+
+    @property
+    def reached(self) -> bool:
+        """Whether all axes are at the target, where one is given, after the least time."""
+        target_dps = np.inf if self.target_dps is None else self.target_dps
+        long = self.seconds_at_rest >= self.least_s
+        return long and bool(self.stretch.reached(target_dps).all())
+
+    @property
+    def done(self) -> bool:
+        """Whether the target is reached, at rest."""
+        return self.rest == STILL and self.reached
+
+    @cached_property
+    def seconds_left(self) -> Array:
+        """Seconds at rest until the target; infinite where never, NaN without a target."""
+        if self.target_dps is None:
+            return np.full(3, np.nan)
+        left = self.stretch.seconds_left(self.target_dps, LONGEST_S)
+        return np.maximum(left, self.least_s - self.seconds_at_rest)
+
+    @cached_property
+    def reasons(self) -> tuple[Reason, ...]:
+        """What should be known about the answer, the most important first."""
+        return tuple(reasons_of(self.counts, self.ended, self.stretch, self.target_dps))
 
 
 class Calibrator:
@@ -67,36 +104,31 @@ class Calibrator:
         history: Its calibrations, the oldest first.
         now: What is known of this calibration beforehand.
         target_dps: Standard deviation to reach; None: none.
-        since_power_on_s: Of the first sample; None: a warm-up's amplitude is left free.
-        known_still: The device is declared to be at rest: nothing is cut.
     """
 
     def __init__(
         self, device_type: DeviceType, rate_hz: float, history: Sequence[Calibration] = (),
         now: Circumstances | None = None, target_dps: float | None = None,
-        since_power_on_s: float | None = None, known_still: bool = False,
     ) -> None:  # fmt: skip
         if not (np.isfinite(rate_hz) and rate_hz >= 2):  # noqa: PLR2004
             raise InputError(f"rate_hz: expected at least 2 samples a second, got {rate_hz}")
-        self.device_type, self.rate_hz, self.history = device_type, float(rate_hz), tuple(history)
-        self.now, self.target_dps = now or Circumstances(), target_dps
-        self.since_power_on_s, self.known_still = since_power_on_s, known_still
-        self.size = max(round(BLOCK_S * self.rate_hz), _LEAST_SAMPLES)
-        self.block_s = self.size / self.rate_hz
-        self.scale, self.freedom = noise_of(self.history, device_type)
-        self.least_s = LEAST_S if np.all(self.freedom > 0) else LEAST_UNKNOWN_S
-        self.time_s, self.counts = 0.0, Counts()
+        now = now or Circumstances()
+        self.setup = Setup(device_type, float(rate_hz), tuple(history), now)
+        self.target_dps, self.counts = target_dps, Counter[str]()
+        self.ended = dict[str, Reason]()
+        self._constant = np.zeros(3)  # blocks in a row of one value
+        self.least_s = LEAST_S if np.all(self.setup.known[1] > 0) else LEAST_UNKNOWN_S
         self._pending = np.empty((0, _COLUMNS))  # samples of a block that is not full
         self._last_time: float | None = None
         self._end: float | None = None  # of the last block, on the clock of the samples
         self._proof_s = 0.0  # how long a rest must last, after one that was none
+        self._taken, self._skipped_s = 0, 0.0  # blocks, and seconds of gaps
         self._rest_s = 0.0  # at rest in stretches that ended
-        self._stretch_at = partial(
-            Stretch, device_type, self._prior_of, self.scale, self.freedom, self.size,
-            self.block_s, known_still,
-        )  # fmt: skip
-        self.stretch = self._new_stretch()
         self._kept: Stretch | None = None
+        self.stretch = Stretch.start(self.setup, 0.0)
+        # The stretch before its last blocks, and those.
+        self._before: tuple[Stretch, Blocks] | None = None
+        self._moving, self._turned = 0, np.zeros(3)  # blocks of motion that just came, degrees
 
     @classmethod
     def open(  # noqa: PLR0913 - what can be known beforehand
@@ -114,11 +146,11 @@ class Calibrator:
             target_mdps: Standard deviation to reach.
             registry: Folder; None: the environment's, or the user's own.
             started_at: Of the first sample, POSIX seconds; None: one day after the last one.
-            since_power_on_s: Of the first sample.
+            since_power_on_s: Of the first sample; None: a warm-up's amplitude is left free.
             device_type: Its type; None, here and below: what ``device.toml`` says.
             same_heading: Whether the heading repeats.
             latitude_deg: Of the place.
-            known_still: The device is declared to be at rest.
+            known_still: The device is declared to be at rest: nothing is cut.
             without: Hash of a log whose own stored calibration is not to count.
 
         Raises:
@@ -129,18 +161,17 @@ class Calibrator:
         folder = registry_folder(registry)
         stored = None if device is None else Device(folder, device)
         settings = stored.settings() if stored else {}
-        heading = settings.get("mounted", False) if same_heading is None else same_heading
-        latitude = settings.get("latitude") if latitude_deg is None else latitude_deg
-        day = None if started_at is None else started_at / DAY_S
-        return cls(
-            read_type(device_type or settings.get("type"), folder),
-            rate_hz,
-            stored.history(without) if stored else (),
-            Circumstances(day, same_heading=bool(heading), latitude_deg=latitude),
-            None if target_mdps is None else target_mdps * MDPS,
+        now = Circumstances(
+            started_at,
             since_power_on_s,
+            bool(settings.get("mounted") if same_heading is None else same_heading),
+            settings.get("latitude") if latitude_deg is None else latitude_deg,
             known_still,
+            stored.attempt(without) if stored else 1,
         )
+        kind = read_type(device_type or settings.get("type"), folder)
+        history = stored.history(without) if stored else ()
+        return cls(kind, rate_hz, history, now, target_mdps and target_mdps * MDPS)
 
     def update(
         self, time_s: ArrayLike | None, gyro_dps: ArrayLike, accel_g: ArrayLike | None = None,
@@ -159,45 +190,30 @@ class Calibrator:
         """
         rows = self._rows(time_s, gyro_dps, accel_g, temperature_c)
         if len(rows):
-            rows = np.vstack([self._pending, rows])
+            rows = np.concatenate([self._pending, rows])
             gaps = np.diff(rows[:, 0])
-            edges = np.flatnonzero((gaps > BLOCK_S / 2) | (gaps < -1 / self.rate_hz)) + 1
+            edges = np.flatnonzero((gaps > BLOCK_S / 2) | (gaps < -1 / self.setup.rate_hz)) + 1
             for first, last in pairwise([0, *edges, len(rows)]):
                 self._pending = self._take_whole_blocks(rows[first:last])
         return self.state()
 
+    @property
+    def time_s(self) -> float:
+        """Since the first sample, up to the last block."""
+        return self._taken * self.setup.block_s + self._skipped_s
+
     def finish(self) -> State:
-        """The answer, from the stretch that knows most."""
+        """The answer from the stretch that knows most; the history's if none was at rest."""
         return self.state(finished=True)
 
     def state(self, finished: bool = False) -> State:
         """The answer so far."""
-        stretch = copy(self.best if finished else self.stretch)
-        own, prior, target = stretch.estimate, stretch.prior, self.target_dps
-        left_s = max(self.least_s - stretch.seconds, 0.0)
-
-        def look_ahead() -> Array:
-            if target is None:
-                return np.full(3, np.nan)
-            return np.maximum(stretch.seconds_left(target, LONGEST_S), left_s)
-
-        reached = target is None or bool(stretch.reached(target).all())
-        return State(
-            stretch.bias, np.sqrt(stretch.variance), own.bias, np.sqrt(own.variance), prior.mean,
-            np.sqrt(prior.narrow), self._rest(stretch, finished), self.time_s, stretch.seconds,
-            stretch.outcome, reached and left_s == 0, look_ahead,
-            partial(reasons_of, copy(self.counts), stretch, target),
-        )  # fmt: skip
-
-    def evidence(self) -> Calibration:
-        """What is stored of this calibration: from its own data, never from the history."""
-        stretch = self.best
-        (noise, freedom), temperature = stretch.log_noise(), stretch.current.temperature
-        return Calibration(
-            stretch.estimate.bias, stretch.estimate.variance, self.now.day,
-            temperature.mean if temperature.blocks else None, stretch.up, stretch.outcome, noise,
-            freedom,
-        )  # fmt: skip
+        stretch = self.best if finished else self.stretch
+        rest = self._rest(stretch, finished)
+        if finished and rest == MOVING:
+            stretch = Stretch.start(self.setup, self.time_s)
+        noticed = self.counts.copy(), self.ended
+        return State(stretch, *noticed, rest, self.time_s, self.least_s, self.target_dps)
 
     @property
     def best(self) -> Stretch:
@@ -206,6 +222,31 @@ class Calibrator:
         if kept and not np.sum(last.estimate.variance - kept.estimate.variance) < 0:
             return kept
         return last
+
+    def calibration(self) -> Calibration:
+        """What is stored: evidence from its own data, never from the history."""
+        state, stretch, now = self.finish(), self.best, self.setup.now
+        own, (noise, freedom), seen = stretch.estimate, stretch.log_noise(), stretch.temperature
+        usable = state.rest == STILL and bool(np.isfinite(own.variance).all())
+        gravity = stretch.gravity / max(stretch.blocks, 1)
+        return Calibration(
+            mean_dps=tuple(own.bias.tolist()) if usable else None,
+            variance_dps2=tuple(own.variance.tolist()) if usable else None,
+            time=now.time,
+            since_power_on_s=now.since_power_on_s,
+            temperature_c=(seen.mean, seen.least, seen.most) if seen.blocks else None,
+            gravity=tuple(gravity.tolist()) if gravity.any() else None,
+            seconds=stretch.seconds,
+            rest=state.rest,  # type: ignore[arg-type]
+            outcome=stretch.outcome,
+            noise_mdps_rts=None if noise is None else tuple((noise / MDPS).tolist()),
+            noise_freedom=freedom,
+            same_heading=now.same_heading,
+            known_still=now.known_still,
+            reached=state.done,
+            attempt=now.attempt,
+            reasons=tuple(reason.sentence for reason in state.reasons),
+        )
 
     def _rows(
         self, time_s: ArrayLike | None, gyro_dps: ArrayLike, accel_g: ArrayLike | None,
@@ -217,17 +258,19 @@ class Calibrator:
             raise InputError(f"gyro_dps: expected (n, 3) or (3,) deg/s, got {np.shape(gyro_dps)}")
         rows = np.full((len(rates), _COLUMNS), np.nan)
         if time_s is None:
-            first = -1 if self._last_time is None else round(self._last_time * self.rate_hz)
-            time_s = (first + 1 + np.arange(len(rows))) / self.rate_hz
+            rate_hz = self.setup.rate_hz
+            first = -1 if self._last_time is None else round(self._last_time * rate_hz)
+            time_s = (first + 1 + np.arange(len(rows))) / rate_hz
         rows[:, 0], rows[:, 1:4] = time_s, rates
         if accel_g is not None:
             rows[:, 4:7] = accel_g
         if temperature_c is not None:
             rows[:, 7] = temperature_c
-        finite, zero = np.isfinite(rows[:, :4]).all(axis=1), ~rates.any(axis=1)
-        self.counts.samples += len(rows)
-        self.counts.not_finite += int(np.sum(~finite))
-        self.counts.zero += int(np.sum(zero))
+        # a sum is finite where all are, and rates of 0 have one
+        finite = np.isfinite(rows[:, 0] + rows[:, 1] + rows[:, 2] + rows[:, 3])
+        zero = (rows[:, 1] == 0) & (rows[:, 2] == 0) & (rows[:, 3] == 0)
+        bad = {"not_finite": int(np.sum(~finite)), "zero": int(np.sum(zero))}
+        self.counts.update(samples=len(rows), **bad)
         if len(rows) and np.isfinite(rows[-1, 0]):
             self._last_time = float(rows[-1, 0])
         good = finite & ~zero
@@ -235,85 +278,114 @@ class Calibrator:
 
     def _take_whole_blocks(self, rows: Array) -> Array:
         """Take the blocks of rows without a gap; returns the rows that are left."""
-        used = len(rows) // self.size * self.size
+        size = self.setup.size
+        used = len(rows) // size * size
         self._cross_gap(rows[0, 0])
         if used:
-            for block in _blocks(rows[:used].reshape(-1, self.size, _COLUMNS)):
-                self.counts.constant = np.where(block.variance == 0, self.counts.constant + 1, 0)
-                self.counts.dead = self.counts.dead | (self.counts.constant >= _DEAD_BLOCKS)
-                self._take(block)
-            self._end = rows[used - 1, 0] + 1 / self.rate_hz
+            blocks = _blocks(rows[:used].reshape(-1, size, _COLUMNS))
+            self._look_for_dead_axes(blocks.variance == 0)
+            while len(blocks.mean):
+                blocks = blocks.part(self._take(blocks))
+            self._end = rows[used - 1, 0] + 1 / self.setup.rate_hz
         return rows[used:]
+
+    def _look_for_dead_axes(self, constant: Mask) -> None:
+        for axes in constant if constant.any() or self._constant.any() else ():
+            self._constant = np.where(axes, self._constant + 1, 0)
+            for axis in np.flatnonzero(self._constant >= _DEAD_BLOCKS):
+                self.ended = {**self.ended, AXES[axis]: reason("dead", axis=axis)}
 
     def _cross_gap(self, start: float) -> None:
         """Move on to where rows start, if that is not where the last block ended."""
         gap = 0.0 if self._end is None else start - self._end
-        if gap < -1 / self.rate_hz or gap > _JUMP_S:
-            self.counts.jumps += 1
-            gap = self.block_s
+        if gap < -1 / self.setup.rate_hz or gap > _JUMP_S:
+            self.counts["jumps"] += 1
+            gap = self.setup.block_s
         elif gap > BLOCK_S / 2:
-            self.counts.gaps += 1
-            self.counts.gap_s += gap
+            self.counts["gaps"] += 1
+            self.counts["gap_ms"] += round(gap * 1e3)
         else:
             return
-        self.time_s += gap
-        self.stretch.skip(gap)
+        self._skipped_s += gap
+        self.stretch, self._before = self.stretch.cut(gap, None), None
         self._end = start
 
-    def _take(self, block: Block) -> None:
-        """Take a block; an alarm ends a stretch and starts the next."""
-        alarm = self.stretch.take(block)
-        if alarm is None or alarm.code != ATTITUDE:
-            self.time_s += self.block_s
-        if alarm is None:
-            return
-        self._note(alarm)
-        if alarm.code in (MOTION, ATTITUDE):  # what came before it was at rest
-            self._rest_s += self.stretch.seconds
-            self._kept = self.best
-        else:
-            self._proof_s = max(self._proof_s, self.time_s - self.stretch.start_s)
-        self.stretch = self._new_stretch()
-        if alarm.code == ATTITUDE:
-            self._take(block)
+    def _take(self, blocks: Blocks) -> int:
+        """Take some blocks; a motion is cut, another alarm begins a new stretch. Returns how many.
 
-    def _note(self, alarm: Alarm) -> None:
-        """Keep why a stretch ended, for people."""
-        told, name = None, self.device_type.name
+        After a motion the attitude must be the same.
+        """
+        if self._moving:
+            blocks = blocks.part(0, 1)
+        after, count, alarm = self.stretch.take(blocks)
+        if alarm is None and self._moving and self.stretch.blocks:
+            if self.stretch.turned_deg(self._turned, blocks.gravity[0]) > _TURN_DEG:
+                self._end_stretch(Alarm(ATTITUDE))
+                return 0
+        self._taken += max(count, 1)
+        if alarm is None:
+            self._before, self.stretch = (self.stretch, blocks.part(0, count)), after
+            self._moving, self._turned = 0, np.zeros(3)
+        elif (
+            alarm.code == MOTION and self.stretch.blocks >= _REFERENCE and self._moving < _PATIENCE
+        ):
+            self._cut(blocks.mean[0])
+        else:
+            self._end_stretch(alarm)
+        return max(count, 1)
+
+    def _cut(self, mean: Array) -> None:
+        """Leave out a block of motion and the one before it."""
+        motion, told = [mean], None
+        if not self._moving:
+            if self._before is not None:
+                motion.append(self.stretch.last_mean)
+                self.stretch, blocks = self._before
+                while len(blocks.mean) > 1:
+                    self.stretch, count, _ = self.stretch.take(blocks.part(0, -1))
+                    blocks = blocks.part(count)
+            told = reason("cut", self.stretch.start_s + self.stretch.filter.time_s)
+        turned = np.sum(np.array(motion) - self.stretch.unscaled.bias, axis=0)
+        self._turned = self._turned + turned * self.setup.block_s
+        self._moving, self._before = self._moving + len(motion), None
+        self.stretch = self.stretch.cut(len(motion) * self.setup.block_s, told)
+
+    def _end_stretch(self, alarm: Alarm) -> None:
+        """Keep why a stretch ended, for people, and begin the next."""
+        told, name = None, self.setup.device_type.type
         if alarm.code == NOISE:
             told = unit_reason(alarm.value, name)
         words: dict[str, Any] = {"name": name, "factor": alarm.value, "rate": alarm.value / MDPS}
         told = told or reason(alarm.code, self.time_s, sigma=alarm.sigma / MDPS, **words)
-        self.counts.ended = {**self.counts.ended, alarm.code: told}
-
-    def _new_stretch(self) -> Stretch:
-        age = None if self.since_power_on_s is None else self.since_power_on_s + self.time_s
-        return self._stretch_at(self.time_s, age)
-
-    def _prior_of(self, up: Array | None, temperature_c: float | None, believed: bool) -> Prior:
-        same = self.now.same_heading and believed
-        now = replace(self.now, up=up, temperature_c=temperature_c, same_heading=same)
-        return prior_of(self.history, self.device_type, now)
+        self.ended = {**self.ended, alarm.code: told}
+        shown = alarm.code == MOTION and self.stretch.blocks >= _REFERENCE
+        if shown or alarm.code == ATTITUDE:  # what came before it was at rest
+            self._rest_s += self.stretch.seconds
+            self._kept = self.best
+        else:
+            self._proof_s = max(self._proof_s, self.time_s - self.stretch.start_s)
+        self.stretch, self._before = Stretch.start(self.setup, self.time_s), None
+        self._moving, self._turned = 0, np.zeros(3)
 
     def _rest(self, stretch: Stretch, finished: bool) -> str:
         """Whether it is at rest now; or, once finished, whether half of it, and enough, was."""
-        if self.known_still:
+        if self.setup.now.known_still:
             return STILL if stretch.blocks else UNSURE
         enough = stretch.seconds >= max(min(self.least_s, 2 * LEAST_S), self._proof_s)
-        ended = bool(self.counts.ended.keys() - {ATTITUDE})
+        ended = bool(self.ended.keys() - {ATTITUDE, *AXES})
         if finished:
             half = self._rest_s + self.stretch.seconds >= self.time_s / 2
-            return STILL if enough and half else MOVING if ended or stretch.motions else UNSURE
-        if stretch.moving or (ended and not enough):
+            cut = any(note.code == "cut" for note in stretch.notes)
+            return STILL if enough and half else MOVING if ended or cut else UNSURE
+        if self._moving or (ended and not enough):
             return MOVING
         return STILL if enough else UNSURE
 
 
-def _blocks(samples: Array) -> list[Block]:
+def _blocks(samples: Array) -> Blocks:
     """Means and variances of whole blocks, (block, sample, 8)."""
     means, variances = samples.mean(axis=1), samples[..., 1:4].var(axis=1, ddof=1)
     gravity_variances = np.full(len(samples), np.nan)
     if np.isfinite(means[:, 4:7]).any():
         gravity_variances = samples[..., 4:7].var(axis=1, ddof=1).mean(axis=1)
-    columns = means[:, 1:4], variances, means[:, 4:7], gravity_variances, means[:, 7].tolist()
-    return [Block(*row) for row in zip(*columns, strict=True)]
+    return Blocks(means[:, 1:4], variances, means[:, 4:7], gravity_variances, means[:, 7])

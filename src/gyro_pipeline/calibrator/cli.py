@@ -10,7 +10,8 @@ import json
 import re
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -22,11 +23,12 @@ import numpy as np
 
 import gyro_pipeline
 from gyro_pipeline.calibrator import output, registry
-from gyro_pipeline.calibrator.calibrator import BLOCK_S, Calibrator
+from gyro_pipeline.calibrator.calibrator import Calibrator, State
 from gyro_pipeline.calibrator.device_types import names
+from gyro_pipeline.calibrator.history import STILL, USED, Calibration
 from gyro_pipeline.calibrator.reasons import UNUSABLE_CODES
-from gyro_pipeline.calibrator.registry import Device, RegistryError, registry_folder
-from gyro_pipeline.calibrator.state import STILL, USED, State
+from gyro_pipeline.calibrator.registry import SET, Device, RegistryError, registry_folder
+from gyro_pipeline.calibrator.stretch import BLOCK_S
 from gyro_pipeline.conventions import MDPS, InputError
 
 DONE, USAGE, NOT_REACHED, NOT_AT_REST, NO_HISTORY, UNUSABLE, NOT_STORED = 0, 2, 3, 4, 5, 6, 7
@@ -34,15 +36,13 @@ DONE, USAGE, NOT_REACHED, NOT_AT_REST, NO_HISTORY, UNUSABLE, NOT_STORED = 0, 2, 
 
 def _posix(text: str) -> float:
     """POSIX seconds of such, or of an ISO 8601 time."""
-    try:
-        return float(text)
-    except ValueError:
-        pass
-    try:
-        return datetime.fromisoformat(text).timestamp()
-    except ValueError as error:
-        expected = "2026-01-31T12:00:00+00:00 or POSIX seconds"
-        raise click.BadParameter(f"expected {expected}, got {text!r}") from error
+    for read in (float, lambda text: datetime.fromisoformat(text).timestamp()):
+        try:
+            return float(read(text))
+        except ValueError:
+            continue
+    expected = "2026-01-31T12:00:00+00:00 or POSIX seconds"
+    raise click.BadParameter(f"expected {expected}, got {text!r}")
 
 
 _option = partial(partial, click.option)  # still without the name of its argument
@@ -71,7 +71,6 @@ _SHARED = {
     "rate_hz": _option("--rate", type=float, help="samples a second, where times do not tell"),
     **_JSON,
 }
-Source = dict[str, str]
 _FOLDER = {"folder": _DEVICE["registry"]}
 
 
@@ -89,10 +88,8 @@ def _with(options: dict[str, Any]) -> Callable[[Any], Any]:
 def _reader_options() -> dict[str, Any]:
     from gyro_pipeline.parameters import ReaderOptions  # noqa: PLC0415
 
-    texts = {
-        name: info.description or "a name, or a number from 0"
-        for name, info in ReaderOptions.model_fields.items()
-    }
+    fields = ReaderOptions.model_fields.items()
+    texts = {name: info.description or "a name, or a number from 0" for name, info in fields}
     return {name: _option(_flag(name), help=text, metavar="VALUE") for name, text in texts.items()}
 
 
@@ -107,11 +104,11 @@ def _read_reader_options(texts: dict[str, str]) -> Any:
     from gyro_pipeline.parameters import ReaderOptions  # noqa: PLC0415
 
     given: dict[str, Any] = {name: _value(text) for name, text in texts.items() if text is not None}
-    for name in {"columns", "acceleration_columns", "rows"} & given.keys():
-        given[name] = [_value(part.strip()) for part in texts[name].split(",")]
+    for name in {"columns", "acceleration_columns"} & given.keys():
+        given[name] = [_value(part) for part in texts[name].split(",")]
     if "rows" in given:
         pairs = (part.partition("=") for part in texts["rows"].split(","))
-        given["rows"] = {_value(column.strip()): _value(value) for column, _, value in pairs}
+        given["rows"] = {_value(column): _value(value) for column, _, value in pairs}
     try:
         return ReaderOptions(**given)
     except ValidationError as error:
@@ -127,7 +124,7 @@ def _value(text: str) -> Any:
     try:
         return json.loads(text)
     except ValueError:
-        return text
+        return text.strip()
 
 
 def _in_options(message: str) -> str:
@@ -145,6 +142,10 @@ def _in_options(message: str) -> str:
 
 def _say(text: str, colour: str = "yellow") -> None:
     click.secho(text, fg=colour, err=True)
+
+
+def _print(as_json: bool, answer: Any, lines: Iterable[str]) -> None:
+    click.echo(json.dumps(answer, allow_nan=False) if as_json else "\n".join(lines))
 
 
 class Commands(click.Group):
@@ -167,19 +168,17 @@ def main() -> None:
 
 
 def _job(values: dict[str, Any]) -> SimpleNamespace:
-    """What ``log`` and ``stream`` were asked for: ``known`` is for :meth:`.Calibrator.open`."""
+    """What ``log`` and ``stream`` were asked for: ``known`` is for :meth:`.Calibrator.open`.
+
+    That the device can be written is seen before anything is measured.
+    """
     known = {name: values.pop(name) for name in _DEVICE}
-    shared = {name: values.pop(name) for name in _SHARED}
-    return SimpleNamespace(known=known, reader=_read_reader_options(values), **shared)
-
-
-def _device(job: SimpleNamespace) -> Device | None:
-    """Where to store; that it can be written is seen before anything is measured."""
-    if job.known["device"] is None or not job.store:
-        return None
-    device = Device(registry_folder(job.known["registry"]), job.known["device"])
-    device.create(job.known["device_type"])
-    return device
+    job = SimpleNamespace(known=known, **{name: values.pop(name) for name in _SHARED})
+    job.reader, job.stored_in = _read_reader_options(values), None
+    if known["device"] is not None and job.store:
+        job.stored_in = Device(registry_folder(known["registry"]), known["device"])
+        job.stored_in.create(known["device_type"])
+    return job
 
 
 @main.command()
@@ -196,7 +195,6 @@ def _log(path: Path, job: SimpleNamespace) -> int:
     from gyro_pipeline.readers import read_log  # noqa: PLC0415
     from gyro_pipeline.readers.table import IN_READER  # noqa: PLC0415
 
-    device = _device(job)
     try:
         recording = read_log(path, job.reader, job.rate_hz)
     except InputError as error:
@@ -212,43 +210,48 @@ def _log(path: Path, job: SimpleNamespace) -> int:
     source = hashlib.sha256(path.read_bytes()).hexdigest()
     calibrator = Calibrator.open(rate_hz=rate_hz, **job.known, without=source)
     states = _feed(calibrator, recording, 1.0 if job.plot else np.inf)
-    return _report(calibrator, job, states, device, source, path.name)
+    return _report(calibrator, job, states, source, path.name)
 
 
 def _feed(calibrator: Calibrator, recording: Any, chunk_s: float) -> list[State]:
     """Feed a log in chunks; the states after each."""
-    count = len(recording.samples)
-    times = np.arange(count) / calibrator.rate_hz
+    count, rate_hz = len(recording.samples), calibrator.setup.rate_hz
+    times = np.arange(count) / rate_hz
     for row in recording.gap_rows:  # how long a gap is, a log does not say
         times[row:] += 2 * BLOCK_S
     beside = recording.acceleration_g, recording.temperature_c
     columns: list[Any] = [times, recording.samples, *beside]
-    step, states = max(round(min(chunk_s * calibrator.rate_hz, count)), 1), []
+    step, states = max(round(min(chunk_s * rate_hz, count)), 1), []
     for row in range(0, count, step):
         chunk: list[Any] = [None if x is None else x[row : row + step] for x in columns]
         states.append(calibrator.update(*chunk))
     return states
 
 
-def _report(  # noqa: PLR0917 - what an answer is made of
-    calibrator: Calibrator, job: SimpleNamespace, states: Sequence[State], device: Device | None,
-    source: str, name: str,
-) -> int:  # fmt: skip
+def _report(
+    calibrator: Calibrator, job: SimpleNamespace, states: Sequence[State], source: str, name: str
+) -> int:
     """Print, plot and store; returns the exit code."""
     state, target = calibrator.finish(), job.known["target_mdps"]
     code = _code(state, job)
-    if job.as_json:
+    if job.as_json or code != UNUSABLE:
         answer = output.as_json(state, job.known["device"], source=name)
-        click.echo(json.dumps(answer, allow_nan=False))
-    else:
-        if code != UNUSABLE:
-            click.echo(output.as_text(state, target, calibrator))
+        _print(job.as_json, answer, output.as_text(state, target, calibrator))
+    if not job.as_json:
         for sentence in output.notes(state):
             _say(sentence, "red" if code in {UNUSABLE, NOT_AT_REST} else "yellow")
     if job.plot:
         output.plot(job.plot, [*states, state], target)
-    if device is not None and code != UNUSABLE:
-        _store(calibrator, state, job, device, {"hash": source, "source": name})
+    if job.stored_in is not None and code != UNUSABLE:
+        calibration = replace(
+            calibrator.calibration(), hash=source, source=name, version=gyro_pipeline.__version__
+        )
+        if job.stored_in.append(calibration):
+            job.stored_in.write_model(
+                Calibrator.open(rate_hz=calibrator.setup.rate_hz, **job.known)
+            )
+        else:
+            _say(f"{name} is stored already; it is not stored again")
     return code
 
 
@@ -263,25 +266,6 @@ def _code(state: State, job: SimpleNamespace) -> int:
     return DONE if state.reached else NOT_REACHED
 
 
-def _store(
-    calibrator: Calibrator, state: State, job: SimpleNamespace, device: Device, source: Source
-) -> None:
-    """Add the calibration, or the attempt, to the device's history."""
-    name, known = source["source"], job.known
-    declared = {
-        "time": known["started_at"], "since_power_on_s": known["since_power_on_s"],
-        "same_heading": calibrator.now.same_heading, "known_still": known["known_still"],
-        "version": gyro_pipeline.__version__,
-    }  # fmt: skip
-    if not device.append(registry.line_of(calibrator, state, {**source, **declared})):
-        _say(f"{name} is stored already; it is not stored again")
-        return
-    try:
-        device.write_model(Calibrator.open(rate_hz=calibrator.rate_hz, **known))
-    except RegistryError as error:
-        _say(f"{name} is stored, but model.json is not made anew: {error}")
-
-
 @main.command()
 @click.option("--port", help="serial port; else standard input")
 @click.option("--baud", type=int, default=115200, show_default=True)
@@ -292,13 +276,12 @@ def stream(port: str | None, baud: int, timeout: float, **values: Any) -> int:
     from gyro_pipeline.calibrator import stream as lines  # noqa: PLC0415
 
     job = _job(values)
-    device, parser = _device(job), lines.Parser(job.reader, job.rate_hz)
+    parser, name = lines.Parser(job.reader, job.rate_hz), port or "standard input"
     job.known["started_at"] = job.known["started_at"] or time.time()
     calibrator, states = None, list[State]()
 
     def show(state: State) -> None:
-        answer = output.as_json(state, job.known["device"])
-        click.echo(json.dumps(answer, allow_nan=False))
+        click.echo(json.dumps(output.as_json(state, job.known["device"]), allow_nan=False))
         states.append(state)
 
     with lines.source(port, baud) as descriptor:
@@ -315,8 +298,8 @@ def stream(port: str | None, baud: int, timeout: float, **values: Any) -> int:
         raise InputError("stream: expected lines of samples, got none; check what sends them")
     if parser.bad:
         _say(f"{parser.bad} lines were of another shape and were left out")
-    source = hashlib.sha256(f"{job.known['started_at']} {state.own_dps}".encode()).hexdigest()
-    return _report(calibrator, job, states, device, source, port or "standard input")
+    source = hashlib.sha256(f"{name} {job.known['started_at']}".encode()).hexdigest()
+    return _report(calibrator, job, states, source, name)
 
 
 @main.command()
@@ -328,18 +311,14 @@ def plan(heading: str | None, as_json: bool, **known: Any) -> int:
         raise InputError("plan: expected either --target 0.3 (mdps) or --heading 1deg/h")
     target_mdps = known["target_mdps"] = known["target_mdps"] or _heading_mdps(str(heading))
     calibrator = Calibrator.open(rate_hz=100.0, **known)
-    if not np.all(calibrator.freedom > 0):
+    if not np.all(calibrator.setup.known[1] > 0):
         listed = ", ".join(names(registry_folder(known["registry"])))
         text = f"expected a device of known noise; give --type ({listed})"
         raise InputError(f"plan: {text} or a --device with history")
-    seconds = calibrator.state().seconds_left
-    if as_json:
-        answer = {"target_mdps": target_mdps, "seconds": output.numbers(seconds)}
-        click.echo(json.dumps(answer))
-    else:
-        floors = calibrator.device_type.noise.floor_dps / MDPS
-        click.echo("\n".join(output.planned(seconds, floors, target_mdps)))
-    return DONE if np.isfinite(seconds).all() else NOT_REACHED
+    state = calibrator.state()
+    answer = {"target_mdps": target_mdps, "seconds": output.numbers(state.seconds_left)}
+    _print(as_json, answer, output.planned(state, target_mdps))
+    return DONE if np.isfinite(state.seconds_left).all() else NOT_REACHED
 
 
 def _heading_mdps(text: str) -> float:
@@ -371,28 +350,20 @@ def _existing(folder: str | None, name: str) -> Device:
 def list_devices(folder: str | None, as_json: bool) -> None:
     """Devices, their types and how many calibrations count."""
     rows = [
-        {"device": d.name, "type": d.settings().get("type"), "calibrations": len(d.calibrations())}
+        {"device": d.name, "type": d.settings().get("type"), "calibrations": len(d.history())}
         for d in registry.devices(registry_folder(folder))
     ]
-    if as_json:
-        click.echo(json.dumps(rows))
-        return
-    for row in rows:
-        click.echo(f"{row['device']:<24} {row['type'] or '-':<12} {row['calibrations']:>4}")
-    _say(f"types: {', '.join(names(registry_folder(folder)))}")
+    _print(as_json, rows, output.device_list(rows, names(registry_folder(folder))))
 
 
 @devices.command()
 @click.argument("name")
 @_with({**_FOLDER, **_JSON})
 def show(name: str, folder: str | None, as_json: bool) -> None:
-    """Level over time, turn-on spread, walk, temperature slope and noise of a device."""
+    """Level over time, turn-on spread, walk, temperature slope, noise and health of a device."""
     device = _existing(folder, name)
-    lines, model = device.lines(), device.model()
-    if as_json:
-        click.echo(json.dumps({"lines": lines, "model": model}))
-    else:
-        click.echo("\n".join(output.device_table(lines, device.calibrations(), model)))
+    answer = {"lines": device.lines(), "model": device.model()}
+    _print(as_json, answer, output.device_table(device))
 
 
 @devices.command()
@@ -402,6 +373,22 @@ def show(name: str, folder: str | None, as_json: bool) -> None:
 def note(name: str, text: str, folder: str | None) -> None:
     """Append a note to a device's history."""
     _existing(folder, name).append({"event": "note", "time": time.time(), "text": text})
+
+
+@devices.command("set", context_settings={"ignore_unknown_options": True})  # -0.1 is a number
+@click.argument("name")
+@click.argument("bias_dps", nargs=3, type=float)
+@click.option("--sigma", type=float, default=0.0, show_default=True, help="of them, mdps")
+@_with({**_FOLDER, "device_type": _DEVICE["device_type"]})
+def set_bias(
+    name: str, bias_dps: tuple[float, float, float], sigma: float, folder: str | None,
+    device_type: str | None,
+) -> None:  # fmt: skip
+    """Type in a bias, deg/s about x, y and z: it stands for the history until it is forgotten."""
+    device, variance = Device(registry_folder(folder), name), (sigma * MDPS) ** 2
+    device.create(device_type)
+    about: Any = {"time": time.time(), "hash": SET, "source": SET, "event": SET}
+    device.append(Calibration(bias_dps, (variance,) * 3, **about))
 
 
 @devices.command()
@@ -415,13 +402,11 @@ def forget(name: str, source: str | None, everything: bool, folder: str | None) 
     if everything:
         device.remove()
         return
-    lines = [line for line in device.lines() if line["event"] == "calibration"]
-    hashes = [
-        line["hash"] for line in lines
-        if source and (line["source"] == source or line["hash"].startswith(source))
-    ]  # fmt: skip
+    stored = device.calibrations()
+    matches = {key for key in stored if source and key.startswith(source)}
+    hashes = matches | {key for key, c in stored.items() if c.source == source}
     if not hashes:
-        known = ", ".join(line["source"] for line in lines) or "none"
+        known = ", ".join(c.source for c in stored.values()) or "none"
         raise InputError(f"forget: expected one of {known}, or a hash, got {source!r}; or --all")
     for withdrawn in hashes:
         device.append({"event": "forget", "time": time.time(), "of": withdrawn})
@@ -445,9 +430,9 @@ def load(file: Path, name: str | None, folder: str | None) -> None:
     try:
         content = json.loads(file.read_text("utf-8"))
         Device(registry_folder(folder), name or content["device"]).restore(content)
+    except InputError:
+        raise
     except (ValueError, KeyError, TypeError) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"{file}: expected what devices save writes, but: {error!r}") from error
 
 

@@ -1,61 +1,84 @@
 """What the devices of one type share: ``<registry>/types/<type>.json``, or one that ships.
 
 A file is written by hand, or by :func:`type_of_models` from the pipeline's own fits. Its keys are
-those of ``_TRIPLES`` (a number, or one for each of x, y, z), ``_NUMBERS``, ``warm_up`` and
-``sources``; docs/calibrator.md explains them.
+the fields of :class:`DeviceType`; docs/calibrator.md explains them.
 """
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cache, cached_property
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 
-from gyro_pipeline.calibrator.filter import FLICKER_S, Noise
-from gyro_pipeline.calibrator.state import Array
-from gyro_pipeline.conventions import AXES, MDPS, InputError
+from gyro_pipeline.calibrator.filter import FLICKER_S, Array, Noise
+from gyro_pipeline.conventions import MDPS, InputError
 
 if TYPE_CHECKING:
     from gyro_pipeline.physics.recording_model import RecordingModel
 
-UNKNOWN = "unknown"
-"""The type of a device of which nothing is said: its noise is told from the log alone."""
+Axes = float | tuple[float, float, float]
+"""A number, or one for each of x, y, z."""
 
-_TRIPLES = {  # and what stands for one that a file leaves out
-    "noise_mdps_rts": 1e3,
-    "flicker_mdps": 0.0,
-    "random_walk_mdps_per_rts": 0.0,
-    "turn_on_mdps": 10.0,
-    "walk_mdps_per_rtday": 3.0,
-    "conflict_mdps": 5.0,
-    "temperature_slope_mdps_per_c": 0.0,
-    "temperature_spread_mdps_per_c": 0.0,
-}
-_NUMBERS = {
-    "noise_spread": 0.0, "turn_on_factor": 3.0, "walk_factor": 4.0, "least_change_mdps": 20.0,
-}  # fmt: skip
-_WARM_UP = ("amplitude_mdps", "spread_mdps", "time_constant_s")
-_TEXTS = {"schema", "type", "about", "sources", "warm_up"}
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class WarmUp:
+    """The bias of a device that warms up: it decays from an amplitude at power-on."""
+
+    amplitude_mdps: Axes
+    spread_mdps: Axes
+    time_constant_s: float
 
 
 @dataclass(frozen=True)
 class DeviceType:
-    """A type in deg/s; arrays are (3,)."""
+    """A type, as in its file. Without its noise it is told from the log alone."""
 
-    name: str
-    noise: Noise  # N is 1 where it is not known, and noise_freedom 0
-    noise_freedom: float  # that N is worth before a log is seen; infinite: known
-    turn_on: Array  # median of tau
-    turn_on_factor: float  # one standard deviation of tau, as a factor
-    walk: Array  # median of the level's walk, deg/s a square root of a day
-    walk_factor: float
-    wide: Array  # standard deviation of the wide prior
-    slope: Array  # of the bias, deg/s a degree Celsius
-    slope_spread: Array  # its standard deviation; 0: temperature is not used
-    least_change: float  # smaller changes of the rate within half a minute are no motion
+    type: str = "unknown"
+    noise_mdps_rts: Axes | None = None  # N
+    noise_spread: float = 0.0  # of N from device to device, relative
+    flicker_mdps: Axes = 0.0  # B
+    random_walk_mdps_per_rts: Axes = 0.0  # K
+    turn_on_mdps: Axes = 10.0  # median of tau
+    turn_on_factor: float = 3.0  # one standard deviation of tau, as a factor
+    walk_mdps_per_rtday: Axes = 3.0  # median of the level's walk
+    walk_factor: float = 4.0
+    conflict_mdps: Axes = 5.0  # standard deviation of a history that is wrong
+    temperature_slope_mdps_per_c: Axes = 0.0
+    temperature_spread_mdps_per_c: Axes = 0.0  # of the slope; 0: temperature is not used
+    least_change_mdps: float = 20.0  # smaller changes within half a minute are no motion
+    warm_up: WarmUp | None = None
+    schema: int = 1
+    about: str = ""
+    sources: dict[str, str] = field(default_factory=dict)
+
+    def dps(self, name: str) -> Array:
+        """(3,), a field that is in mdps, in deg/s."""
+        return np.broadcast_to(np.asarray(getattr(self, name), np.float64) * MDPS, 3)
+
+    @cached_property
+    def noise(self) -> Noise:
+        """Its noise figures; N is 1 where it is not known."""
+        white = np.ones(3) if self.noise_mdps_rts is None else self.dps("noise_mdps_rts")
+        warm, warm_up = self.warm_up, None
+        if warm is not None:
+            pair = (np.broadcast_to(x, 3) * MDPS for x in (warm.amplitude_mdps, warm.spread_mdps))
+            mean, spread = pair
+            warm_up = mean, np.maximum(spread, 1e-3 * MDPS), warm.time_constant_s
+        others = self.dps("flicker_mdps"), self.dps("random_walk_mdps_per_rts")
+        return Noise(white, *others, warm_up)
+
+    @property
+    def noise_freedom(self) -> float:
+        """Degrees of freedom that N is worth before a log is seen; infinite: known."""
+        if self.noise_mdps_rts is None:
+            return 0.0
+        return 1 / (2 * self.noise_spread**2) if self.noise_spread else np.inf
 
 
 def read_type(name: str | None, registry: Path | None = None) -> DeviceType:
@@ -64,11 +87,10 @@ def read_type(name: str | None, registry: Path | None = None) -> DeviceType:
     Raises:
         InputError: There is no such type, or its file is not as it should be.
     """
-    if name in (None, UNKNOWN):
-        return type_of({}, "the unknown type")
+    if name in (None, DeviceType.type):
+        return DeviceType()
     for folder in _folders(registry):
-        path = folder / f"{name}.json"
-        if path.is_file():
+        if (path := folder / f"{name}.json").is_file():
             try:
                 return type_of(json.loads(path.read_text("utf-8")), str(path))
             except json.JSONDecodeError as error:
@@ -91,45 +113,31 @@ def _folders(registry: Path | None) -> list[Any]:
 
 
 def type_of(content: Mapping[str, Any], where: str) -> DeviceType:
-    """The type that a file's content describes.
+    """The type that a file's content describes."""
+    return validated(DeviceType, content, where)
+
+
+def validated(kind: type[T], content: Mapping[str, Any], where: str) -> T:
+    """A dataclass of what a file holds.
 
     Raises:
         InputError: A key is unknown, or a value is not as it should be.
     """
-    if extra := set(content) - {*_TRIPLES, *_NUMBERS, *_TEXTS}:
-        known = ", ".join((*_TRIPLES, *_NUMBERS, "warm_up", "sources"))
-        raise InputError(f"{where}: expected the keys {known}, got {sorted(extra)}; correct them")
-    v = {key: _triple(content.get(key, default), key, where) for key, default in _TRIPLES.items()}
-    n = {key: float(content.get(key, default)) for key, default in _NUMBERS.items()}
-    white, spread = v["noise_mdps_rts"], n["noise_spread"]
-    freedom = 1 / (2 * spread**2) if spread else np.inf
-    noise = Noise(white, v["flicker_mdps"], v["random_walk_mdps_per_rts"], _warm_up(content, where))
-    return DeviceType(
-        str(content.get("type", UNKNOWN)), noise, freedom if "noise_mdps_rts" in content else 0.0,
-        v["turn_on_mdps"], n["turn_on_factor"], v["walk_mdps_per_rtday"], n["walk_factor"],
-        v["conflict_mdps"], v["temperature_slope_mdps_per_c"], v["temperature_spread_mdps_per_c"],
-        n["least_change_mdps"] * MDPS,
-    )  # fmt: skip
+    from pydantic import ValidationError  # noqa: PLC0415
 
-
-def _triple(value: Any, key: str, where: str) -> Array:
-    """Three numbers in deg/s, of one or three in mdps."""
     try:
-        triple = np.broadcast_to(np.asarray(value, np.float64), 3)
-    except (TypeError, ValueError):
-        triple = np.full(3, np.nan)
-    if not np.all(np.isfinite(triple)):
-        raise InputError(f"{where}: {key}: expected a number for each of {AXES}, got {value!r}")
-    return triple * MDPS
+        return cast(T, _adapter(cast(Any, kind)).validate_python(content))
+    except ValidationError as error:
+        first = error.errors()[0]
+        key, text = str(first["loc"][0]), first["msg"].lower()
+        raise InputError(f"{where}: {key}: {text}, got {first['input']!r}; correct it") from error
 
 
-def _warm_up(content: Mapping[str, Any], where: str) -> tuple[Array, Array, float] | None:
-    if (given := content.get("warm_up")) is None:
-        return None
-    if set(given) != set(_WARM_UP):
-        raise InputError(f"{where}: warm_up: expected {', '.join(_WARM_UP)}, got {sorted(given)}")
-    mean, spread = (_triple(given[k], k, where) for k in ("amplitude_mdps", "spread_mdps"))
-    return mean, np.maximum(spread, 1e-3 * MDPS), float(given["time_constant_s"])
+@cache
+def _adapter(kind: Any) -> Any:
+    from pydantic import ConfigDict, TypeAdapter, with_config  # noqa: PLC0415
+
+    return TypeAdapter(with_config(ConfigDict(extra="forbid", allow_inf_nan=False))(kind))
 
 
 def type_of_models(
@@ -147,14 +155,13 @@ def type_of_models(
         [(m.noise.white, m.noise.instability, m.noise.random_walk) for m in device]
         for device in models
     ]
-    white, instability, walk = np.moveaxis(np.array(figures), -1, 0) / MDPS
+    white, flicker, walk = np.moveaxis(np.array(figures), -1, 0) / MDPS
     slower = [[np.log(m.samples / m.rate_hz / FLICKER_S) / np.pi for m in d] for d in models]
     variances = np.array([[m.covariance[0, 0] for m in device] for device in models]) / MDPS**2
-    logs = np.log(np.maximum(variances + np.array(slower) * instability**2, 1e-4)) / 2
+    logs = np.log(np.maximum(variances + np.array(slower) * flicker**2, 1e-4)) / 2
     relative = np.std(white / np.sqrt(np.mean(white**2, axis=0)), axis=0, ddof=len(models) > 1)
-    rms = {"noise_mdps_rts": white, "flicker_mdps": instability, "random_walk_mdps_per_rts": walk}
+    rms = {"noise_mdps_rts": white, "flicker_mdps": flicker, "random_walk_mdps_per_rts": walk}
     return {
-        "schema": 1,
         "type": name,
         **{key: np.sqrt(np.mean(v**2, axis=0)).round(4).tolist() for key, v in rms.items()},
         "noise_spread": round(float(max(relative.max(), 0.02)), 3),

@@ -22,8 +22,9 @@ from functools import lru_cache
 from typing import NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gyro_pipeline.calibrator.state import Array
+Array = NDArray[np.float64]
 
 FLICKER_S = 120.0
 """Flicker counts down to one cycle in two such times; what is slower is turn-on bias."""
@@ -54,24 +55,25 @@ class Noise:
 
 
 class Estimate(NamedTuple):
-    """Estimates by the data alone after each of n filters; infinite before the first block.
+    """An estimate by the data alone, (..., 3); infinite variances before the first block.
 
     The bias now is ``transfer`` times the bias at the start, plus something independent of it.
     """
 
-    bias: Array  # (n, 3), now
-    variance: Array  # (n, 3)
-    start: Array  # (n, 3), the bias at the start
-    start_variance: Array  # (n, 3)
-    transfer: Array  # (n, 3)
-    squares: Array  # (n, 3), of the residuals over their variances
-    freedom: Array  # (n, 1), degrees of freedom of those
+    bias: Array  # now
+    variance: Array
+    start: Array  # the bias at the start
+    start_variance: Array
+    transfer: Array
+    squares: Array  # of the residuals over their variances
+    freedom: Array  # (..., 1), degrees of freedom of those
 
 
 class _Step(NamedTuple):
     """What some seconds do to the four processes, the walk first (exact integrals)."""
 
     keep: Array  # (4,), F
+    forget: Array  # (4, 4), F F'
     read: Array  # (4,), H: the mean over the step, per value at its start
     added: Array  # (3, 4, 4), Q
     shared: Array  # (3, 4), covariance of what is added to the end and to the mean
@@ -87,7 +89,8 @@ def _step(noise: Noise, step_s: float) -> _Step:
     within = flicker * (2 * (d - 1 + decay) / d**2 - mean**2)
     white = noise.white**2 / step_s + _WITHIN_BLOCK * noise.instability**2
     return _Step(
-        keep=np.append(1.0, decay),
+        keep=(keep := np.append(1.0, decay)),
+        forget=keep[:, None] * keep,
         read=np.append(1.0, mean),
         added=np.hstack([walk, flicker * (1 - decay**2)])[:, :, None] * np.eye(4),
         shared=np.hstack([walk / 2, flicker * (1 - decay) ** 2 / d]),
@@ -96,14 +99,17 @@ def _step(noise: Noise, step_s: float) -> _Step:
 
 
 class Filter(NamedTuple):
-    """State after some blocks; an update makes a new one, so one can go back to an older one."""
+    """State after some blocks; an update makes a new one, so one can go back to an older one.
+
+    In a :meth:`stack` of several, arrays have a leading axis.
+    """
 
     noise: Noise
     block_s: float
     age_s: float | None  # from power-on to the start; None: a warm-up's amplitude is free
-    reference: Array  # (3,), deg/s, the first block's mean, which is subtracted from the data
     time_s: float  # since the start, gaps included
-    blocks: int  # taken so far
+    reference: Array  # (3,), deg/s, the first block's mean, which is subtracted from the data
+    blocks: NDArray[np.integer] | int  # taken so far
     states: Array  # (3, 4, 1 + p), of the walk and flicker, in y and in each column of X
     covariance: Array  # (3, 4, 4), of the states, (deg/s)^2
     information: Array  # (3, p, p), on c
@@ -116,47 +122,45 @@ class Filter(NamedTuple):
         p, zero = 1 if noise.warm_up is None else 2, np.zeros(3)
         flicker = noise.instability[:, None] ** 2 * _VARIANCES
         covariance = np.hstack([np.zeros((3, 1)), flicker])[:, :, None] * np.eye(4)
-        information, weighted = np.zeros((3, p, p)), np.zeros((3, p))
-        if noise.warm_up is not None:
+        information, weighted, squares = np.zeros((3, p, p)), np.zeros((3, p)), zero
+        if noise.warm_up is not None:  # the amplitude's prior is one datum more
             mean, spread, _ = noise.warm_up
             if age_s is None:
                 mean, spread = zero, np.full(3, _FREE_DPS)
-            information[:, 1, 1] = 1 / spread**2
-            weighted[:, 1] = mean / spread**2
-        states = np.zeros((3, 4, 1 + p))
-        return cls(
-            noise, block_s, age_s, zero, 0.0, 0, states, covariance, information, weighted, zero
-        )
+            information[:, 1, 1], weighted[:, 1] = 1 / spread**2, mean / spread**2
+            squares = (mean / spread) ** 2
+        sums = np.zeros((3, 4, 1 + p)), covariance, information, weighted, squares
+        return cls(noise, block_s, age_s, 0.0, zero, 0, *sums)
 
     def update(self, mean: Array | None) -> tuple[Self, Array]:
         """Take the mean of a block, (3,), deg/s; None looks ahead: all but the data moves on.
 
-        Returns:
-            The next filter, and the block's innovation (3,) in units of its standard deviation;
-            0 at the first block.
+        The second result is the innovation (3,) in its standard deviation; 0 at the first block.
         """
         reference = self.reference if self.blocks or mean is None else mean
         step = _step(self.noise, self.block_s)
         to_mean = self.covariance @ step.read
         variance = to_mean @ step.read + step.white
-        residuals = (
-            self._columns(0.0 if mean is None else mean - reference) - step.read @ self.states
-        )
+        columns = self._columns(0.0 if mean is None else mean - reference)
+        residuals = columns - step.read @ self.states
         of_y, of_x = residuals[:, 0], residuals[:, 1:]
-        gain = (step.keep * to_mean + step.shared) / variance[:, None]
-        scaled = of_x / variance[:, None]
-        explained = (variance[:, None] * gain)[:, :, None] * gain[:, None, :]
-        following = self.skip(self.block_s)
-        following = following._replace(
+        added = step.keep * to_mean + step.shared
+        gain, scaled = added / variance[:, None], of_x / variance[:, None]
+        skipped = self.skip(self.block_s)
+        following = skipped._replace(
             reference=reference,
             blocks=self.blocks + 1,
-            states=following.states + gain[:, :, None] * residuals[:, None, :],
-            covariance=following.covariance - explained,
+            states=skipped.states + gain[:, :, None] * residuals[:, None, :],
+            covariance=skipped.covariance - added[..., None] * gain[:, None],
             information=self.information + scaled[:, :, None] * of_x[:, None, :],
             weighted=self.weighted + scaled * of_y[:, None],
             squares=self.squares + of_y**2 / variance,
         )
-        return following, self._innovation(of_y, of_x, variance)
+        if not self.blocks:
+            return following, np.zeros(3)
+        c, uncertainty = self._constants()
+        spread = variance + np.sum(_times(uncertainty, of_x) * of_x, axis=1)
+        return following, (of_y - np.sum(of_x * c, axis=1)) / np.sqrt(spread)
 
     def skip(self, seconds: float) -> Self:
         """Move on over a gap without data."""
@@ -164,7 +168,7 @@ class Filter(NamedTuple):
         return self._replace(
             time_s=self.time_s + seconds,
             states=step.keep[:, None] * self.states,
-            covariance=step.keep[:, None] * step.keep * self.covariance + step.added,
+            covariance=step.forget * self.covariance + step.added,
         )
 
     def _columns(self, y: Array | float) -> Array:
@@ -178,20 +182,13 @@ class Filter(NamedTuple):
 
     def _decay(self) -> float:
         """What is left now of a warm-up's amplitude at power-on, or else at the start."""
-        if self.noise.warm_up is None:
-            return 0.0
-        return float(np.exp(-(self.time_s + (self.age_s or 0.0)) / self.noise.warm_up[2]))
-
-    def _innovation(self, of_y: Array, of_x: Array, variance: Array) -> Array:
-        if not self.blocks:
-            return np.zeros(3)
-        c, uncertainty = self._constants()
-        spread = variance + np.sum(_times(uncertainty, of_x) * of_x, axis=1)
-        return np.asarray((of_y - np.sum(of_x * c, axis=1)) / np.sqrt(spread))
+        constant_s = self.noise.warm_up[2] if self.noise.warm_up else np.inf
+        return float(np.exp(-(self.time_s + (self.age_s or 0.0)) / constant_s))
 
     def _constants(self) -> tuple[Array, Array]:
-        """The constants c by the data alone, (3, p), and their covariance, (3, p, p)."""
-        uncertainty = _inverse(self.information)
+        """The constants c by the data alone, (..., p), and their covariance, (..., p, p)."""
+        one = self.information.shape[-1] == 1
+        uncertainty = np.asarray(1 / self.information if one else np.linalg.inv(self.information))
         return _times(uncertainty, self.weighted), uncertainty
 
     def warm_up(self) -> tuple[Array, Array]:
@@ -199,47 +196,38 @@ class Filter(NamedTuple):
         c, uncertainty = self._constants()
         return self._decay() * c[:, -1], self._decay() * np.sqrt(uncertainty[:, -1, -1])
 
-    def ahead(self, blocks: int) -> list[Self]:
-        """Filters after each of the blocks to come: their variances are known now."""
+    def stack(self, filters: Sequence[Self]) -> Self:
+        """Later ones of the same stretch as one."""
+        arrays = (np.array(values) for values in list(zip(*filters, strict=True))[4:])
+        return self.__class__(*self[:4], *arrays)
+
+    def ahead(self, blocks: int) -> tuple[Self, Self]:
+        """The filter after some blocks to come, and a stack of those after each of them."""
         filters = [self]
         for _ in range(blocks):
             filters.append(filters[-1].update(None)[0])
-        return filters[1:]
+        return filters[-1], self.stack(filters[1:])
 
-
-def estimates(filters: Sequence[Filter]) -> Estimate:
-    """What filters of one stretch say by the data alone."""
-    first, blocks = filters[0], np.array([[f.blocks] for f in filters], np.float64)
-    if not first.blocks:
-        unknown, infinite = np.full((1, 3), np.nan), np.full((1, 3), np.inf)
-        one, zero = np.ones((1, 3)), np.zeros((1, 3))
-        return Estimate(unknown, infinite, unknown, infinite, one, zero, zero[:, :1])
-    uncertainty = _inverse(np.array([f.information for f in filters]))
-    weighted = np.array([f.weighted for f in filters])
-    walk = np.array([f.states[:, 0] for f in filters])  # of y, and of each column
-    walk_variance = np.array([f.covariance[:, 0, 0] for f in filters])
-    c, on_c = _times(uncertainty, weighted), -walk[..., 1:]
-    on_c[..., 0] += 1
-    shared = _times(uncertainty, on_c)
-    squares = np.array([f.squares for f in filters]) - np.sum(c * weighted, axis=-1)
-    freedom = blocks - 1
-    if first.noise.warm_up is not None:  # the amplitude's prior is one datum more
-        mean, spread, _ = first.noise.warm_up
-        free = first.age_s is None
-        squares, freedom = squares + (0 if free else (mean / spread) ** 2), freedom - free
-    return Estimate(
-        bias=first.reference + walk[..., 0] + np.sum(on_c * c, axis=-1),
-        variance=walk_variance + np.sum(shared * on_c, axis=-1),
-        start=first.reference + c[..., 0],
-        start_variance=uncertainty[..., 0, 0],
-        transfer=shared[..., 0] / uncertainty[..., 0, 0],
-        squares=squares,
-        freedom=np.maximum(freedom, 0),
-    )
-
-
-def _inverse(matrices: Array) -> Array:
-    return np.asarray(1 / matrices if matrices.shape[-1] == 1 else np.linalg.inv(matrices))
+    def estimate(self) -> Estimate:
+        """What the filter, or each of a stack, says by the data alone."""
+        if not np.all(self.blocks):
+            unknown, infinite, zero = np.full(3, np.nan), np.full(3, np.inf), np.zeros(3)
+            return Estimate(unknown, infinite, unknown, infinite, zero + 1, zero, zero[:1])
+        c, uncertainty = self._constants()
+        walk = self.states[..., 0, :]  # of y, and of each column
+        on_c = -walk[..., 1:]
+        on_c[..., 0] += 1
+        shared = _times(uncertainty, on_c)
+        free = self.noise.warm_up is not None and self.age_s is None
+        return Estimate(
+            bias=self.reference + walk[..., 0] + np.sum(on_c * c, axis=-1),
+            variance=self.covariance[..., 0, 0] + np.sum(shared * on_c, axis=-1),
+            start=self.reference + c[..., 0],
+            start_variance=uncertainty[..., 0, 0],
+            transfer=shared[..., 0] / uncertainty[..., 0, 0],
+            squares=self.squares - np.sum(c * self.weighted, axis=-1),
+            freedom=np.maximum(np.asarray(self.blocks, float)[..., None] - 1 - free, 0),
+        )
 
 
 def _times(matrices: Array, vectors: Array) -> Array:

@@ -17,53 +17,96 @@ direction u in the axes of the device, latitude phi and an unknown heading, the 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from gyro_pipeline.calibrator.device_types import DeviceType
+from gyro_pipeline.calibrator.filter import Array
 from gyro_pipeline.calibrator.reasons import Reason, reason
-from gyro_pipeline.calibrator.state import DROPPED, Array
 from gyro_pipeline.conventions import MDPS
 
 EARTH_DPS = 4.178e-3
 """The Earth's rate, 15.041 deg/h."""
 
-DAY_S = 86400.0
-
 SAME_ATTITUDE_DEG = 5.0
 """Attitudes that differ by more are different ones."""
 
+STILL, MOVING, UNSURE = "still", "moving", "unsure"
+"""At rest, not at rest, or too few blocks to say."""
+
+USED, DROPPED, NONE = "used", "dropped", "none"
+"""What became of the history on an axis."""
+
+_DAY_S = 86400.0
 _GRID = (11, 9)  # points of tau and of the walk, over 2.5 standard deviations to both sides
 _MOST = 100  # calibrations that are used, the latest
 _LEAST_DPS = 1e-3 * MDPS
 
+Triple = tuple[float, float, float]
 Fitted = dict[str, tuple[float, float]]
 """Level, tau, walk and slope of an axis, each with its standard deviation."""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Evidence of one calibration, by its own data alone; arrays are (3,)."""
+    """A calibration as it is stored: its evidence, by its own data alone, and what it is from."""
 
-    mean: Array  # deg/s
-    variance: Array  # of the mean
-    day: float | None = None  # when it was made, in days since any epoch
-    temperature_c: float | None = None
-    up: Array | None = None  # the direction of the mean acceleration, a unit vector
-    outcome: tuple[str, ...] = ("none",) * 3  # what became of the history on each axis
-    noise: Array | None = None  # N, deg/s * sqrt(s), as these data show it
-    freedom: float = 0.0  # its degrees of freedom
+    mean_dps: Triple | None  # None: an attempt that was not at rest
+    variance_dps2: Triple | None  # of the mean
+    time: float | None = None  # of the first sample, POSIX seconds
+    since_power_on_s: float | None = None
+    temperature_c: Triple | None = None  # mean, least, most
+    gravity: Triple | None = None  # mean acceleration, g
+    seconds: float = 0.0  # at rest
+    rest: Literal["still", "moving", "unsure"] = "still"
+    outcome: tuple[str, str, str] = (NONE, NONE, NONE)  # what became of the history on each axis
+    noise_mdps_rts: Triple | None = None  # N, as these data show it
+    noise_freedom: float = 0.0  # its degrees of freedom
+    same_heading: bool = False  # declared
+    known_still: bool = False  # declared
+    reached: bool = True  # the target, where one was given
+    attempt: int = 1  # 2: the one before was not at rest, or did not reach its target
+    reasons: tuple[str, ...] = ()
+    hash: str = ""  # of the source
+    source: str = ""
+    version: str = ""
+    event: Literal["calibration", "set"] = "calibration"  # set: numbers that a person typed
+    schema: int = 1
+
+    @property
+    def mean(self) -> Array:
+        """The mean of its data, (3,), deg/s."""
+        return _floats(self.mean_dps or [None] * 3)
+
+    @property
+    def variance(self) -> Array:
+        """The variance of the mean, (3,)."""
+        return _floats(self.variance_dps2 or [None] * 3)
+
+    @property
+    def celsius(self) -> float | None:
+        """The mean temperature."""
+        return None if self.temperature_c is None else self.temperature_c[0]
+
+    @property
+    def up(self) -> Array | None:
+        """The direction of gravity, a unit vector (3,)."""
+        return None if self.gravity is None else unit(np.array(self.gravity))
 
 
 @dataclass(frozen=True)
 class Circumstances:
-    """What is known of a calibration besides its rates."""
+    """What is known of a calibration besides its samples."""
 
-    day: float | None = None
-    temperature_c: float | None = None
-    up: Array | None = None
+    time: float | None = None  # of the first sample, POSIX seconds
+    since_power_on_s: float | None = None  # None: a warm-up's amplitude is left free
     same_heading: bool = False  # whether the heading is declared to be that of the history
     latitude_deg: float | None = None
+    known_still: bool = False  # declared to be at rest: nothing is cut
+    attempt: int = 1
+    temperature_c: float | None = None
+    up: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -75,9 +118,19 @@ class Prior:
     wide: Array  # variance where it is wrong
     slope: Array  # of the bias, deg/s a degree Celsius; the type's where there is no history
     slope_sigma: Array
-    count: tuple[int, ...] = (0, 0, 0)  # calibrations that make the level of each axis
+    count: int = 0  # calibrations that make the level, of the axis that has most
     reasons: tuple[Reason, ...] = ()  # what widened it
     fitted: tuple[Fitted, ...] = ()
+
+
+def unit(vector: Array) -> Array:
+    """Its direction."""
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def angle_deg(first: Array, second: Array) -> float:
+    """Angle between two directions, degrees."""
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second)))
 
 
 def prior_of(
@@ -87,10 +140,14 @@ def prior_of(
     past = list(calibrations)[-_MOST:]
     if not past:
         none, infinite = np.full(3, np.nan), np.full(3, np.inf)
-        return Prior(none, infinite, infinite, device_type.slope, device_type.slope_spread)
-    days = _known([*(c.day for c in past), now.day])  # a gap that is not known is of one day
-    days = np.append(0.0, np.cumsum(np.nan_to_num(np.abs(np.diff(days)), nan=1.0)))
-    members = [level_members(past, axis, device_type.turn_on[axis]) for axis in range(3)]
+        spread = device_type.dps("temperature_spread_mdps_per_c")
+        slope = device_type.dps("temperature_slope_mdps_per_c")
+        return Prior(none, infinite, infinite, slope, spread)
+    times = _floats([*(c.time for c in past), now.time]) / _DAY_S
+    days = np.nan_to_num(np.abs(np.diff(times)), nan=1.0)  # a gap that is not known is of one day
+    days = np.append(0.0, np.cumsum(days))
+    turn_on = device_type.dps("turn_on_mdps")
+    members = [level_members(past, axis, turn_on[axis]) for axis in range(3)]
     axes = [
         _axis_prior([past[i] for i in chosen], days[[*chosen, -1]], axis, device_type, now)
         for axis, chosen in enumerate(members)
@@ -100,12 +157,12 @@ def prior_of(
     heading, of_heading = _earth(past, now, np.array(tau))
     beyond, of_temperature = _beyond(past, device_type, now)
     narrow = np.array(variance) + heading + beyond
-    wide = np.maximum(device_type.wide**2, 9 * narrow)  # at least three times as far
-    count, reasons = tuple(map(len, members)), (*of_heading, *of_temperature)
+    wide = np.maximum(device_type.dps("conflict_mdps") ** 2, 9 * narrow)  # at least thrice as far
+    count, reasons = max(map(len, members)), (*of_heading, *of_temperature)
     return Prior(np.array(mean), narrow, wide, slope, slope_sigma, count, reasons, fitted)
 
 
-def _known(values: Sequence[float | None]) -> Array:
+def _floats(values: Sequence[float | None]) -> Array:
     """An array, NaN for None."""
     return np.array(values, np.float64)
 
@@ -138,11 +195,12 @@ def _axis_prior(
     past: Sequence[Calibration], days: Array, axis: int, device_type: DeviceType, now: Circumstances
 ) -> tuple[float, float, float, Fitted]:
     """Mean and variance of the next bias without the Earth, tau squared, and what was fitted."""
-    temperatures = _known([*(c.temperature_c for c in past), now.temperature_c])
+    temperatures = _floats([*(c.celsius for c in past), now.temperature_c])
     unknown = np.isnan(temperatures[:-1])
     seen = temperatures[:-1][~unknown] if not unknown.all() else np.zeros(1)
     warmth = np.nan_to_num(temperatures - seen.mean()) * (not unknown.all())
-    type_slope, spread = device_type.slope[axis], device_type.slope_spread[axis] ** 2
+    type_slope = device_type.dps("temperature_slope_mdps_per_c")[axis]
+    spread = device_type.dps("temperature_spread_mdps_per_c")[axis] ** 2
     tau, walk, logs = _grid(device_type, axis)
     days = days - days[0]
     of_walk = walk[:, None, None] ** 2 * np.minimum(days[:, None], days)
@@ -178,9 +236,10 @@ def _grid(device_type: DeviceType, axis: int) -> tuple[Array, Array, Array]:
     """Points of tau and of the walk, (g,) each, and the logarithm of their prior."""
     z = [np.linspace(-2.5, 2.5, number) for number in _GRID]
     first, second = (grid.ravel() for grid in np.meshgrid(*z, indexing="ij"))
-    tau = max(device_type.turn_on[axis], _LEAST_DPS) * device_type.turn_on_factor**first
-    walk = max(device_type.walk[axis], _LEAST_DPS) * device_type.walk_factor**second
-    return tau, walk, -(first**2 + second**2) / 2
+    tau = np.maximum(device_type.dps("turn_on_mdps")[axis], _LEAST_DPS)
+    walk = np.maximum(device_type.dps("walk_mdps_per_rtday")[axis], _LEAST_DPS)
+    logs = -(first**2 + second**2) / 2
+    return tau * device_type.turn_on_factor**first, walk * device_type.walk_factor**second, logs
 
 
 def _krige(
@@ -188,12 +247,9 @@ def _krige(
 ) -> tuple[Array, Array, Array]:
     """Restricted deviance, conditional means and variances of k targets at each point of a grid.
 
-    Args:
-        among: (g, n, n), covariance of the evidence.
-        cross: (g, n, k), of the evidence with the targets.
-        own: (g, k), variances of the targets.
-        y: (n,), the evidence, about an unknown level.
-        flat: (k,), by how much a target moves with the level.
+    ``among`` (g, n, n) is the covariance of the evidence y (n,) about an unknown level, ``cross``
+    (g, n, k) that with the targets, ``own`` (g, k) holds the targets' variances, and ``flat`` (k,)
+    by how much a target moves with the level.
     """
     reference = y.mean()
     columns = np.stack([np.ones(len(y)), y - reference], axis=-1)
@@ -223,21 +279,18 @@ def _beyond(
     past: Sequence[Calibration], device_type: DeviceType, now: Circumstances
 ) -> tuple[Array, list[Reason]]:
     """Variance of a temperature that the history has not seen, or that is not known now."""
-    seen = [c.temperature_c for c in past if c.temperature_c is not None]
-    if not seen or not np.any(device_type.slope_spread):
+    spread = device_type.dps("temperature_spread_mdps_per_c")
+    ranges = [c.temperature_c for c in past if c.temperature_c is not None]
+    if not ranges or not spread.any():
         return np.zeros(3), []
-    least, most, value = min(seen), max(seen), now.temperature_c
+    least, most = min(r[1] for r in ranges), max(r[2] for r in ranges)
+    value = now.temperature_c
     distance = most - least if value is None else max(value - most, least - value, 0.0)
     if not distance:
         return np.zeros(3), []
     key = "temperature unknown" if value is None else "temperature beyond"
     told = reason(key, value, distance, least=least, most=most)
-    return (device_type.slope_spread * distance) ** 2, [told]
-
-
-def angle_deg(first: Array, second: Array) -> float:
-    """Angle between two directions, degrees."""
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second)))
+    return (spread * distance) ** 2, [told]
 
 
 def _earth(
@@ -250,7 +303,7 @@ def _earth(
     tau holds it already.
     """
     ups, up, latitude = [c.up for c in past if c.up is not None], now.up, now.latitude_deg
-    before = np.sum(ups, axis=0) / np.linalg.norm(np.sum(ups, axis=0)) if ups else None
+    before = unit(np.sum(ups, axis=0)) if ups else None
     turned = 0.0 if before is None or up is None else angle_deg(up, before)
     if turned > SAME_ATTITUDE_DEG:
         told = reason("attitude history", turned, SAME_ATTITUDE_DEG)
@@ -276,7 +329,8 @@ def noise_of(calibrations: Sequence[Calibration], device_type: DeviceType) -> tu
         return np.ones(3), freedom
     total = freedom.copy()
     for past in calibrations:
-        if past.noise is not None and past.freedom > 0:
-            total += past.freedom * (past.noise / device_type.noise.white) ** 2
-            freedom += past.freedom
+        if past.noise_mdps_rts is not None:
+            noise = np.array(past.noise_mdps_rts) * MDPS / device_type.noise.white
+            total += past.noise_freedom * noise**2
+            freedom += past.noise_freedom
     return np.where(freedom > 0, total / np.maximum(freedom, 1e-9), 1.0), freedom

@@ -1,15 +1,17 @@
 """Answers as text for people and as JSON for programs, and a picture of how one came about."""
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
 
-from gyro_pipeline.calibrator.calibrator import Calibrator
-from gyro_pipeline.calibrator.state import DROPPED, NONE, STILL, USED, Array, State
+from gyro_pipeline.calibrator.calibrator import Calibrator, State
+from gyro_pipeline.calibrator.filter import Array
+from gyro_pipeline.calibrator.history import DROPPED, NONE, STILL, USED
+from gyro_pipeline.calibrator.registry import SET, Device
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 
 HEADING_DEG = 3.6
@@ -38,32 +40,42 @@ def numbers(values: Array) -> list[float | None]:
     return [value if math.isfinite(value) else None for value in values.tolist()]
 
 
-def as_text(state: State, target_mdps: float | None, calibrator: Calibrator) -> str:
+def as_text(state: State, target_mdps: float | None, calibrator: Calibrator) -> Iterator[str]:
     """A table of the axes, with a line above and what is left to do below; coloured."""
-    still = state.rest == STILL
-    cut = ", ".join(f"{r.value:.1f} s" for r in state.reasons if r.code == "cut")
-    first = "" if still else f"not at rest ({state.rest}): "
-    first += f"at rest for {state.seconds_at_rest:.1f} of {state.time_s:.1f} s"
-    first += f" (a motion at {cut} was cut)" if cut else ""
-    temperature, count = calibrator.best.current.temperature, max(calibrator.best.prior.count)
-    first += f"; {temperature.mean:.1f} °C" if temperature.blocks else ""
-    heading = f"heading {'' if calibrator.now.same_heading else 'not '}declared to repeat"
-    past = f"{count} calibration{'s' * (count != 1)}, {heading}" if count else "none"
-    lines = [click.style(f"{first}; history: {past}", fg="green" if still else "red")]
-    lines.append(f"{'bias, deg/s':>17}{'σ, mdps':>11}   from")
+    yield click.style(_summary(state, calibrator), fg="green" if state.rest == STILL else "red")
     sigmas = state.sigma_dps / MDPS
+    if state.rest != STILL:
+        if np.isinf(sigmas).all():
+            return
+        yield "The stored value is still the one to use:"
+    yield f"{'bias, deg/s':>17}{'σ, mdps':>11}   from"
     for axis, name in enumerate(AXES):
         row = f"{name}{state.bias_dps[axis]:+16.6f}{sigmas[axis]:11.2f}   {_from(state, axis)}"
-        dropped = state.history[axis] == DROPPED
-        lines.append(click.style(row, fg="yellow") if dropped else row)
+        yield click.style(row, fg="yellow") if state.history[axis] == DROPPED else row
     if target_mdps is not None:
-        lines.append(_left(state, target_mdps))
+        yield _left(state, target_mdps)
     if np.isfinite(sigmas).all():
         drifts = zip(sigmas * HEADING_DEG, AXES, strict=True)
         listed = ", ".join(f"{drift:.2g}° about {name}" for drift, name in drifts)
-        lines.append(f"In one hour the heading drifts by {listed} (1 σ of the bias alone).")
-    bounds = [r.sentence for r in state.reasons if r.code == "rotation_bound"]
-    return "\n".join([*lines, *bounds])
+        yield f"In one hour the heading drifts by {listed} (1 σ of the bias alone)."
+    yield from (r.sentence for r in state.reasons if r.code == "rotation_bound")
+
+
+def _summary(state: State, calibrator: Calibrator) -> str:
+    """How long it was at rest, what was cut, the temperature and the history."""
+    cut = ", ".join(f"{r.value:.1f} s" for r in state.reasons if r.code == "cut")
+    text = "" if state.rest == STILL else f"not at rest ({state.rest}): "
+    text += f"at rest for {state.seconds_at_rest:.1f} of {state.time_s:.1f} s"
+    text += f" (a motion at {cut} was cut)" if cut else ""
+    temperature, count = state.stretch.temperature, state.stretch.prior.count
+    text += f"; {temperature.mean:.1f} °C" if temperature.blocks else ""
+    history = calibrator.setup.history
+    if not count:
+        return f"{text}; history: none"
+    past = f"{count} calibration{'s' * (count != 1)}"
+    past = "set by hand" if history[0].event == SET else past
+    heading = "" if calibrator.setup.now.same_heading else "not "
+    return f"{text}; history: {past}, heading {heading}declared to repeat"
 
 
 def notes(state: State) -> Iterator[str]:
@@ -76,7 +88,9 @@ def notes(state: State) -> Iterator[str]:
 def _from(state: State, axis: int) -> str:
     """What an axis's answer is made of."""
     if state.history[axis] == USED:
-        own, past = state.own_sigma_dps[axis] / MDPS, state.history_sigma_dps[axis] / MDPS
+        stretch = state.stretch
+        variances = stretch.estimate.variance[axis], stretch.prior.narrow[axis]
+        own, past = np.sqrt(variances) / MDPS
         return f"this log {own:.2f}, history {past:.2f}"
     conflicts = [r for r in state.reasons if r.code == "conflict" and r.axis == AXES[axis]]
     return f"this log alone: {conflicts[0].sentence}" if conflicts else "this log"
@@ -97,10 +111,11 @@ def _left(state: State, target_mdps: float) -> str:
     return f"{'; '.join(parts)}." if parts else f"The target of {target_mdps:g} mdps is reached."
 
 
-def planned(seconds: Array, floors_mdps: Array, target_mdps: float) -> Iterator[str]:
+def planned(state: State, target_mdps: float) -> Iterator[str]:
     """A line an axis: the seconds that a target takes, or why it is not reached."""
     same = f"{target_mdps:.3g} mdps ({target_mdps * HEADING_DEG:.3g}° of heading an hour)"
-    for name, needed, floor in zip(AXES, seconds, floors_mdps, strict=True):
+    floors = state.stretch.floor_dps / MDPS
+    for name, needed, floor in zip(AXES, state.seconds_left, floors, strict=True):
         if np.isfinite(needed):
             yield f"{name}: {needed:.1f} s at rest for {same}"
         elif floor > target_mdps:
@@ -109,25 +124,33 @@ def planned(seconds: Array, floors_mdps: Array, target_mdps: float) -> Iterator[
             yield f"{name}: not within an hour"
 
 
-def device_table(
-    lines: Sequence[Mapping[str, Any]], counting: Collection[str], model: Mapping[str, Any]
-) -> Iterator[str]:
-    """The history of a device, and what is derived from it."""
+def device_list(rows: Sequence[Mapping[str, Any]], types: Sequence[str]) -> Iterator[str]:
+    """A line a device, and the types that there are."""
+    for row in rows:
+        yield f"{row['device']:<24} {row['type'] or '-':<12} {row['calibrations']:>4}"
+    yield f"types: {', '.join(types)}"
+
+
+def device_table(device: Device) -> Iterator[str]:
+    """The history of a device, what is derived from it, and its health."""
     yield f"{'source':<24}{'rest':>8}{'s':>8}  {'bias, deg/s':^36}{'σ, mdps':^20}  history"
-    for line in lines:
+    stored, counting = device.calibrations(), device.history()
+    for line in device.lines():
         if line["event"] == "note":
             yield f"note: {line['text']}"
-        elif line["event"] == "calibration":
+        elif line["event"] != "forget":
             head = f"{line['source'][:23]:<24}{line['rest']:>8}{line['seconds']:8.1f}"
             mean = "".join(f"{m:+12.6f}" for m in line["mean_dps"] or [])
             sigma = "".join(f"{v**0.5 / MDPS:7.2f}" for v in line["variance_dps2"] or [])
-            out = "" if line["hash"] in counting else "  (does not count)"
+            out = "" if stored.get(line["hash"]) in counting else "  (does not count)"
             yield f"{head}{mean}{sigma}  {'/'.join(line['outcome'])}{out}"
-    if model:
-        for name, fit, noise in zip(AXES, model["axes"], model["noise_mdps_rts"], strict=False):
-            figures = ", ".join(f"{key} {value:.3g} ± {sd:.2g}" for key, (value, sd) in fit.items())
-            known = "not known" if noise is None else f"{noise:.3g} mdps·√s"
-            yield f"{name}: noise {known}; {figures} (mdps, √day, °C)"
+    for axis, fit in device.model().items():
+        figures = (f"{k} {v:.3g}" + (f" ± {sd:.2g}" if sd else "") for k, (v, sd) in fit.items())
+        yield f"{axis}: {', '.join(figures)} (mdps, √s, √day, °C)"
+    attempts = [c for c in stored.values() if c.event != SET]
+    dropped = sum(DROPPED in c.outcome for c in attempts)
+    failed = sum(c.rest != STILL for c in attempts)
+    yield f"{len(attempts)} attempts: {failed} not at rest, {dropped} dropped the history"
 
 
 def plot(path: Path, states: Sequence[State], target_mdps: float | None) -> None:
@@ -167,7 +190,8 @@ def _draw(panel: Any, states: Sequence[State], axis: int) -> None:
     panel.fill_between(times, bias - band, bias + band, alpha=0.25, label="95 %")
     panel.plot(times, bias, label="estimate")
     if last.history[axis] != NONE:
-        past, width = last.history_dps[axis] - centre, 1.96 * last.history_sigma_dps[axis]
+        prior = last.stretch.prior
+        past, width = prior.mean[axis] - centre, 1.96 * np.sqrt(prior.narrow[axis])
         low, high = (past - width) / MDPS, (past + width) / MDPS
         panel.axhspan(low, high, color="C1", alpha=0.2, label="history, 95 %")
     for reason in last.reasons:

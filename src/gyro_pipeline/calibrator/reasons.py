@@ -1,5 +1,6 @@
 """What should be known about an answer: codes for programs, sentences for people."""
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, SupportsIndex
@@ -9,7 +10,6 @@ import numpy as np
 from gyro_pipeline.conventions import AXES, MDPS
 
 if TYPE_CHECKING:
-    from gyro_pipeline.calibrator.calibrator import Counts
     from gyro_pipeline.calibrator.stretch import Stretch
 
 UNUSABLE_CODES = {"dead", "unit"}
@@ -27,7 +27,7 @@ _SENTENCES = {  # by code, and what distinguishes several of one code
     "dead": "one value for 2 s: a dead sensor, or steps far above its noise; check the sensor and "
     "its resolution",
     "dead zero": "all samples are zero: a dead sensor; check its wiring",
-    "dead nan": "no sample is a finite number; check the columns (--columns)",
+    "dead not_finite": "no sample is a finite number; check the columns (--columns)",
     "unit": "the noise is {ratio:.3g} times {way} that of {name}: a wrong unit? {unit} differ by "
     "{near:g}; give --units, or another --type",
     "cut": "a motion at {value:.1f} s was cut",
@@ -48,6 +48,7 @@ _SENTENCES = {  # by code, and what distinguishes several of one code
     "temperature missing": "the temperature is missing in {value:.0f} of {limit} blocks",
     "temperature moved": "the temperature moved by {value:.1f} °C; the bias may have moved with it",
     "conflict": "the history is {away:.1f} mdps away (1 in {chance:,.0f}) and was dropped",
+    "attempt": "attempt {value}: those before it were not at rest or did not reach their target",
     "colour": "the colour of the noise is not known, and σ holds for white noise; give --type",
     "floor": "the target is below the floor of {value:.2g} mdps, which no longer average of this "
     "sensor goes below",
@@ -90,69 +91,54 @@ def unit_reason(factor: float, name: str) -> Reason | None:
         return None
     ratio, way = max(factor, 1 / factor), "above" if factor > 1 else "below"
     near = min(_UNITS, key=lambda unit: abs(np.log(ratio / unit)))
-    words: dict[str, Any] = {
-        "ratio": ratio,
-        "way": way,
-        "name": name,
-        "unit": _UNITS[near],
-        "near": near,
-    }
-    return reason("unit", factor, _FAR, **words)
+    words: dict[str, Any] = {"ratio": ratio, "way": way, "name": name, "near": near}
+    return reason("unit", factor, _FAR, unit=_UNITS[near], **words)
 
 
-def reasons_of(counts: "Counts", stretch: "Stretch", target_dps: float | None) -> Iterator[Reason]:
+def reasons_of(
+    counts: Counter[str], ended: dict[str, Reason], stretch: "Stretch", target_dps: float | None
+) -> Iterator[Reason]:
     """All that should be known, the most important first."""
-    yield from _of_data(counts)
-    yield from (reason("cut", start) for start in stretch.motions)
-    yield from counts.ended.values()
-    noise, freedom = stretch.log_noise()
-    if noise is not None and freedom >= _ENOUGH and np.all(stretch.freedom > 0):
-        factors = noise / (np.sqrt(stretch.scale) * stretch.noise.white)  # also too little noise
-        if told := unit_reason(sorted(factors.tolist())[1], stretch.device_type.name):
+    yield from ended.values()
+    for code in ("zero", "not_finite"):
+        if 0 < counts[code] < counts["samples"]:
+            yield reason(code, counts[code], counts["samples"])
+        elif counts[code]:
+            yield reason(f"dead {code}")
+    setup, (noise, freedom) = stretch.setup, stretch.log_noise()
+    if noise is not None and freedom >= _ENOUGH and np.all(setup.known[1] > 0):
+        factors = noise / (np.sqrt(setup.known[0]) * setup.noise.white)  # also too little noise
+        if told := unit_reason(sorted(factors.tolist())[1], setup.device_type.type):
             yield told
     if np.isfinite(stretch.prior.narrow).any():
         yield from stretch.prior.reasons
-    yield from stretch.current.conflicts
+    yield from stretch.notes
+    if setup.now.attempt > 1:
+        yield reason("attempt", setup.now.attempt)
     yield from _of_noise(stretch, target_dps)
-    yield from _of_samples(counts)
+    if counts["gaps"]:
+        yield reason("gap", counts["gap_ms"] / 1e3, places=counts["gaps"])
+    if counts["jumps"]:
+        yield reason("clock", counts["jumps"])
     yield from _of_temperature(stretch)
     yield from _of_rotation(stretch)
 
 
-def _of_data(counts: "Counts") -> Iterator[Reason]:
-    for axis in np.flatnonzero(counts.dead):
-        yield reason("dead", axis=axis)
-    if counts.samples and counts.zero == counts.samples:
-        yield reason("dead zero")
-    elif counts.samples and counts.not_finite == counts.samples:
-        yield reason("dead nan")
-
-
 def _of_noise(stretch: "Stretch", target_dps: float | None) -> Iterator[Reason]:
-    if not stretch.device_type.noise_freedom:
+    setup, floor = stretch.setup, stretch.floor_dps / MDPS
+    if not setup.device_type.noise_freedom:
         yield reason("colour")
-    floor = stretch.floor_dps / MDPS
     if target_dps is not None:
         for axis in np.flatnonzero(stretch.floor_dps > target_dps):
             yield reason("floor", float(floor[axis]), target_dps / MDPS, axis)
-    if stretch.noise.warm_up is not None and stretch.blocks:
-        left, sigma = stretch.current.filter.warm_up()
+    if setup.noise.warm_up is not None and stretch.blocks:
+        left, sigma = stretch.filter.warm_up()
         for axis in np.flatnonzero(np.abs(left) > np.maximum(2 * sigma, MDPS)):
             yield reason("warm_up", float(left[axis] / MDPS), axis=axis)
 
 
-def _of_samples(counts: "Counts") -> Iterator[Reason]:
-    for code, number in (("not_finite", counts.not_finite), ("zero", counts.zero)):
-        if 0 < number < counts.samples:
-            yield reason(code, number, counts.samples)
-    if counts.gaps:
-        yield reason("gap", counts.gap_s, places=counts.gaps)
-    if counts.jumps:
-        yield reason("clock", counts.jumps)
-
-
 def _of_temperature(stretch: "Stretch") -> Iterator[Reason]:
-    measured = stretch.current.temperature
+    measured = stretch.temperature
     if 0 < measured.blocks < stretch.blocks:
         yield reason("temperature missing", stretch.blocks - measured.blocks, stretch.blocks)
     moved = measured.most - measured.least

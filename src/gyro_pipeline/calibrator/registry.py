@@ -16,6 +16,7 @@ import shutil
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +24,15 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from gyro_pipeline.calibrator.calibrator import Calibrator
-from gyro_pipeline.calibrator.history import DAY_S, Calibration
-from gyro_pipeline.calibrator.state import STILL, State
-from gyro_pipeline.conventions import MDPS, InputError
+from gyro_pipeline.calibrator.device_types import validated
+from gyro_pipeline.calibrator.history import STILL, Calibration
+from gyro_pipeline.conventions import AXES, MDPS, InputError
 
 VARIABLE = "GYRO_CALIBRATE_REGISTRY"
 """The environment variable that names the folder."""
+
+SET = "set"
+"""In place of a hash, what was set by hand."""
 
 _NAME = re.compile(r"[\w][\w.-]{0,63}")
 _LOCK_S = 10.0
@@ -95,25 +99,33 @@ class Device:
         parsed = map(_parsed, _read(self.lines_path).split(b"\n"))
         return [line for line in parsed if line is not None]
 
-    def calibrations(self) -> dict[str, Line]:
-        """The calibrations that count, by hash: at rest, and not withdrawn since."""
-        return {key: line for key, line in self._kept().items() if line["rest"] == STILL}
-
-    def _kept(self) -> dict[str, Line]:
-        """All that were not withdrawn since, attempts as well."""
-        kept: dict[str, Line] = {}
-        for line in self.lines():
-            if line["event"] == "calibration":
-                kept.setdefault(line["hash"], line)
+    def calibrations(self) -> dict[str, Calibration]:
+        """All that were not withdrawn since, by hash, attempts as well."""
+        kept: dict[str, Calibration] = {}
+        for number, line in enumerate(self.lines(), 1):
+            if line["event"] in ("calibration", SET):
+                calibration = validated(Calibration, line, f"{self.lines_path}: line {number}")
+                if calibration.event == SET:
+                    kept.pop(SET, None)
+                kept.setdefault(calibration.hash, calibration)
             elif line["event"] == "forget":
                 kept.pop(line["of"], None)
         return kept
 
     def history(self, without: str | None = None) -> list[Calibration]:
-        """The evidence of the calibrations that count, but for that of one hash."""
-        return [_evidence(line) for key, line in self.calibrations().items() if key != without]
+        """The calibrations that count, but for that of one hash; or what was set by hand alone."""
+        kept = self.calibrations()
+        if SET in kept:
+            return [kept[SET]]
+        return [c for key, c in kept.items() if c.rest == STILL and c.mean_dps and key != without]
 
-    def append(self, line: Mapping[str, Any]) -> bool:
+    def attempt(self, without: str | None = None) -> int:
+        """Number of the next attempt: one more than those that just did not do."""
+        past = [c for key, c in self.calibrations().items() if key not in (SET, without)]
+        numbers = [n for n, c in enumerate(reversed(past)) if c.reached]
+        return 1 + (numbers[0] if numbers else len(past))
+
+    def append(self, line: Mapping[str, Any] | Calibration) -> bool:
         """Write a line, synced; not if there is a calibration of the same hash.
 
         Returns:
@@ -122,22 +134,28 @@ class Device:
         Raises:
             RegistryError: The disk is full, or the folder cannot be written.
         """
-        data = json.dumps({"schema": 1, **line}, allow_nan=False).encode() + b"\n"
+        line = asdict(line) if isinstance(line, Calibration) else {"schema": 1, **line}
+        data = json.dumps(line, allow_nan=False).encode() + b"\n"
         with self._locked():
-            if line["event"] == "calibration" and line["hash"] in self._kept():
+            if line["event"] == "calibration" and line["hash"] in self.calibrations():
                 return False
             _append(self.lines_path, data)
         return True
 
     def write_model(self, calibrator: Calibrator) -> None:
         """Replace ``model.json``, for people and other programs, by what is known now."""
-        noise = np.sqrt(calibrator.scale) * calibrator.device_type.noise.white / MDPS
-        known = zip(noise.tolist(), calibrator.freedom > 0, strict=True)
-        axes = [
-            {key: [value / MDPS, sigma / MDPS] for key, (value, sigma) in axis.items()}
-            for axis in calibrator.best.prior.fitted
-        ]
-        model = {"axes": axes, "noise_mdps_rts": [n if is_known else None for n, is_known in known]}
+        setup, prior = calibrator.setup, calibrator.best.prior
+        (scale, freedom), kind = setup.known, setup.device_type
+        noise = np.sqrt(scale) * setup.noise.white / MDPS
+        model: dict[str, dict[str, Any]] = {}
+        for axis, name in enumerate(AXES):
+            fitted = prior.fitted[axis] if prior.fitted else {}
+            model[name] = {key: [v / MDPS, sigma / MDPS] for key, (v, sigma) in fitted.items()}
+            if freedom[axis] > 0:
+                sigma = noise[axis] / np.sqrt(2 * freedom[axis])
+                model[name]["noise"] = [float(noise[axis]), float(sigma)]
+            for key in ("flicker_mdps", "random_walk_mdps_per_rts"):  # the type's, not fitted
+                model[name][key.partition("_mdps")[0]] = [float(kind.dps(key)[axis] / MDPS), None]
         temporary = self.model_path.with_suffix(".new")
         with self._locked():
             temporary.write_text(json.dumps(model, indent=1) + "\n", "utf-8")
@@ -218,45 +236,3 @@ def _parsed(line: bytes) -> Line | None:
     except ValueError:
         return None
     return content if isinstance(content, dict) and "event" in content else None
-
-
-def _evidence(line: Line) -> Calibration:
-    """What a stored line says."""
-    temperature, up, noise = line["temperature_c"], line["gravity"], line["noise_mdps_rts"]
-    return Calibration(
-        mean=np.array(line["mean_dps"]),
-        variance=np.array(line["variance_dps2"]),
-        day=None if line["time"] is None else line["time"] / DAY_S,
-        temperature_c=None if temperature is None else temperature[0],
-        up=None if up is None else np.array(up),
-        outcome=tuple(line["outcome"]),
-        noise=None if noise is None else np.array(noise) * MDPS,
-        freedom=line["noise_freedom"],
-    )
-
-
-def line_of(calibrator: Calibrator, state: State, source: Mapping[str, Any]) -> Line:
-    """The line of a calibration, or of an attempt.
-
-    Args:
-        calibrator: After its last sample.
-        state: Its answer.
-        source: ``hash``, ``time`` (POSIX), ``source`` and what else is to be kept of it.
-    """
-    evidence, seen = calibrator.evidence(), calibrator.best.current.temperature
-    usable = state.rest == STILL and bool(np.isfinite(evidence.variance).all())
-    noise = None if evidence.noise is None else (evidence.noise / MDPS).tolist()
-    return {
-        "event": "calibration",
-        **source,
-        "seconds": state.seconds_at_rest,
-        "mean_dps": evidence.mean.tolist() if usable else None,
-        "variance_dps2": evidence.variance.tolist() if usable else None,
-        "temperature_c": [seen.mean, seen.least, seen.most] if seen.blocks else None,
-        "gravity": None if evidence.up is None else evidence.up.tolist(),
-        "rest": state.rest,
-        "outcome": list(evidence.outcome),
-        "noise_mdps_rts": noise,
-        "noise_freedom": evidence.freedom,
-        "reasons": [reason.sentence for reason in state.reasons],
-    }

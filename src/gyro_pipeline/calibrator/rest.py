@@ -7,11 +7,13 @@ before. The slope of the direction of gravity bounds a rotation about horizontal
 threshold on the gyroscope can see.
 """
 
-from typing import NamedTuple
+from copy import copy
+from typing import NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gyro_pipeline.calibrator.state import Array
+from gyro_pipeline.calibrator.filter import Array
 from gyro_pipeline.conventions import MDPS
 from gyro_pipeline.quality.rest import RestDetector, spent_limits
 
@@ -25,14 +27,18 @@ _LEAST_ROTATION = 0.5 * MDPS  # an accelerometer that warms up seems to turn by 
 _FEWEST = 4  # blocks that a slope is told from
 
 
-class Block(NamedTuple):
-    """Means and variances of the samples of a block, in deg/s, g and degrees Celsius."""
+class Blocks(NamedTuple):
+    """Means and variances of the samples of n blocks, in deg/s, g and degrees Celsius."""
 
-    mean: Array  # (3,)
-    variance: Array  # (3,)
-    gravity: Array  # (3,), NaN where it is not measured
-    gravity_variance: float  # the mean over axes
-    temperature: float  # NaN where it is not measured
+    mean: Array  # (n, 3)
+    variance: Array  # (n, 3)
+    gravity: Array  # (n, 3), NaN where it is not measured
+    gravity_variance: Array  # (n,), the mean over axes
+    temperature: Array  # (n,), NaN where it is not measured
+
+    def part(self, first: int, last: int | None = None) -> Self:
+        """Some of them."""
+        return self.__class__(*(values[first:last] for values in self))
 
 
 class Alarm(NamedTuple):
@@ -44,89 +50,105 @@ class Alarm(NamedTuple):
 
 
 class RestMonitor:
-    """The three tests over one stretch.
+    """The three tests over one stretch; :meth:`update` returns a new one.
 
-    Args:
-        size: Samples in a block.
-        block_s: Its length, seconds.
-        least_dps: Smaller changes of the rate are the bias's own.
-        freedom: (3,), degrees of freedom of the noise known beforehand; 0: unknown.
-        noise_dps: (3,), standard deviation of a sample at rest, if it was just seen.
+    A block has ``size`` samples, changes of the rate below ``least_dps`` are the bias's own, and
+    ``freedom`` (3,) is that of the noise known beforehand, 0 where it is not known.
     """
 
-    def __init__(
-        self, size: int, block_s: float, least_dps: float, freedom: Array,
-        noise_dps: Array | None = None,
-    ) -> None:  # fmt: skip
-        self.size, self.block_s, self.freedom = size, block_s, freedom
-        self.detector = RestDetector(
-            size, _FALSE_ALARM, least_dps, least_rise=_LEAST_RISE, noise_dps=noise_dps
-        )
-        self.blocks = 0
-        self._squares = np.zeros(3)
-        self._sums = np.zeros(10)  # that the slope of gravity is told from
-        self._gravity: Array | None = None  # of the last block
+    def __init__(self, size: int, block_s: float, least_dps: float, freedom: Array) -> None:
+        self.block_s, self.blocks, self._squares = block_s, 0, np.zeros(3)
+        self.freedom = freedom if np.any(freedom > 2) else None  # noqa: PLR2004 - of the limit
+        self.detector = RestDetector(size, _FALSE_ALARM, least_dps, least_rise=_LEAST_RISE)
+        self._count, self._sums, self._gravity = 0, np.zeros(10), np.full(3, np.nan)
 
-    def update(self, innovation: Array, white_dps: Array, block: Block) -> Alarm | None:
-        """Take a block.
+    def level_anew(self) -> Self:
+        """With a slope of gravity that begins with the next block."""
+        after = copy(self)
+        after._count, after._sums, after._gravity = 0, np.zeros(10), np.full(3, np.nan)
+        return after
 
-        Args:
-            innovation: (3,), in units of the standard deviation known beforehand.
-            white_dps: (3,), deg/s, standard deviation of the white noise of a block's mean.
-            block: The block itself.
+    def update(
+        self, innovations: Array, white: Array, blocks: Blocks
+    ) -> tuple[Self, int, Alarm | None]:
+        """The monitor after n blocks, and the first alarm with the number of its block, or n.
+
+        ``innovations`` (n, 3) are in units of the standard deviation known beforehand, ``white``
+        (3,) is that of the white noise of a block's mean, deg/s.
         """
-        self.blocks += 1
-        changes = self.detector.update((innovation * white_dps)[None], block.variance[None])
-        if np.any(changes):
-            return Alarm(MOTION)
-        return self._noise(innovation) or self._rotation(block)
+        after, n = copy(self), len(innovations)
+        after.detector = copy(self.detector)
+        moved, noisier = after.detector.update(innovations * white, blocks.variance)
+        noise, (rate, sigma, turns) = after._noise(innovations), after._rotation(blocks)
+        scattered = np.any(np.isfinite(noise), axis=1)
+        alarms = (moved | noisier).any(axis=1) | scattered | turns
+        if not alarms.any():
+            return after, n, None
+        k = int(alarms.argmax())
+        if moved[k].any() or noisier[k].any():
+            return after, k, Alarm(MOTION)
+        if scattered[k]:
+            return after, k, Alarm(NOISE, float(np.nanmax(noise[k])))
+        return after, k, Alarm(ROTATION, float(rate[k]), float(sigma[k]))
 
-    def _noise(self, innovation: Array) -> Alarm | None:
-        """The mean square of the innovations over 1, by its cube root (Wilson and Hilferty)."""
-        self._squares = self._squares + innovation**2
-        known, ratio = self.freedom > 2, self._squares / self.blocks  # noqa: PLR2004 - of the limit
-        if self.blocks < _FEWEST or not known.any():
-            return None
-        limit = spent_limits(_FALSE_ALARM / 6)[self.blocks.bit_length() - 1]
-        spread = np.sqrt(2 / 9 * (1 / self.blocks + 1 / np.maximum(self.freedom, 1)))
-        high = np.cbrt(ratio) > np.cbrt(_LEAST_RISE**2) + limit * spread
-        return Alarm(NOISE, float(np.sqrt(ratio[known].max()))) if (high & known).any() else None
+    def _noise(self, innovations: Array) -> Array:
+        """The noise over the known one where it is too high, else NaN, (n, 3).
 
-    def _rotation(self, block: Block) -> Alarm | None:
-        """A rate by the slope of gravity that noise does not make; until gravity is missing.
+        The cube root of the mean square of innovations is nearly normal (Wilson and Hilferty).
+        """
+        self._squares = _summed(self._squares, innovations**2)
+        count = self.blocks + 1 + np.arange(len(innovations))
+        self.blocks, squares, self._squares = int(count[-1]), self._squares, self._squares[-1]
+        if self.freedom is None:
+            return np.full(squares.shape, np.nan)
+        ratio, limits = squares / count[:, None], spent_limits(_FALSE_ALARM / 6)
+        spread = np.sqrt(2 / 9 * (1 / count[:, None] + 1 / self.freedom))
+        limit = limits[np.frexp(count)[1] - 1][:, None] * spread
+        high = (np.cbrt(ratio) > np.cbrt(_LEAST_RISE**2) + limit) & (count >= _FEWEST)[:, None]
+        return np.where(high, np.sqrt(ratio), np.nan)
+
+    def _rotation(self, blocks: Blocks) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Rates by the slope of gravity, their sigma, and which noise does not make, (n,) each.
 
         Two normal components exceed z sigma with probability exp(-z^2 / 2), of which a share of
-        1 / (k (k + 1)) is spent on block k.
+        1 / (k (k + 1)) is spent on block k. Where gravity is missing, the test ends.
         """
-        g, n = block.gravity, self.blocks
-        if not np.isfinite(g).all() or (self._gravity is None and n > 1):
-            self._gravity = None
-            return None
-        t, change = (n - 0.5) * self.block_s, 0.0 if self._gravity is None else g - self._gravity
-        noise = block.gravity_variance / self.size
-        self._sums = self._sums + np.hstack([t, t * t, g, g * t, noise, np.sum(np.square(change))])
-        self._gravity = g
-        rate, sigma = _rotation(self._sums, n)
-        limit = np.sqrt(-2 * np.log(_FALSE_ROTATION / (n * (n + 1))))
-        seen = n >= _FEWEST and rate > max(limit * sigma, _LEAST_ROTATION)
-        return Alarm(ROTATION, rate, sigma) if seen else None
+        g, none = blocks.gravity, np.full(len(blocks.gravity), np.nan)
+        if self._count < 0 or np.isnan(g[0, 0]):
+            self._count = -1
+            return none, none, np.zeros(len(g), bool)
+        count = self._count + 1 + np.arange(len(g))
+        t = ((count - 0.5) * self.block_s)[:, None]
+        change = np.sum(np.diff(g, axis=0, prepend=self._gravity[None]) ** 2, axis=1)
+        change = np.where(count == 1, 0, change)
+        noise = blocks.gravity_variance / self.detector.size
+        sums = _summed(self._sums, np.hstack([t, t * t, g, g * t, np.c_[noise, change]]))
+        measured = np.isfinite(sums).all(axis=1)
+        self._count = int(count[-1]) if measured.all() else -1
+        self._sums, self._gravity = sums[-1], g[-1]
+        rate, sigma = _rotation(sums, count[:, None])
+        limit = np.sqrt(-2 * np.log(_FALSE_ROTATION / (count * (count + 1))))
+        above = rate > np.maximum(limit * sigma, _LEAST_ROTATION)
+        return rate, sigma, above & measured & (count >= _FEWEST)
 
 
-def _rotation(sums: Array, n: int) -> tuple[float, float]:
-    """Rate about horizontal axes and its standard deviation, deg/s, by least squares.
+def _summed(before: Array, values: Array) -> Array:
+    """Sums up to each row."""
+    return np.add.accumulate(np.vstack([before, values]))[1:]
+
+
+def _rotation(sums: Array, n: NDArray[np.integer]) -> tuple[Array, Array]:
+    """Rates about horizontal axes and their standard deviations, deg/s, by least squares.
 
     Gravity turns in the axes of the device by -w x g, so w = g x slope / g^2 but for its part along
     g. The noise of a block is that of its samples, or more where neighbours differ by more.
-
-    Args:
-        sums: (10,), over n blocks, of t, t^2, g, g t, the variance of a block's mean and the
-            squared difference from the block before.
-        n: Blocks so far.
+    ``sums`` (m, 10) are over n (m, 1) blocks, of t, t^2, g, g t, the variance of a block's mean and
+    the squared difference from the block before.
     """
-    of_time = max(sums[1] - sums[0] ** 2 / n, 1e-12)
-    mean, slope = sums[2:5] / n, (sums[5:8] - sums[0] * sums[2:5] / n) / of_time
-    size = np.linalg.norm(mean)
-    rate = np.linalg.norm(np.cross(mean, slope)) / size**2
-    shown = sums[9] / 6 / max(n - 1, 1) / (1 + 2 * np.sqrt(3 / n))
-    variance = max(sums[8] / n, shown) / of_time
-    return float(np.degrees(rate)), float(np.degrees(np.sqrt(variance) / size))
+    of_time = np.maximum(sums[:, 1:2] - sums[:, :1] ** 2 / n, 1e-12)
+    mean, slope = sums[:, 2:5] / n, (sums[:, 5:8] - sums[:, :1] * sums[:, 2:5] / n) / of_time
+    size = np.linalg.norm(mean, axis=1)
+    rate = np.linalg.norm(np.cross(mean, slope), axis=1) / size**2
+    shown = sums[:, 9:] / 6 / np.maximum(n - 1, 1) / (1 + 2 * np.sqrt(3 / n))
+    variance = (np.maximum(sums[:, 8:9] / n, shown) / of_time)[:, 0]
+    return np.degrees(rate), np.degrees(np.sqrt(variance) / size)

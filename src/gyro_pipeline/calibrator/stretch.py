@@ -1,35 +1,76 @@
 """A stretch in one attitude: the filter, the test of rest, and the history with its conflict."""
 
-from collections.abc import Callable
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from statistics import NormalDist
-from typing import Any, NamedTuple, SupportsIndex
+from typing import NamedTuple, SupportsIndex
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from gyro_pipeline.calibrator.device_types import DeviceType
-from gyro_pipeline.calibrator.filter import Estimate, Filter, estimates
-from gyro_pipeline.calibrator.history import Prior, angle_deg
+from gyro_pipeline.calibrator.filter import Array, Estimate, Filter
+from gyro_pipeline.calibrator.history import (
+    DROPPED,
+    NONE,
+    USED,
+    Calibration,
+    Circumstances,
+    Prior,
+    angle_deg,
+    noise_of,
+    prior_of,
+    unit,
+)  # fmt: skip
 from gyro_pipeline.calibrator.reasons import VERTICAL, Reason, reason
-from gyro_pipeline.calibrator.rest import ATTITUDE, MOTION, Alarm, Block, RestMonitor
-from gyro_pipeline.calibrator.state import DROPPED, NONE, USED, Array, Mask
+from gyro_pipeline.calibrator.rest import Alarm, Blocks, RestMonitor
 from gyro_pipeline.conventions import MDPS
-from gyro_pipeline.physics.mixture import Posterior, mixture_posterior
+from gyro_pipeline.physics.mixture import log_e, log_ratios, mixture_posterior
 from gyro_pipeline.quality.rest import student_limits
+
+Mask = NDArray[np.bool_]
 
 CONFLICT = 120.0
 """The e-value at which the history is dropped. Where it holds, that happens in at most one of as
 many calibrations (Ville), and in half of that as measured."""
 
-PriorOf = Callable[[Array | None, float | None, bool], Prior]
-"""The prior by the up direction and the temperature, None where they are not measured, and by
-whether a declared heading is believed."""
+BLOCK_S = 0.5
 
-_TURN_DEG = 1.0  # the attitude is the same after a motion that turned the device by less
+_LEAST_SAMPLES = 5  # in a block: fewer do not tell the noise
 _WARMER_C = 0.5  # by which the temperature moves until the prior is looked up again
-_REFERENCE = 6  # blocks at rest that say what rest is like after a motion
-_PATIENCE = 20  # blocks of motion after which rest is looked for anew
 _AHEAD = 64  # blocks that are looked ahead at a time
 _TWO_SIDED = 1.959964
+
+
+@dataclass
+class Setup:
+    """What is known before the first sample."""
+
+    device_type: DeviceType
+    rate_hz: float
+    history: Sequence[Calibration]  # the oldest first
+    now: Circumstances
+
+    def __post_init__(self) -> None:
+        size = max(round(BLOCK_S * self.rate_hz), _LEAST_SAMPLES)  # samples in a block
+        self.size, self.block_s, self.noise = size, size / self.rate_hz, self.device_type.noise
+        # N^2 over that of the type, (3,), and its degrees of freedom: infinite where it is known,
+        # 0 where it is not.
+        self.known = noise_of(self.history, self.device_type)
+        self.factor = np.sqrt(self.known[0])
+        self.white = self.factor * self.noise.white / np.sqrt(self.block_s)  # of a block's mean
+        # Where neither attitude nor temperature is known.
+        self.unseen_prior = prior_of(self.history, self.device_type, self.now)
+
+    def prior(self, up: Array | None, celsius: float, believed: bool) -> Prior:
+        """What the history says; ``believed``: that a declared heading repeats."""
+        if up is None and np.isnan(celsius) and believed:
+            return self.unseen_prior
+        known = celsius if np.isfinite(celsius) else None
+        same = self.now.same_heading and believed
+        now = replace(self.now, up=up, temperature_c=known, same_heading=same)
+        return prior_of(self.history, self.device_type, now)
 
 
 class Temperature(NamedTuple):
@@ -50,220 +91,219 @@ class Temperature(NamedTuple):
         return Temperature(self.blocks + 1, mean, least, most, value)
 
 
-class Snapshot(NamedTuple):
-    """What the blocks so far come to; a motion goes back to the snapshot before the last block."""
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """What is known from blocks at rest in one attitude; a block makes a new one."""
 
+    setup: Setup
+    start_s: float  # seconds since the first sample
     filter: Filter
+    monitor: RestMonitor
     prior: Prior
     prior_c: float = np.nan  # temperature that the prior is of
     believed: bool = True  # that a declared heading repeats
-    dropped: Mask = np.zeros(3, bool)  # axes whose history was dropped
-    conflicts: tuple[Reason, ...] = ()
-    variances: Array = np.zeros(3)  # summed over blocks, within them
-    gravity: Array = np.zeros(3)  # summed over blocks
+    dropped: Mask = field(default_factory=lambda: np.zeros(3, bool))
+    notes: tuple[Reason, ...] = ()  # motions that were cut, conflicts
+    gravity: Array = field(default_factory=lambda: np.zeros(3))  # summed over blocks
     temperature: Temperature = Temperature()
+    last_mean: Array = field(default_factory=lambda: np.zeros(3))  # of the last block
 
-
-class Stretch:
-    """What is known from blocks at rest in one attitude.
-
-    Args:
-        device_type, known_still: Those of the calibrator.
-        prior_of: What the history says.
-        scale, freedom: (3,), N^2 over that of the type as known beforehand, and its degrees of
-            freedom: infinite where N is known, 0 where it is not.
-        size, block_s: Samples in a block, and its length in seconds.
-        start_s: When it starts, seconds since the first sample.
-        age_s: Seconds from power-on to the start; None where that is unknown.
-    """
-
-    def __init__(  # noqa: PLR0913, PLR0917 - what stretches share, and two that differ
-        self, device_type: DeviceType, prior_of: PriorOf, scale: Array, freedom: Array, size: int,
-        block_s: float, known_still: bool, start_s: float, age_s: float | None,
-    ) -> None:  # fmt: skip
-        self.device_type, self.noise, self.prior_of = device_type, device_type.noise, prior_of
-        self.scale, self.freedom, self.size, self.block_s = scale, freedom, size, block_s
-        self.known_still, self.start_s = known_still, start_s
-        start = Filter.start(self.noise, block_s, age_s)
-        self.current = Snapshot(start, prior_of(None, None, True))
-        self.previous: tuple[Snapshot, Array] | None = None  # before the last block, and its mean
-        self.moving = 0  # blocks of motion that just came
-        self._turned = np.zeros(3)  # degrees, over them
-        self.motions: tuple[float, ...] = ()  # when each started, seconds since the first sample
-        self._renew_monitor()
-        self._conclude()
+    @classmethod
+    def start(cls, setup: Setup, start_s: float) -> "Stretch":
+        """Before the first block; its history is as if attitude and temperature were not known."""
+        power_on_s = setup.now.since_power_on_s
+        age_s = None if power_on_s is None else power_on_s + start_s
+        least = setup.device_type.least_change_mdps * MDPS
+        monitor = RestMonitor(setup.size, setup.block_s, least, setup.known[1])
+        start = Filter.start(setup.noise, setup.block_s, age_s)
+        return cls(setup, start_s, start, monitor, setup.unseen_prior)
 
     @property
     def blocks(self) -> int:
         """Blocks at rest that the estimate is from."""
-        return self.current.filter.blocks
+        return int(self.filter.blocks)
 
     @property
     def seconds(self) -> float:
         """Their length."""
-        return self.blocks * self.block_s
+        return self.blocks * self.setup.block_s
 
-    @property
-    def prior(self) -> Prior:
-        """What the history says at the attitude and temperature of the stretch."""
-        return self.current.prior
-
-    @property
+    @cached_property
     def up(self) -> Array | None:
         """(3,), direction of the mean acceleration; None where it is not measured."""
-        length = np.linalg.norm(self.current.gravity)
-        return np.asarray(self.current.gravity / length) if length > 0 else None
+        return unit(self.gravity) if self.gravity.any() else None
 
-    @property
+    @cached_property
     def usable(self) -> Mask:
         """(3,), axes with a history that was not dropped."""
-        return np.isfinite(self.prior.narrow) & ~self.current.dropped
+        return np.isfinite(self.prior.narrow) & ~self.dropped
 
     @property
-    def outcome(self) -> tuple[str, ...]:
+    def outcome(self) -> tuple[str, str, str]:
         """What became of the history on each axis."""
-        known, dropped = np.isfinite(self.prior.narrow), self.current.dropped
-        return tuple(np.where(known, np.where(dropped, DROPPED, USED), NONE).tolist())
+        kept = np.where(self.dropped, DROPPED, USED)
+        x, y, z = np.where(np.isfinite(self.prior.narrow), kept, NONE).tolist()
+        return x, y, z
+
+    def take(self, blocks: Blocks) -> tuple["Stretch", int, Alarm | None]:
+        """The stretch after some of the blocks; how many; and if that is none, the alarm.
+
+        How they are dealt to calls changes no bit.
+        """
+        before, blocks = self._prepared(blocks)
+        filters, innovations, temperatures = [before.filter], [], [before.temperature]
+        for mean, celsius in zip(blocks.mean, blocks.temperature.tolist(), strict=True):
+            following, innovation = filters[-1].update(mean)
+            filters.append(following)
+            innovations.append(innovation)
+            temperatures.append(temperatures[-1].add(celsius))
+        monitor, count, alarm = before.monitor, len(innovations), None
+        if not self.setup.now.known_still:
+            units = np.array(innovations) / self.setup.factor
+            monitor, count, alarm = monitor.update(units, self.setup.white, blocks)
+        if count == 0:
+            return self, 0, alarm
+        conflict = before._conflicts(filters[1 : count + 1], temperatures[1:])
+        if conflict is None and alarm is None or conflict == len(innovations) - 1:
+            after = before._with(blocks, filters[-1], monitor, temperatures[-1])
+            return (after if conflict is None else after._dropped()), len(innovations), None
+        return self.take(blocks.part(0, count if conflict is None else conflict + 1))
+
+    def _prepared(self, blocks: Blocks) -> tuple["Stretch", Blocks]:
+        """With the prior at the attitude and temperature of the first block; the blocks it is of.
+
+        It is looked up at the first block of all, and where the temperature has moved since.
+        """
+        before, celsius = self, blocks.temperature
+        if not self.blocks or _far(celsius[0], self.prior_c):
+            up = self.up
+            if up is None and np.isfinite(blocks.gravity[0]).all():
+                up = unit(blocks.gravity[0])
+            before = self._with_prior(up, float(celsius[0]), self.believed)
+        far = _far(celsius, before.prior_c)
+        return before, blocks.part(0, int(far.argmax()) if far.any() else None)
+
+    def _with(
+        self, blocks: Blocks, after: Filter, monitor: RestMonitor, temperature: Temperature
+    ) -> "Stretch":
+        measured = np.isfinite(blocks.gravity).all(axis=1)
+        return replace(
+            self,
+            filter=after,
+            monitor=monitor,
+            gravity=np.add.accumulate(np.vstack([self.gravity, blocks.gravity[measured]]))[-1],
+            temperature=temperature,
+            last_mean=blocks.mean[-1],
+        )
+
+    def cut(self, seconds: float, motion: Reason | None) -> "Stretch":
+        """Move on over seconds without data, or over a motion."""
+        if not self.blocks:
+            return self
+        moved = replace(self, filter=self.filter.skip(seconds))
+        if motion is None:
+            return moved
+        return replace(moved, notes=(*self.notes, motion), monitor=self.monitor.level_anew())
+
+    def turned_deg(self, turned: Array, gravity: Array) -> float:
+        """By how much the device was turned over a motion: by its rates, or by gravity."""
+        known = self.up is not None and np.isfinite(gravity).all()
+        tilt = angle_deg(gravity, self.up) if known and self.up is not None else 0.0
+        return max(float(np.linalg.norm(turned)), tilt)
+
+    def _with_prior(self, up: Array | None, celsius: float, believed: bool) -> "Stretch":
+        prior = self.setup.prior(up, celsius, believed)
+        return replace(self, prior=prior, prior_c=celsius, believed=believed)
+
+    def _conflicts(self, filters: Sequence[Filter], temperatures: list[Temperature]) -> int | None:
+        """Number of the first filter at which the e-value says that the history is wrong."""
+        if not self.usable.any():
+            return None
+        own = self.filter.stack(filters).estimate()
+        own = self._scaled(own, *self._noise_with(own))
+        warmer = [_degrees(self.prior_c, t.mean) for t in temperatures[: len(filters)]]
+        off = own.start - self.prior.mean - self.prior.slope * np.array(warmer)[:, None]
+        high = log_e(self._ratios(off, own.start_variance)) > np.log(CONFLICT)
+        return int(high.argmax()) if high.any() else None
+
+    def _ratios(self, off: Array, variance: Array) -> Array:
+        ratios = log_ratios(off, variance, self.prior.narrow, self.prior.wide)
+        return np.where(self.usable, ratios, 0.0)
+
+    def _dropped(self) -> "Stretch":
+        """Without the history on the axes that speak against it, for the rest of the stretch.
+
+        A heading that one of them contradicts is no longer believed.
+        """
+        own = self.estimate
+        off = own.start - self._prior_mean
+        axes = self.usable & (self._ratios(off, own.start_variance) > 0)
+        sigma = np.sqrt(self.prior.narrow + own.start_variance)
+        notes = [_conflict(axis, off[axis], sigma[axis]) for axis in np.flatnonzero(axes)]
+        after = replace(self, dropped=self.dropped | axes, notes=(*self.notes, *notes))
+        horizontal = axes if self.up is None else axes & (np.abs(self.up) < VERTICAL)
+        return after._with_prior(self.up, self.prior_c, False) if horizontal.any() else after
+
+    @cached_property
+    def unscaled(self) -> Estimate:
+        """By the data alone, with the noise of the type."""
+        return self.filter.estimate()
+
+    @cached_property
+    def noise_scale(self) -> tuple[Array, Array]:
+        """N^2 over that of the type, and its degrees of freedom, this log's blocks included."""
+        return self._noise_with(self.unscaled)
+
+    def _noise_with(self, own: Estimate) -> tuple[Array, Array]:
+        scale, freedom = self.setup.known
+        if np.isinf(freedom).all():
+            return scale, freedom
+        total = freedom + own.freedom
+        return (freedom * scale + own.squares) / np.maximum(total, 1e-9), total
+
+    @cached_property
+    def estimate(self) -> Estimate:
+        """By the data alone, with the noise as known; the variances make limits of 1.96 sigma."""
+        return self._scaled(self.unscaled, *self.noise_scale)
+
+    def _scaled(self, estimate: Estimate, factor: Array, freedom: Array) -> Estimate:
+        """With Student's limits; over all attempts, where only this log tells the noise."""
+        if not np.isinf(freedom).all():
+            attempts = self.setup.now.attempt if not self.setup.known[1].any() else 1
+            z = -NormalDist().inv_cdf(0.025 / attempts)
+            student = student_limits(z, np.clip(freedom, 1e-3, 1e9))
+            factor = np.where(freedom > 0, factor * (student / _TWO_SIDED) ** 2, np.inf)
+        own, start = estimate.variance * factor, estimate.start_variance * factor
+        return estimate._replace(variance=own, start_variance=start)
+
+    @cached_property
+    def bias(self) -> Array:
+        """(3,), deg/s, as in the last block; what it settles to, where the device warms up."""
+        return self._posterior(self.estimate)[0] + self.prior.slope * self._warmer
+
+    @cached_property
+    def variance(self) -> Array:
+        """(3,), of the bias."""
+        return self._posterior(self.estimate)[1] + (self.prior.slope_sigma * self._warmer) ** 2
 
     @property
-    def floor_dps(self) -> Array:
-        """(3,), below which no average of the sensor comes."""
-        return np.asarray(self.noise.floor_dps * np.sqrt(self.noise_scale))
+    def _warmer(self) -> float:
+        """By how much the last block is warmer than the mean, where both are known."""
+        return _degrees(self.temperature.mean, self.temperature.last)
 
-    def take(self, block: Block) -> Alarm | None:
-        """Take a block; an alarm that is returned ends the stretch.
-
-        After ATTITUDE the block is the first one of the next stretch, else it is left out.
-        """
-        following, innovation = self.current.filter.update(block.mean)
-        alarm = None if self.known_still else self._alarm(block, innovation)
-        if alarm is None and self.moving and self._attitude_changed(block):
-            return Alarm(ATTITUDE)
-        if alarm is None:
-            self._accept(block, following)
-        elif alarm.code == MOTION:
-            self._leave_out(block)
-            return alarm if self.moving >= _PATIENCE else None
-        return alarm
-
-    def skip(self, seconds: float) -> None:
-        """Move on over a gap in the data."""
-        if self.blocks:
-            self.current = self.current._replace(filter=self.current.filter.skip(seconds))
-            self.previous = None
-            self._conclude()
-
-    def _renew_monitor(self) -> None:
-        enough, sums = self.blocks >= _REFERENCE, self.current.variances
-        noise_dps = np.sqrt(sums / self.blocks) if enough else None
-        least = self.device_type.least_change
-        self._monitor = RestMonitor(self.size, self.block_s, least, self.freedom, noise_dps)
-
-    def _alarm(self, block: Block, innovation: Array) -> Alarm | None:
-        """An alarm; after a motion also where a block is far from the level before it."""
-        white, known = self.noise.white / np.sqrt(self.block_s), np.sqrt(self.scale)
-        alarm = self._monitor.update(innovation / known, white * known, block)
-        if alarm is None and self.moving and self.blocks >= _REFERENCE:
-            limit = self.device_type.least_change + 6 * np.sqrt(self.noise_scale) * white
-            if np.any(np.abs(innovation) * white > limit):
-                return Alarm(MOTION)
-        return alarm
-
-    def _accept(self, block: Block, following: Filter) -> None:
-        """Take a block at rest."""
-        before, gravity = self.current, block.gravity
-        known, first = np.isfinite(gravity).all(), not self.blocks
-        if first or not abs(block.temperature - before.prior_c) <= _WARMER_C:
-            up = gravity / np.linalg.norm(gravity) if known and self.up is None else self.up
-            if first or np.isfinite(block.temperature):
-                self._set_prior(up, block.temperature)
-        self.previous = before, block.mean
-        self.current = self.current._replace(
-            filter=following,
-            variances=before.variances + block.variance,
-            gravity=before.gravity + gravity if known else before.gravity,
-            temperature=before.temperature.add(block.temperature),
-        )
-        self.moving, self._turned = 0, np.zeros(3)
-        self._conclude()
-
-    def _set_prior(self, up: Array | None, temperature_c: float) -> None:
-        known = temperature_c if np.isfinite(temperature_c) else None
-        prior = self.prior_of(up, known, self.current.believed)
-        self.current = self.current._replace(prior=prior, prior_c=temperature_c)
-
-    def _leave_out(self, block: Block) -> None:
-        """Leave out a block of motion and the one before it."""
-        motion, first = [block.mean], not self.moving
-        if first and self.previous is not None:
-            self.current, last_mean = self.previous
-            motion.append(last_mean)
-        if self.blocks:
-            bias = estimates([self.current.filter]).bias[0]
-            self._turned = self._turned + np.sum(motion - bias, axis=0) * self.block_s
-            skipped = self.current.filter.skip(len(motion) * self.block_s)
-            self.current = self.current._replace(filter=skipped)
-        if first:
-            self.motions = (*self.motions, self.start_s + self.current.filter.time_s)
-        self.moving, self.previous = self.moving + len(motion), None
-        self._renew_monitor()
-        self._conclude()
-
-    def _attitude_changed(self, block: Block) -> bool:
-        """Whether the device was turned over a motion: by its rates, or by gravity."""
-        up, known = self.up, np.isfinite(block.gravity).all()
-        tilt = angle_deg(block.gravity, up) if up is not None and known else 0.0
-        return self.blocks > 0 and max(float(np.linalg.norm(self._turned)), tilt) > _TURN_DEG
-
-    def _conclude(self) -> None:
-        """Work out the answer, and drop a history that the blocks so far contradict.
-
-        The e-value says of all axes together that the history is wrong. It is then dropped on the
-        axes that speak against it, for the rest of the stretch.
-        """
-        self.unscaled = Estimate(*(x[0] for x in estimates([self.current.filter])))
-        self.noise_scale, self.noise_freedom = self.scale, self.freedom
-        if not np.isinf(self.freedom).all():
-            self.noise_freedom = self.freedom + self.unscaled.freedom
-            total = self.freedom * self.scale + self.unscaled.squares
-            self.noise_scale = total / np.maximum(self.noise_freedom, 1e-9)
-        self.estimate = _scaled(self.unscaled, self.noise_scale, self.noise_freedom)
-        seen, bias, variance = self._posterior(self.estimate)
-        if seen is not None and seen.log_e > np.log(CONFLICT):
-            self._drop(seen)
-            _, bias, variance = self._posterior(self.estimate)
-        warmer = _warmer(self.current.temperature.last, self.current.temperature.mean)
-        self.bias = bias + self.prior.slope * warmer  # as in the last block
-        self.variance = variance + (self.prior.slope_sigma * warmer) ** 2
-
-    def _drop(self, seen: Posterior) -> None:
-        """Drop the history on axes; a heading that one of them contradicts is not believed."""
-        current, up = self.current, self.up
-        axes = self.usable & np.greater(seen.log_ratio, 0)
-        away = (self.estimate.start - self._prior_mean()) / MDPS
-        sigma = np.sqrt(self.prior.narrow + self.estimate.start_variance) / MDPS
-        reasons = [
-            _conflict(axis, float(away[axis]), float(sigma[axis])) for axis in np.flatnonzero(axes)
-        ]
-        conflicts = (*current.conflicts, *reasons)
-        self.current = current._replace(dropped=current.dropped | axes, conflicts=conflicts)
-        horizontal = axes if up is None else axes & (np.abs(up) < VERTICAL)
-        if current.believed and horizontal.any():
-            self.current = self.current._replace(believed=False)
-            self._set_prior(up, current.prior_c)
-
+    @property
     def _prior_mean(self) -> Array:
         """Mean of the prior at the mean temperature of the blocks, by its slope."""
-        warmer = _warmer(self.current.temperature.mean, self.current.prior_c)
+        warmer = _degrees(self.prior_c, self.temperature.mean)
         return np.asarray(self.prior.mean + self.prior.slope * warmer)
 
-    def _posterior(self, estimate: Estimate) -> tuple[Posterior | None, Array, Array]:
-        """With the history where it is usable: of the bias at the start, and bias and variance."""
+    def _posterior(self, estimate: Estimate) -> tuple[Array, Array]:
+        """Bias now and its variance, with the history where it is usable."""
         usable, transfer = self.usable, estimate.transfer
         if not usable.any():
-            return None, estimate.bias, estimate.variance
-        prior = self._prior_mean(), self.prior.narrow, self.prior.wide
-        mean, narrow, wide = (np.where(usable, x, 1.0) for x in prior)
+            return estimate.bias, estimate.variance
+        given = self._prior_mean, self.prior.narrow, self.prior.wide
+        mean, narrow, wide = (np.where(usable, x, 1.0) for x in given)
         own = np.where(usable, estimate.start_variance, np.inf)
         seen = mixture_posterior(estimate.start, own, mean, narrow, wide)
         unknown = np.isinf(estimate.variance)
@@ -272,14 +312,19 @@ class Stretch:
             added = estimate.variance - transfer**2 * estimate.start_variance
         bias = np.where(usable, np.where(unknown, seen.mean, moved), estimate.bias)
         variance = np.where(unknown, 0.0, added) + transfer**2 * seen.charged
-        return seen, bias, np.where(usable, variance, estimate.variance)
+        return bias, np.where(usable, variance, estimate.variance)
 
     def log_noise(self) -> tuple[Array | None, float]:
         """N of this stretch alone, (3,), deg/s * sqrt(s), and its degrees of freedom."""
         freedom = float(self.unscaled.freedom[0])
         if freedom < 1:
             return None, 0.0
-        return self.noise.white * np.sqrt(self.unscaled.squares / freedom), freedom
+        return self.setup.noise.white * np.sqrt(self.unscaled.squares / freedom), freedom
+
+    @property
+    def floor_dps(self) -> Array:
+        """(3,), below which no average of the sensor comes."""
+        return np.asarray(self.setup.noise.floor_dps * np.sqrt(self.noise_scale[0]))
 
     def reached(self, target_dps: float) -> Mask:
         """(3,), axes at the target, which is not below the sensor's floor without a history."""
@@ -295,36 +340,32 @@ class Stretch:
         below = (self.floor_dps > target_dps) & ~self.usable
         left = np.where(self.reached(target_dps), 0.0, np.inf)
         start = self.estimate.start if self.blocks else np.where(self.usable, self.prior.mean, 0.0)
-        following, done = self.current.filter, 0
-        while np.any(np.isinf(left) & ~below) and done * self.block_s < most_s:
-            filters = following.ahead(_AHEAD)
-            following, number = filters[-1], done + 1 + np.arange(_AHEAD)[:, None]
-            later = _scaled(estimates(filters), self.noise_scale, self.noise_freedom + number)
+        following, done = self.filter, 0
+        while np.any(np.isinf(left) & ~below) and done * self.setup.block_s < most_s:
+            following, stack = following.ahead(_AHEAD)
+            number = done + 1 + np.arange(_AHEAD)[:, None]
+            later = self._scaled(
+                stack.estimate(), self.noise_scale[0], self.noise_scale[1] + number
+            )
             later = later._replace(start=np.broadcast_to(start, (_AHEAD, 3)))
-            reached = self._posterior(later)[2] <= target_dps**2
+            reached = self._posterior(later)[1] <= target_dps**2
             first = np.where(reached.any(axis=0), done + 1 + reached.argmax(axis=0), np.inf)
-            left = np.minimum(left, first * self.block_s)
+            left = np.minimum(left, first * self.setup.block_s)
             done += _AHEAD
         return np.where(below, np.inf, left)
 
 
-def _warmer(now: float, then: float) -> float:
-    """Degrees; 0 where one of them is not known."""
+def _degrees(then: float, now: float) -> float:
+    """From one to the other; 0 where one of them is not known."""
     return 0.0 if np.isnan(now - then) else now - then
+
+
+def _far(now: ArrayLike, then: float) -> NDArray[np.bool_]:
+    """Where the temperature has moved, or is known at last."""
+    return np.isfinite(now) & ~(np.abs(np.subtract(now, then)) <= _WARMER_C)
 
 
 def _conflict(axis: SupportsIndex, away: float, sigma: float) -> Reason:
     chance = max(2 * NormalDist().cdf(-abs(away / sigma)), 1e-12)
-    words: dict[str, Any] = {"away": abs(away), "chance": 1 / chance}
-    return reason("conflict", away, abs(away / sigma), axis, **words)
-
-
-def _scaled(estimate: Estimate, scale: Array, freedom: Array) -> Estimate:
-    """With the noise as known, and 1.96 sigma as Student's limits; infinite where it is unknown."""
-    factor = scale
-    if not np.isinf(freedom).all():
-        student = student_limits(_TWO_SIDED, np.clip(freedom, 1e-3, 1e9))
-        factor = np.where(freedom > 0, scale * (student / _TWO_SIDED) ** 2, np.inf)
-    return estimate._replace(
-        variance=estimate.variance * factor, start_variance=estimate.start_variance * factor
-    )
+    away, sigmas = float(away / MDPS), float(abs(away / sigma))
+    return reason("conflict", away, sigmas, axis, away=abs(away), chance=1 / chance)

@@ -10,9 +10,9 @@ and each set weighs as its prior probability times the likelihood of its axes. O
 the usual mixture of two.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
-from itertools import combinations
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,39 +23,48 @@ NARROW = 0.95
 """Probability that the prior is narrow on all axes."""
 
 
-@dataclass(frozen=True)
-class Posterior:
-    """Of a quantity of some axes, (..., axis).
-
-    Attributes:
-        mean: Of the quantity.
-        variance: Of its error, over the whole mixture.
-        charged: The same with the wide prior's probability counted only as far as the data raised
-            it: the variance that holds where the narrow prior does, and that grows as soon as
-            something speaks against it.
-        wide: Probability that the axis's prior is the wide one.
-        log_ratio: Logarithm of the wide prior's likelihood over the narrow one's.
-        log_e: (...), of its mean over the sets. That mean is an e-process while data come in:
-            where the narrow prior holds, it ever exceeds 1 / p with a probability of at most p
-            (Ville 1939).
-    """
+class Posterior(NamedTuple):
+    """Of a quantity of some axes, (..., axis)."""
 
     mean: Array
-    variance: Array
+    variance: Array  # of its error, over the whole mixture
+    # The same with the wide prior's probability counted only as far as the data raised it: it
+    # holds where the narrow prior does, and grows as soon as something speaks against it.
     charged: Array
-    wide: Array
-    log_ratio: Array
-    log_e: Array
+    wide: Array  # probability that the axis's prior is the wide one
+
+
+def log_ratios(off: ArrayLike, variance: ArrayLike, narrow: ArrayLike, wide: ArrayLike) -> Array:
+    """Logarithm of the wide prior's likelihood over the narrow one's, (..., axis).
+
+    Args:
+        off: An estimate less the mean of the prior, (..., axis).
+        variance: Of the estimate; infinite: no data.
+        narrow: Variance of the narrow prior.
+        wide: Variance of the wide prior.
+    """
+    own = np.asarray(variance, np.float64)
+    small, large = np.add(narrow, own), np.add(wide, own)
+    with np.errstate(invalid="ignore"):
+        squares = np.square(off) * (1 / small - 1 / large)
+        return np.where(np.isinf(own), 0.0, (squares - np.log(large / small)) / 2)
+
+
+def log_e(ratios: Array) -> Array:
+    """Logarithm of the mean likelihood ratio over the sets of axes, (...), from (..., axis).
+
+    While data come in, it is an e-process: where the narrow prior holds, the mean ever exceeds
+    1 / p with a probability of at most p (Ville 1939).
+    """
+    of_sets = np.sum(ratios[..., None, :] * _sets(ratios.shape[-1]), axis=-1)
+    most = np.maximum(of_sets.max(axis=-1), 0.0)
+    return np.asarray(np.log(np.mean(np.exp(of_sets - most[..., None]), axis=-1)) + most)
 
 
 def mixture_posterior(
-    estimate: ArrayLike,
-    variance: ArrayLike,
-    mean: ArrayLike,
-    narrow: ArrayLike,
-    wide: ArrayLike,
+    estimate: ArrayLike, variance: ArrayLike, mean: ArrayLike, narrow: ArrayLike, wide: ArrayLike,
     share: float = NARROW,
-) -> Posterior:
+) -> Posterior:  # fmt: skip
     """The posterior of a quantity; all arguments are (..., axis), or broadcast to that.
 
     Args:
@@ -67,23 +76,15 @@ def mixture_posterior(
         share: Probability that all are narrow, from 0 to 1.
     """
     given = np.broadcast_arrays(estimate, variance, mean, narrow, wide)
-    estimates, own, centre, small, large = (np.asarray(x, np.float64) for x in given)
+    estimates, own, centre, *priors = (np.asarray(x, np.float64) for x in given)
     unseen = np.isinf(own)
-    own = np.where(unseen, 1.0, own)
-    off = np.where(unseen, 0.0, estimates - centre)
-    gains = [np.where(unseen, 0.0, prior / (prior + own)) for prior in (small, large)]
-    left = [
-        np.where(unseen, prior, gain * own)
-        for prior, gain in zip((small, large), gains, strict=True)
-    ]
-    squares = off**2 * (1 / (small + own) - 1 / (large + own))
-    log_ratio = np.where(unseen, 0.0, (squares - np.log((large + own) / (small + own))) / 2)
+    off, own = np.where(unseen, 0.0, estimates - centre), np.where(unseen, 1.0, own)
+    gains = [np.where(unseen, 0.0, prior / (prior + own)) for prior in priors]
+    left = [np.where(unseen, p, gain * own) for p, gain in zip(priors, gains, strict=True)]
     sets = _sets(off.shape[-1])
-    of_sets = log_ratio @ sets.T
+    of_sets = np.where(unseen, 0.0, log_ratios(off, own, *priors)) @ sets.T
     most = np.maximum(of_sets.max(axis=-1), 0.0)
-    ratios = np.exp(of_sets - most[..., None])
-    log_e = np.log(np.mean(ratios, axis=-1)) + most
-    weights = (1 - share) / len(sets) * ratios
+    weights = (1 - share) / len(sets) * np.exp(of_sets - most[..., None])
     weights = weights / (weights.sum(axis=-1) + share * np.exp(-most))[..., None]
     of_wide = weights @ sets
     before = (1 - share) * sets.mean(axis=0)
@@ -92,12 +93,10 @@ def mixture_posterior(
     result = (1 - of_wide) * means[0] + of_wide * means[1]
     spreads = [v + (m - result) ** 2 for v, m in zip(left, means, strict=True)]
     total, charged = ((1 - w) * spreads[0] + w * spreads[1] for w in (of_wide, counted))
-    return Posterior(centre + result, total, charged, of_wide, log_ratio, np.asarray(log_e))
+    return Posterior(centre + result, total, charged, of_wide)
 
 
 @lru_cache
 def _sets(axes: int) -> Array:
     """All sets of one axis or more, (set, axis), 1 where an axis is in it."""
-    sizes = range(1, axes + 1)
-    sets = [chosen for size in sizes for chosen in combinations(range(axes), size)]
-    return np.array([[axis in chosen for axis in range(axes)] for chosen in sets], np.float64)
+    return np.array(list(product([0.0, 1.0], repeat=axes))[1:])
