@@ -26,7 +26,7 @@ MOST_VALUES = 32
 
 _DEVICE = re.compile(
     r"(?i)(?:^|[ _.])(?:device|dev|sensor|imu|gyro|gyroscope|board|chip|unit|module|channel|ch|"
-    r"port|slot|mux|bus|node|source|src|serial|mac|topic|id|name|addr|address|tag|instance)"
+    r"port|slot|mux|bus|node|source|serial|mac|topic|kind|type|id|name|addr|address|tag|instance)"
     r"(?:[ _]?(?:id|no|nr|num|number|name|index|tag|addr|address))?$"
 )
 _NUMBER_OR_FLAG = re.compile(r"(?i)[-+.\de]*|inf|-inf|true|false|t|f|yes|no|y|n|on|off")
