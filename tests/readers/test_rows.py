@@ -62,6 +62,14 @@ def test_texts_say_what_a_row_is(column, words, read_beside):
             read_beside("k", column, WHITE, rows={"k": "acc"})
 
 
+def test_numbers_with_which_the_rate_changes_say_what_a_row_is(read_beside):
+    with pytest.raises(InputError, match="rate about x changes by 0.03.*rows: {k: 0}"):
+        read_beside("k", ROWS % 2, WHITE + 0.03 * EVEN)
+    walk = WHITE + np.cumsum(RNG.normal(0, 0.003, (N, 3)), axis=0)
+    for flag in (ROWS % 2, np.repeat(RNG.integers(0, 2, N // 50), 50), ROWS > 2000):
+        assert len(read_beside("k", flag, walk).samples) == N
+
+
 @pytest.mark.parametrize(
     ("name", "column"),
     [

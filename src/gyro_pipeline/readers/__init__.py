@@ -75,7 +75,7 @@ def log_of(
     raw = raw if keep.all() else raw[keep]
     rates = _in_dps(file, raw, scale, timing.rate_hz or expected_rate_hz)
     contradict_values(file, raw, rates, are_counts)
-    contradict_turns(file, {*columns, *temperature[0], *acceleration[0]}, keep)
+    contradict_turns(file, {*columns, *temperature[0], *acceleration[0]}, keep, rates)
     compare_rates(file, timing.rate_hz, expected_rate_hz, keep)
     file.settle()
     gap_rows = np.union1d(timing.gap_rows, counted_gaps(file, keep)).astype(np.intp)

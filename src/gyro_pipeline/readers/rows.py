@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from gyro_pipeline.conventions import AXES
 from gyro_pipeline.readers.file import File
 from gyro_pipeline.readers.names import RATE, Header
 
@@ -96,27 +97,29 @@ def repeated(rates: Floats) -> Mask:
     return np.r_[False, (rates[1:] == rates[:-1]).all(axis=1)]
 
 
-def contradict_turns(file: File, used: Collection[int], keep: Mask) -> None:
+def contradict_turns(file: File, used: Collection[int], keep: Mask, rates: Floats) -> None:
     """Columns that nobody asked for, measure nothing, and say what a row is of.
 
-    Such a column has few values: texts that come and go, or those of a column that is named as a
-    device. Of devices without such a column, quality control tells by the rates that take turns.
+    Such a column has few values: texts that come and go, those of a column that is named as a
+    device, or numbers with which the rates change.
 
     Args:
         file: Gets the contradictions.
         used: Numbers of the columns that have been asked for.
         keep: (n,), the rows that are left.
+        rates: (m, 3), of these.
     """
     for number, (header, column) in enumerate(zip(file.headers, file.table.columns, strict=True)):
-        is_text, measures = column.dtype.kind != "f", header.unit_text or header.names_time
-        says = is_text or (_DEVICE.search(header.name) and not measures)
-        if number in used or not says or len(column) != len(keep):
+        measures = column.dtype.kind == "f" and (header.unit_text or header.names_time)
+        if number in used or measures or len(column) != len(keep):
             continue
         cells = column[:: len(column) // 100 + 1].tolist()
         if len({cell for cell in cells if cell == cell}) > MOST_VALUES:  # noqa: PLR0124 - not NaN
             continue
         codes, texts = _coded(column[keep])
-        if 1 < len(texts) <= MOST_VALUES and (evidence := _evidence(header.name, codes, texts)):
+        if 1 < len(texts) <= MOST_VALUES and (
+            evidence := _evidence(header.name, codes, texts) or _change(rates, codes)
+        ):
             # to pick: a rate by its word, else one without a quantity
             ranked = [text for q in (RATE, "") for text in texts if Header(text).quantity == q]
             pick = next((text for text in ranked if text), "…")
@@ -135,6 +138,29 @@ def _evidence(name: str, codes: Codes, texts: Texts) -> str:
     if _DEVICE.search(name) and (filled & (rows >= len(codes) / 100)).sum() > 1:
         return "by its name devices"
     return "which say what a row is" if (words & (runs > 2)).sum() > 1 else ""  # noqa: PLR2004
+
+
+def _change(rates: Floats, codes: Codes, least: float = 0.3, sigmas: float = 8) -> str:
+    """How rates (m, 3) change with the codes (m,) of their rows, for a message; or nothing.
+
+    Each run of a code is compared with both of its neighbours, which takes off drift. A change is
+    more than ``least`` of the mean size of the noise, and than ``sigmas`` standard errors.
+    """
+    finite = np.isfinite(rates).all(axis=1)
+    starts = np.flatnonzero(np.diff(codes[finite], prepend=-1))
+    if len(starts) < 32:  # noqa: PLR2004 - of fewer, a standard error says little
+        return ""
+    level = np.clip(rates[finite], *np.quantile(rates[finite], [0.01, 0.99], axis=0))  # no spikes
+    means = np.add.reduceat(level, starts) / np.diff(starts, append=finite.sum())[:, None]
+    differences, runs = means[1:-1] - (means[:-2] + means[2:]) / 2, codes[finite][starts[1:-1]]
+    for code in np.flatnonzero(np.bincount(runs) > 10):  # noqa: PLR2004 - as above
+        of_code = differences[runs == code]
+        sizes, errors = np.abs(of_code.mean(axis=0)), of_code.std(axis=0) / len(of_code) ** 0.5
+        excess = sizes - np.maximum(sigmas * errors, least * level.std(axis=0))
+        if excess.max() > 0:
+            size = f"{AXES[excess.argmax()]} changes by {sizes[excess.argmax()]:.3g} deg/s"
+            return f"with which the rate about {size}"
+    return ""
 
 
 def _coded(column: NDArray[Any]) -> tuple[Codes, Texts]:
