@@ -58,9 +58,9 @@ def inspect(log: Log, rate_hz: float, quality: "Quality") -> Inspected:
     for step in (
         *(masks.cut_zero_rows, masks.mask_non_finite, masks.mask_stuck, values.check_equal_axes),
         *(masks.mask_dropouts, masks.keep_longest_stretch, masks.require_length),
-        *(values.check_dead_band, values.check_repeats, values.check_held_axes, values.check_steps),
-        *(motion.check_bias, masks.mask_bursts, masks.require_length, values.check_levels),
-        *(values.check_turns, values.check_noise, motion.check_rest, motion.report_drift),
+        *(values.check_dead_band, values.check_repeats, values.check_steps, motion.check_bias),
+        *(masks.mask_bursts, masks.require_length, values.check_levels, values.check_turns),
+        *(values.check_noise, motion.check_rest, motion.report_drift),
     ):
         step(recording)
         if recording.rejected:

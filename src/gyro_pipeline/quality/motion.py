@@ -63,19 +63,16 @@ def fit_drift(recording: Recording, shortest: float = 0.5) -> Array:
 def check_rest(recording: Recording) -> None:
     """A drift too large for a bias, or a mean or a noise that changes beside the drift."""
     blocks, q, drift = recording.blocks, recording.quality, fit_drift(recording)
-    changed, noisier = alarms(recording, blocks.means - drift)
-    if np.ptp(drift, axis=1).max() > q.largest_drift_dps:
-        sizes = np.ptp(drift, axis=1)
+    sizes, left = np.ptp(drift, axis=1), blocks.means - drift
+    moved, noisier = alarms(recording, left)
+    if sizes.max() > q.largest_drift_dps:
         detail = f"the rate drifts by {sizes.max():.2g} deg/s, axis {AXES[sizes.argmax()]}; a bias "
         detail += f"by at most {q.largest_drift_dps:g} (quality.largest_drift_dps)"
-    elif changed.any():
-        apart = blocks.means - drift
-        apart = np.abs(apart - median(apart)[:, None])
+    elif moved:
+        apart = np.abs(left - median(left)[:, None])
         axis, rows = evidence(recording, apart / (q.least_change_dps + 6 * blocks.noise[:, None]))
-        change = apart[axis].max()
-        detail = f"the rate changes by up to {change:.2g} deg/s, axis {AXES[axis]}, {rows}"
-        if change < 10 * q.least_change_dps:
-            detail += f"; a bias by at most {q.least_change_dps:g} (quality.least_change_dps)"
+        detail = f"the rate changes by up to {apart[axis].max():.2g} deg/s, axis {AXES[axis]}, "
+        detail += f"{rows}; a bias by at most {q.least_change_dps:g} (quality.least_change_dps)"
     elif noisier.any():
         rise = np.sqrt(blocks.variances) / blocks.sigma[:, None]
         axis, rows = evidence(recording, rise * noisier)
@@ -85,14 +82,14 @@ def check_rest(recording: Recording) -> None:
     recording.add("motion", REJECTED, detail)
 
 
-def alarms(recording: Recording, left: Array) -> tuple[Mask, Mask]:
-    """(block,): whether the mean changes beside the drift, and whether the noise rises."""
+def alarms(recording: Recording, left: Array) -> tuple[bool, Mask]:
+    """Whether the mean changes beside the drift; and (block,) whether the noise rises."""
     q, axes = recording.quality, len(AXES)
     detector = RestDetector(recording.size, q.false_alarm, q.least_change_dps)
     # forwards and backwards: its first blocks have little before them to be compared with
     series = (np.vstack([x, x[:, ::-1]]).T for x in (left, recording.blocks.variances))
-    changed, noisier = (x[:, :axes] | x[::-1, axes:] for x in detector.update(*series))
-    return np.any(changed, axis=1), np.any(noisier, axis=1)
+    moved, noisier = detector.update(*series)
+    return bool(moved.any()), np.any(noisier[:, :axes] | noisier[::-1, axes:], axis=1)
 
 
 def evidence(recording: Recording, excess: Array) -> tuple[int, str]:

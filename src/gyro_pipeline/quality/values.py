@@ -25,29 +25,24 @@ def check_equal_axes(recording: Recording) -> None:
 
 
 def check_repeats(recording: Recording, reported: float = 0.01, most: float = 0.2) -> None:
-    """A share of rows that repeat the one before, beyond what chance makes of coarse axes."""
-    shares = recording.repeats
-    if shares.min() <= reported:
-        return
-    same = recording.changes == 0
-    # an axis repeats by chance as often as where the one that repeats least does not
-    rarest = int(np.argmin(shares))
-    others = np.delete(same, rarest, axis=0)[:, ~same[rarest]]
-    chance = shares[rarest] * np.prod(others.mean(axis=1))
-    share = (same.all(axis=0).mean() - chance) / (1 - chance)
-    detail = f"{share:.1%} of the rows repeat the one before"
-    if share > most:
-        detail += f", {1 / (1 - share):.3g} rows a sample; type `repeats: drop` {READER}"
-        recording.add("repeated rows", REJECTED, detail)
-    elif share > reported + 4 * np.sqrt(chance / same.shape[1]):
-        recording.add("repeated rows", KEPT, detail)
+    """Rows that repeat the one before, or an axis its own values, beyond what coarse steps make.
 
-
-def check_held_axes(recording: Recording, most: float = 0.2) -> None:
-    """An axis that repeats its own values beyond chance, though the others change.
-
-    Noise makes counts of changes by 0, 1, 2 steps that are log-concave: n0 n2 <= n1^2.
+    By chance axes repeat independently: an axis as often as where the one that repeats least does
+    not. Noise makes counts of changes by 0, 1, 2 steps that are log-concave: n0 n2 <= n1^2.
     """
+    shares, same = recording.repeats, recording.changes == 0
+    rarest = int(np.argmin(shares))
+    if shares[rarest] > reported:
+        others = np.delete(same, rarest, axis=0)[:, ~same[rarest]]
+        chance = shares[rarest] * np.prod(others.mean(axis=1))
+        share = (same.all(axis=0).mean() - chance) / (1 - chance)
+        detail = f"{share:.1%} of the rows repeat the one before"
+        if share > most:
+            detail += f", {1 / (1 - share):.3g} rows a sample; type `repeats: drop` {READER}"
+            recording.add("repeated rows", REJECTED, detail)
+            return
+        if share > reported + 4 * np.sqrt(chance / same.shape[1]):
+            recording.add("repeated rows", KEPT, detail)
     for axis in np.flatnonzero(recording.steps):
         sizes = np.minimum(np.abs(recording.changes[axis]) / recording.steps[axis] + 0.5, 3)
         repeats, ones, twos, _ = np.bincount(sizes.astype(np.intp), minlength=4)
