@@ -50,6 +50,16 @@ def check_writable(path: Path) -> None:
         raise InputError(in_the_way(path, PermissionError(errno.EACCES, "no permission to write")))
 
 
+def check_made(path: Path) -> None:
+    """Refuse to read a file that no stage has made yet.
+
+    Raises:
+        InputError: It is not there.
+    """
+    if not path.is_file():
+        raise InputError(f"{path} is not there; first run what makes it, such as kedro run")
+
+
 def in_the_way(path: Path, error: OSError) -> str:
     """Say which of the folders above a path is the trouble, and what to do."""
     nearest = next(folder for folder in path.parents if folder.exists())

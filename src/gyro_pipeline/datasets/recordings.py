@@ -15,8 +15,8 @@ import numpy as np
 import xarray as xr
 from kedro.io import AbstractDataset
 
-from gyro_pipeline.conventions import AXES, InputError, Missing
-from gyro_pipeline.datasets.atomic import replacing
+from gyro_pipeline.conventions import AXES, InputError
+from gyro_pipeline.datasets.atomic import check_made, replacing
 from gyro_pipeline.fingerprints import data_hash
 from gyro_pipeline.logs import Finding, Listing, Recording
 
@@ -29,7 +29,7 @@ _TEXT: Final = h5py.string_dtype()
 _UNITS: Final = {"angular_rate": "deg/s", "temperature_c": "degrees Celsius", "acceleration_g": "g"}
 
 
-class Recordings(AbstractDataset[xr.Dataset, xr.Dataset | Missing]):
+class Recordings(AbstractDataset[xr.Dataset, xr.Dataset]):
     """Keeps recordings in one netCDF file and reads them lazily.
 
     What ``load`` returns stays in the file until values are asked for, and again afterwards, so
@@ -37,19 +37,14 @@ class Recordings(AbstractDataset[xr.Dataset, xr.Dataset | Missing]):
 
     Args:
         filepath: The netCDF file.
-        made_by: The command that makes it. Where it is given and there is no file, ``load``
-            returns it as :class:`Missing`, so that a report can say what it lacks.
         metadata: For other tools, such as Kedro-Viz.
     """
 
-    def __init__(
-        self, filepath: str, made_by: str | None = None, metadata: dict[str, Any] | None = None
-    ) -> None:
+    def __init__(self, filepath: str, metadata: dict[str, Any] | None = None) -> None:
         self._filepath = Path(filepath)
-        self._made_by = made_by
         self.metadata = metadata
 
-    def load(self) -> xr.Dataset | Missing:
+    def load(self) -> xr.Dataset:
         """Open the file.
 
         Returns:
@@ -58,8 +53,7 @@ class Recordings(AbstractDataset[xr.Dataset, xr.Dataset | Missing]):
         Raises:
             InputError: As the cause of Kedro's ``DatasetError``, a damaged file.
         """
-        if self._made_by and not self._exists():
-            return Missing((self._made_by,))
+        check_made(self._filepath)
         return open_recordings(self._filepath)
 
     def save(self, data: xr.Dataset) -> None:

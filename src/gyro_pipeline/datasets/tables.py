@@ -7,32 +7,25 @@ import pandas as pd
 from kedro.io import AbstractDataset
 from kedro_datasets._typing import TablePreview
 
-from gyro_pipeline.conventions import Missing
-from gyro_pipeline.datasets.atomic import replacing
+from gyro_pipeline.datasets.atomic import check_made, replacing
 from gyro_pipeline.tracking import FINGERPRINT
 
 
-class Table(AbstractDataset[pd.DataFrame, pd.DataFrame | Missing]):
+class Table(AbstractDataset[pd.DataFrame, pd.DataFrame]):
     """Keeps a table without its index; numbers come back exactly as they were.
 
     Args:
         filepath: The file, ``.csv`` or, for long tables, ``.parquet``.
-        made_by: The command that makes it. Where it is given and there is no file, ``load``
-            returns it as :class:`Missing`, so that a report can say what it lacks.
         metadata: For other tools, such as Kedro-Viz.
     """
 
-    def __init__(
-        self, filepath: str, made_by: str | None = None, metadata: dict[str, Any] | None = None
-    ) -> None:
+    def __init__(self, filepath: str, metadata: dict[str, Any] | None = None) -> None:
         self._filepath = Path(filepath)
-        self._made_by = made_by
         self.metadata = metadata
 
-    def load(self) -> pd.DataFrame | Missing:
+    def load(self) -> pd.DataFrame:
         """Read the table; an empty cell is a missing value, and nothing else is."""
-        if self._made_by and not self._exists():
-            return Missing((self._made_by,))
+        check_made(self._filepath)
         return read_table(self._filepath)
 
     def save(self, data: pd.DataFrame) -> None:
