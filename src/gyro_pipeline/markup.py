@@ -7,7 +7,7 @@ import pandas as pd
 
 _WITHOUT_EXPONENT = 1e4
 _SPECIAL = re.compile(r"[\\`*<>|&~$]|(?<!\w)_|_(?!\w)|\](?=[(\[:])|^\s*(?=[#+-])(?![+-][\d.])")
-_INTERVAL = re.compile(r"\S+ \[\S+, \S+\]")
+_INTERVAL = re.compile(r"[-+−\d.]+ \[[-+−\d.]+, [-+−\d.]+\]")
 
 
 def escape(text: str) -> str:
@@ -48,5 +48,5 @@ def plain(value: Any) -> str:
 def _cell(value: Any) -> str:
     text = plain(value)
     if _INTERVAL.fullmatch(text):  # which stays on one line
-        text = text.replace(" ", "\N{NO-BREAK SPACE}")
+        return text.replace(" ", "\N{NO-BREAK SPACE}")
     return escape(text) or "–"

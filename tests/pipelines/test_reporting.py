@@ -406,7 +406,7 @@ def test_what_beats_the_oracle_is_called_a_defect(make_run, mean, pool, write):
     assert "DEFECT OF THE EVALUATION: 1 beat the oracle" in page
 
 
-def test_what_was_not_made_is_named_with_the_fewest_commands(grid, write):
+def test_what_was_not_made_is_named_with_the_fewest_commands(grid, write, pool, make_run, mean):
     results = grid["augmentation/results"].copy()
     results.loc[results.estimator == CNN, "status"] = "not run"
     page = write(grid | {"augmentation/results": results}, only=Only(sensor="sparkfun"))[2]
@@ -417,6 +417,10 @@ def test_what_was_not_made_is_named_with_the_fewest_commands(grid, write):
         "| kedro run --pipeline=unseen_devices --env=smoke | the study unseen_devices |",
     ]
     assert "- **Narrowed to**: sensor=sparkfun" in page
+    untrained = pool([], plan=plan_of([mean, make_run("network", errors(1.0))]))
+    tables, _, page = write(stored_as("augmentation", untrained))
+    assert tables["augmentation_three_gyroscopes"]["Note"][0] == "not run"
+    assert "| kedro run | 2 of 2 results of augmentation, the study real2real" in page
     nothing = write({})
     assert "There is no finished run with the current settings yet" in nothing[2]
     assert "| kedro run | the study augmentation, the study real2real" in nothing[2]

@@ -13,7 +13,6 @@ import matplotlib as mpl
 import pandas as pd
 from jinja2 import Environment, PackageLoader
 from kedro.io import AbstractDataset, DatasetError
-from kedro_datasets._typing import ImagePreview, TablePreview
 from markdown_it import MarkdownIt
 from markdown_it.renderer import RendererHTML
 from markdown_it.token import Token
@@ -93,17 +92,6 @@ class ReportTable(AbstractDataset[pd.DataFrame, pd.DataFrame]):
             with replacing(self._path.with_name(self._path.stem + suffix)) as temporary:
                 temporary.write_text(text, encoding="utf-8")
 
-    def preview(self, nrows: int = 40) -> TablePreview:
-        """Show the first rows in Kedro-Viz.
-
-        Args:
-            nrows: How many.
-
-        Returns:
-            Columns and rows as Kedro-Viz takes them.
-        """
-        return Table(str(self._path)).preview(nrows)
-
     def _exists(self) -> bool:
         return self._path.is_file()
 
@@ -139,14 +127,6 @@ class ReportFigure(AbstractDataset[Figure, Path]):
             with replacing(self._path.with_name(f"{self._path.stem}.svg")) as temporary:
                 data.savefig(temporary, metadata={"Date": None})
         plt.close(data)
-
-    def preview(self) -> ImagePreview:
-        """Show the figure in Kedro-Viz.
-
-        Returns:
-            The PNG file in base 64.
-        """
-        return ImagePreview(base64.b64encode(self._path.read_bytes()).decode("ascii"))
 
     def _exists(self) -> bool:
         return self._path.is_file()

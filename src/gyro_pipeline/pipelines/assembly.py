@@ -19,14 +19,16 @@ from gyro_pipeline.studies import used_sensors
 
 def assemble(parameters: Parameters) -> dict[str, Pipeline]:
     """All pipelines; each study ends by writing its own tables and figures."""
-    sensors = {
-        study: left or parameters.studies[study].sensors_among(parameters.sensors)
-        for study, left in used_sensors(parameters).items()  # where none is left, a check says so
+    left = used_sensors(parameters)
+    # where nothing is left, a check says so
+    whole = {
+        name: study.sensors_among(parameters.sensors) for name, study in parameters.studies.items()
     }
-    default = [study for study, asked in parameters.studies.items() if asked.default]
+    default = [name for name, study in parameters.studies.items() if study.default]
+    shown = left if any(left[name] for name in default) else whole
     known = [name for name in parameters.sensors if parameters.only.sensor in (None, name)]
-    pipelines = {study: _study(parameters, {study: sensors[study]}) for study in sensors}
-    pipelines["__default__"] = _study(parameters, {study: sensors[study] for study in default})
+    pipelines = {name: _study(parameters, {name: left[name] or whole[name]}) for name in whole}
+    pipelines["__default__"] = _study(parameters, {name: shown[name] for name in default})
     pipelines["reporting"] = Pipeline(
         [node for node in pipelines["__default__"].nodes if not _makes_runs(node)]
     )

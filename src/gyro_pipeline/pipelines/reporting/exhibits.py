@@ -10,7 +10,6 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from gyro_pipeline.conventions import ALL, FIRST, LEAVE_ONE_DEVICE_OUT
-from gyro_pipeline.estimators import DEFAULT
 from gyro_pipeline.parameters import Published, PublishedResult
 from gyro_pipeline.pipelines.reporting.results import column
 from gyro_pipeline.studies import CNN, CONSTANT, MEAN
@@ -134,11 +133,6 @@ class Material:
 def label(estimator: str) -> str:
     """What a reader calls an estimator."""
     return _LABELS.get(estimator, estimator.replace("_", " "))
-
-
-def recommended_label() -> str:
-    """What the page calls the recommended estimator beside the paper's network."""
-    return label(DEFAULT)
 
 
 def ends(row: Mapping[str, Any] | pd.Series | None, name: str, windows: str) -> tuple[float, ...]:

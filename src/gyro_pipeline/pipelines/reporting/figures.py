@@ -99,6 +99,8 @@ def _draw_claim(
             fmt="<" if outside else marker, color=colour, ms=4.5, capsize=2, lw=1.2,
             label=label(name),
         )  # fmt: skip
+    if material.result(claim, CNN) is None:
+        ax.text(2, place, material.status(claim), color="grey", va="center", fontsize=8)
     limit, lo, hi = ends(material.result(claim, CNN), f"ceiling_{gain}", windows)
     if not np.isnan(limit):
         span = (lo, hi) if not np.isnan(lo) else (limit - 0.4, limit + 0.4)

@@ -9,7 +9,7 @@ from gyro_pipeline.conventions import ALL, MDPS
 from gyro_pipeline.estimators import DEFAULT
 from gyro_pipeline.parameters import PublishedResult
 from gyro_pipeline.physics.ceiling import best_gain
-from gyro_pipeline.pipelines.reporting.exhibits import Material, label, recommended_label
+from gyro_pipeline.pipelines.reporting.exhibits import Material, label
 from gyro_pipeline.pipelines.reporting.results import column
 from gyro_pipeline.protocol.scores import holm
 from gyro_pipeline.studies import CNN, CONSTANT, MEAN
@@ -73,7 +73,7 @@ def _networks(rows: pd.DataFrame) -> str:
             f"{_gain(here, CONSTANT)} %"
         )
     if (here.estimator == DEFAULT).any():
-        parts.append(f"the {recommended_label()} predictor {_gain(here, DEFAULT)} %")
+        parts.append(f"the {label(DEFAULT)} predictor {_gain(here, DEFAULT)} %")
     parts.append(f"and the ceiling is {_range(here[_CEILING_GAIN].dropna())} %")
     return f"{', '.join(parts)}."
 

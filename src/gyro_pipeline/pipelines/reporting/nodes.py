@@ -22,8 +22,9 @@ _OF_THE_PAPER = ("augmentation", "real2real", "input_channels")
 """Studies that the paper has tables or figures of; others have a figure and a table per sensor."""
 
 _BASE = ("base", "local")
-_NO_RESULTS = [*ROW, "study", "status", "run_ids", "fingerprints", "env", "simulated"]
-_NO_RESULTS += ["recommended", "beats_oracle_p"]
+_COLUMNS = [*ROW, "study", "status", "run_ids", "fingerprints", "env", "simulated"]
+_COLUMNS += ["recommended", "beats_oracle_p"]
+"""Of results, also where none was made."""
 
 
 def write_report(
@@ -93,11 +94,12 @@ def _material(source: str, published: Published, stored: Tables) -> Material:
         parts = [part for part in parts if len(part)]
         return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=[*columns])
 
+    results = gathered("results", _COLUMNS)
     leaks = stored.get(f"{LEAKAGE}/results", pd.DataFrame)
     return Material(
         source=source,
         published=published,
-        results=gathered("results", _NO_RESULTS),
+        results=results.reindex(columns=results.columns.union(_COLUMNS, sort=False)),
         curves=gathered("curves", ["study", "sensor"]),
         leaks=leaks(),
         sensors=gathered("description", ["sensor"]),

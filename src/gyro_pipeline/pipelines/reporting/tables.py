@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gyro_pipeline.conventions import ALL, DISJOINT, FIRST, MDPS, PAPER, TRUE
+from gyro_pipeline.conventions import ALL, AXES, DISJOINT, FIRST, MDPS, PAPER, TRUE
 from gyro_pipeline.estimators import DEFAULT, ESTIMATORS, ORIENTATION_NOTE
 from gyro_pipeline.parameters import PublishedHours, PublishedResult
 from gyro_pipeline.pipelines.reporting.exhibits import (
@@ -17,7 +17,6 @@ from gyro_pipeline.pipelines.reporting.exhibits import (
     interval,
     label,
     percent,
-    recommended_label,
     split,
 )
 from gyro_pipeline.pipelines.reporting.recordings import SIGMAS_MDPS
@@ -60,11 +59,13 @@ def _result_table(material: Material, name: str, title: str) -> Exhibit | None:
         return None
     rows = [_result_row(material, claim) for claim in material.published.of_table(table)]
     shown = ["Approach", "Sensor", "Gyroscopes", "Published S/A %", "S %", "A %", "Constant A %"]
-    shown += [_BEST_A, "Ceiling S %", "Ceiling A %", "Paper's way A %", "Note"]
-    return Exhibit(name, title, _SUMMARY, pd.DataFrame(rows), shown)
+    shown += [_BEST_A, "Ceiling S %", "Ceiling A %", "Paper's way A %"]
+    made = pd.DataFrame(rows)
+    shown += ["Note"] if made["Note"].notna().any() else []
+    return Exhibit(name, title, _SUMMARY, made, shown)
 
 
-_BEST_A = f"{recommended_label().capitalize()} A %"
+_BEST_A = f"{label(DEFAULT).capitalize()} A %"
 
 
 def _result_row(material: Material, claim: PublishedResult) -> dict[str, Any]:
@@ -130,7 +131,7 @@ def results_table(material: Material, study: str) -> Exhibit:
         table[f"ceiling {windows} mdps"] = ceiling
     logger.info("results\n%s", table.to_string(index=False, na_rep="–"))
     table["split"] = [split(row) for _, row in rows.iterrows()]
-    table["status"], table["runs"] = rows.status, rows.run_ids.fillna("").map(_short)
+    table["status"], table["runs"] = rows.status, rows.run_ids.map(_short, na_action="ignore")
     return Exhibit(f"{study}_results", f"All results of {study}", "", table, ())
 
 
@@ -305,7 +306,7 @@ def sensor_specifications(material: Material) -> Exhibit | None:
             {
                 "Sensor": material.sensor_name(sensor),
                 "Source": material.source_name,
-                "Gyroscopes": None if row is None else len_gyroscopes(row),
+                "Gyroscopes": None if row is None else len(AXES) * int(row.imus),
                 "Datasheet rate Hz": rate,
                 "Rate Hz": None if row is None else round(row.rate_hz, 1),
                 "Datasheet noise density mdps/√Hz": density,
@@ -331,11 +332,6 @@ def sensor_specifications(material: Material) -> Exhibit | None:
     shown = [name for name in table.columns.astype(str) if name not in hidden]
     name, title = "sensor_specifications", "Sensors: datasheets and recordings"
     return Exhibit(name, title, caption, table, shown)
-
-
-def len_gyroscopes(row: pd.Series) -> int:
-    """How many gyroscopes a described sensor has."""
-    return 3 * int(row.imus)
 
 
 def _rms(row: pd.Series | None, name: str, factor: float) -> str:
