@@ -286,6 +286,16 @@ def test_results_stand_beside_the_published_ones_and_the_ceiling(grid, report):
     assert len(report[0]["augmentation_results"]) == 1 + 4 + 3 + 1  # equal runs once
 
 
+def test_a_source_with_fewer_gyroscopes_stands_beside_the_published_row(grid, write):
+    results = grid["real2real/results"]
+    few = results[results.real_gyros == 3].assign(source="published", simulated=False)
+    stored = {"real2real/results": few, "real2real/curves": grid["real2real/curves"]}
+    table = write(stored, "published")[0]["real2real_generalization"]
+    row = table.iloc[0][["Gyroscopes", "Published S/A %", "Source"]]
+    assert row.tolist() == ["3 real", "82/87 (9 real)", "published (measured)"]
+    assert table["A %"][0] != "–"
+
+
 def test_the_ends_of_the_curve_and_what_is_beyond_the_ceiling_are_said(grid, write):
     results = grid["augmentation/results"].copy()
     three = (results.real_gyros == 3) & (results.estimator == CNN)
@@ -383,7 +393,7 @@ def test_the_page_answers_first_and_names_the_premise(report):
     assert "Over all windows of 10 s the paper's network is " in answers
     assert "a constant, the device's known mean returned without a look" in answers
     # 72/57 is within 1 - sqrt(10 / 87) = 66 %, the other four are beyond
-    assert "4 of the 5 published gains on these sensors are beyond what white noise" in answers
+    assert "4 of 5 published gains on these sensors are beyond what white noise" in answers
     places = [answers.index(words) for words in ("a warm-up (SparkFun", "another truth", "a leak")]
     assert places == sorted(places)
     assert sentence(page, "- *constant*").endswith("a constant that ignores the window.")

@@ -114,14 +114,19 @@ class Material:
     def result(self, claim: PublishedResult, estimator: str) -> pd.Series | None:
         """Our result for a published one; None where there is none.
 
+        Where the study has no row with as many real gyroscopes, such as on the public file of a
+        single IMU, it is the one that comes closest from below.
+
         Args:
             claim: The published result.
             estimator: Whose.
         """
-        rows = self.made[self.made.study == _STUDIES_OF[claim.table]]
-        match = np.all([rows[key] == getattr(claim, key) for key in _KEYS], axis=0)
-        rows = rows[match & (rows.estimator == estimator)]
-        return rows.iloc[0] if len(rows) else None
+        rows = self.of(_STUDIES_OF[claim.table], estimator=estimator)
+        for key in ("sensor", "virtual_gyros", "window_s"):
+            rows = rows[rows[key] == getattr(claim, key)]
+        rows = rows[rows.real_gyros <= claim.real_gyros].sort_values("real_gyros")
+        row = rows.iloc[-1] if len(rows) else None
+        return None if row is None or pd.notna(row.status) else row
 
     def status(self, claim: PublishedResult) -> str:
         """Why there is no result for a published one."""

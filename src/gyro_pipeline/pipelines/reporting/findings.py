@@ -115,7 +115,8 @@ def _published(material: Material) -> str:
         return ""
     beyond = beyond_white_noise(material)
     return (
-        f"{len(beyond)} of the {len(material.claims)} published gains on these sensors are beyond "
+        f"{len(beyond)} of {len(material.claims)} published gains on these sensors "
+        f"{'is' if len(beyond) == 1 else 'are'} beyond "
         "what white noise without drift allows, A = 1 − √(T0/T), even if the bias is known exactly."
     )
 

@@ -75,13 +75,15 @@ def _result_row(material: Material, claim: PublishedResult) -> dict[str, Any]:
     known: Any = {} if row is None else row
     runs = [other.run_ids for other in (row, residual) if other is not None]
     beyond = row is not None and beyond_ceiling(row)
+    fewer = row is not None and bool(row.real_gyros < claim.real_gyros)
+    other = f" ({gyroscopes(claim)})" * fewer
     return {
         "Approach": claim.approach,
         "Sensor": claim.sensor,
         "Source": material.source_name,
         "Split": split(known),
-        "Gyroscopes": gyroscopes(claim),
-        "Published S/A %": f"{claim.time_saving_pct:.0f}/{claim.accuracy_gain_pct:.0f}",
+        "Gyroscopes": gyroscopes(claim if row is None else row),
+        "Published S/A %": f"{claim.time_saving_pct:.0f}/{claim.accuracy_gain_pct:.0f}" + other,
         "S %": interval(row, "time_saving_pct"),
         "A %": interval(row, "accuracy_gain_pct"),
         "Paper's way S %": interval(row, "time_saving_pct", FIRST),
