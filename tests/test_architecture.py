@@ -17,6 +17,7 @@ ALLOWED = {
     "conventions": set(),
     "fingerprints": set(),
     "units": set(),
+    "markup": set(),
     "parameters": {"conventions", "units"},
     "executors": {"conventions", "parameters"},
     "studies": {"conventions", "estimators", "parameters"},
@@ -39,11 +40,19 @@ ALLOWED = {
     "learning": {"conventions", "executors", "parameters", "physics"},
     "datasets": {
         *("conventions", "estimators", "fingerprints", "logs", "parameters", "physics"),
-        *("readers", "tracking"),
+        *("readers", "tracking", "markup"),
     },
     **{
         f"pipelines.{stage}": {
-            *("conventions", "estimators", "executors", "fingerprints", "learning", "logs"),
+            *(
+                "conventions",
+                "estimators",
+                "executors",
+                "fingerprints",
+                "learning",
+                "logs",
+                "markup",
+            ),
             *("parameters", "physics", "protocol", "quality", "studies", "tracking"),
         }
         for stage in STAGES

@@ -25,7 +25,7 @@ STUDIES = {
 }
 PIPELINES = STUDIES | {"__default__", "ground_truth", "reporting", "virtual_gyros"}
 MEMORY = "kedro.io.MemoryDataset"
-SHARED = {"mlflow.db", "data/08_reporting/report"}  # by all sources
+SHARED = {"mlflow.db"}  # by all sources
 PUBLISHED = "data/01_raw/published"  # files to read only, of two sources
 
 # The package says so itself, but pytest sets filters of its own.
@@ -102,7 +102,7 @@ def test_every_dataset_has_an_entry_and_a_path_of_its_own_with_the_source(regist
     assert len(files) == len(set(files)) > 5
     # only messages between nodes stay in memory, and the reference to the recordings
     kept = [name for name in names if entry(name, env)["type"] == MEMORY]
-    assert all(".windowed_splits." in name or ".reporting.gaps." in f".{name}" for name in kept)
+    assert all(".windowed_splits." in name for name in kept)
     for name in configuration(env)["catalog"] if env != "base" else ():  # it overrides entries
         assert name in names or name in configuration("base")["catalog"]
 
@@ -114,7 +114,7 @@ def test_every_dataset_has_an_entry_and_a_path_of_its_own_with_the_source(regist
         "augmentation.sparkfun.training.run",
         "augmentation.sparkfun.windowed_splits.window",
         "augmentation.reporting.result",
-        "reporting.table.dataset_hours",
+        "reporting.table",
     ],
 )
 def test_a_typo_has_none(typo):
@@ -142,10 +142,7 @@ def test_every_parameter_and_every_pattern_is_used(registered):
         ("augmentation.dot.windowed_splits.windows", "tables.Table"),
         ("augmentation.dot.training.plan", "tables.Table"),
         ("augmentation.dot.training.runs", "tracked_runs.TrackedRuns"),
-        ("augmentation.reporting.tables.results", "reports.ReportTable"),
-        ("estimators.reporting.figures.ng", "reports.ReportFigure"),
-        ("reporting.folder", "report_page.ReportFolder"),
-        ("reporting.figures.allan_deviation", "reports.ReportFigure"),
+        ("reporting.report", "reports.ReportPage"),
     ],
 )
 def test_names_get_their_own_kind_of_dataset(name, kind):
@@ -155,18 +152,6 @@ def test_names_get_their_own_kind_of_dataset(name, kind):
 def test_kedro_viz_shows_every_dataset_in_the_layer_of_its_stage(registered):
     for name in datasets_of(registered["base"]):
         assert entry(name)["metadata"]["kedro-viz"]["layer"] in name.split("."), name
-
-
-def test_data_that_a_report_may_lack_name_the_pipeline_that_makes_them(registered):
-    kinds = (".training.plan", ".raw_logs.recordings", ".ground_truth.allan", ".quality")
-    stored = [name for name in registered["base"]["reporting"].inputs() if name.endswith(kinds)]
-    assert {"ng.ground_truth.allan", "augmentation.dot.training.plan"} <= set(stored)
-    for name in stored:
-        pipeline, only = (
-            entry(name)["made_by"].removeprefix("kedro run --pipeline=").split(" --params=")
-        )
-        assert only == f"only.sensor={name.split('.')[-3]}"
-        assert name in registered["base"][pipeline].all_outputs()
 
 
 def test_studies_that_take_long_are_pipelines_of_their_own(registered):
@@ -181,9 +166,6 @@ def test_a_studys_runs_are_narrowed_to_it_and_tracked_ones_are_not():
     runs = entry("real2real.ng.evaluation.runs")
     assert (runs["study"], runs["sensor"], runs["source"]) == ("real2real", "ng", "simulated")
     assert "study" not in entry("ng.training.tracked")
-    everywhere = entry("real2real.reporting.all_runs")
-    assert everywhere["study"] == "real2real"
-    assert not {"sensor", "source"} & set(everywhere)
 
 
 def test_sources_never_share_a_path(registered):

@@ -5,20 +5,29 @@ import pytest
 from kedro.io import DataCatalog
 from kedro.runner import ParallelRunner, SequentialRunner
 
-from gyro_pipeline.conventions import InputError, Missing
+from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.tracked_runs import TrackedRuns
-from gyro_pipeline.hooks import Preflight, Provenance, Session
-
-ABSENT = {"ng.raw_logs.recordings": Missing(("kedro run --pipeline=ground_truth",))}
+from gyro_pipeline.hooks import Provenance, Session, settings_in_words
 
 
-def test_only_the_report_goes_on_without_its_data():
-    training = SimpleNamespace(namespace="training")
-    message = "ng.raw_logs.recordings is not there; make it: kedro run --pipeline=ground_truth"
-    with pytest.raises(InputError, match=message):
-        Preflight().before_node_run(training, ABSENT)
-    Preflight().before_node_run(training, {"ng.raw_logs.recordings": 1})
-    Preflight().before_node_run(SimpleNamespace(namespace="reporting"), ABSENT)
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        ({}, ""),
+        ({"execution": {"workers": 2}, "logs": "here", "reader": {"units": "mdps"}}, ""),
+        ({"only": {"sensor": "dot", "window_s": 10}}, "only.sensor=dot,only.window_s=10"),
+        ({"seeds": [0, 1]}, "seeds=-0-1"),
+        ({"only": {"sensor": "../x"}}, "only.sensor=..-x"),
+    ],
+)
+def test_settings_of_a_command_name_the_folder_of_its_report(given, name):
+    assert settings_in_words(given) == name
+
+
+def test_long_settings_are_cut_and_still_told_apart():
+    names = [settings_in_words({"seeds": [*range(100), last]}) for last in (1, 2)]
+    assert names[0] != names[1]
+    assert max(map(len, names)) < 100
 
 
 @pytest.mark.parametrize(

@@ -157,7 +157,7 @@ def test_what_sensors_cannot_give_stops_the_studies_that_ask_for_it_and_no_other
     with pytest.raises(InputError) as refused:
         check_possible(parameters, ["ground_truth", pipeline])
     assert said in str(refused.value)
-    for other in ("ground_truth", "virtual_gyros", "reporting"):
+    for other in ("ground_truth", "virtual_gyros"):
         check_possible(parameters, [other])
 
 
@@ -166,14 +166,6 @@ def test_a_study_without_a_name_is_checked_like_one_with_it(loaded):
     with pytest.raises(InputError, match="12 real gyroscopes"):
         check_possible(parameters, ["__default__"])
     check_possible(Parameters(**loaded(sensors={"dot": {"imus": 1}}, only=ONE_DOT)), ["real2real"])
-
-
-def test_the_report_wants_the_sensors_that_the_paper_speaks_of(loaded):
-    given = loaded()
-    given["published"]["hours"][0]["sensor"] = "bosch"
-    check_possible(Parameters(**given), ["augmentation"])
-    with pytest.raises(InputError, match="published: unknown sensor 'bosch'"):
-        check_possible(Parameters(**given), ["reporting"])
 
 
 @pytest.mark.parametrize(

@@ -22,8 +22,6 @@ A windows table has a row per window: ``protocol, window_s, window_stride_s``; `
 ``origin``, real or virtual; ``imu``, ``recording`` and ``start``, its first sample.
 """
 
-from dataclasses import dataclass
-
 AXES = ("x", "y", "z")
 DIMENSIONS = ("imu", "recording", "axis", "sample")
 
@@ -82,10 +80,3 @@ LAST, BEST = "last", "best"
 
 class InputError(ValueError):
     """Input that cannot be used; the message says what, where, and what to do."""
-
-
-@dataclass(frozen=True)
-class Missing:
-    """In place of a result: what it could not be made from."""
-
-    reasons: tuple[str, ...]

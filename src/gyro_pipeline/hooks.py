@@ -8,6 +8,7 @@ import hashlib
 import logging
 import os
 import platform
+import re
 import shlex
 import subprocess
 import sys
@@ -23,12 +24,12 @@ from kedro.framework.hooks import hook_impl
 from kedro.framework.session import KedroSession
 
 from gyro_pipeline import boundary, run_lock
-from gyro_pipeline.conventions import InputError, Missing
+from gyro_pipeline.conventions import InputError
 
 if TYPE_CHECKING:
     from kedro.framework.context import KedroContext
     from kedro.io import CatalogProtocol
-    from kedro.pipeline import Node, Pipeline
+    from kedro.pipeline import Pipeline
     from pydantic import ValidationError
 
     from gyro_pipeline.parameters import Parameters
@@ -40,6 +41,41 @@ _WITHOUT_EFFECT = ("execution", "only")
 
 _NAMES_NODES = ("node_names", "from_nodes", "to_nodes", "from_inputs", "to_outputs", "tags")
 """Options that name nodes: these are run, whether they are up to date or not."""
+
+
+OWN_SETTINGS = "own_settings"
+"""Name of a resolver for the catalog: a folder named after the settings of a command, if any."""
+
+_CHANGE_NO_RESULT = ("execution", "logs", "reader")
+_LONGEST_NAME = 80
+
+
+def settings_in_words(given: Mapping[str, Any], prefix: str = "") -> str:
+    """Name the settings that a command gave with ``--params``, such as ``only.sensor=dot``.
+
+    A run with settings of its own, narrowed or with other parameters, has a report of its own, and
+    never replaces that of the full study.
+
+    Args:
+        given: Parameters; those of execution and of where logs are read change no result.
+        prefix: Of the keys.
+
+    Returns:
+        A name for a folder; empty where there are none.
+    """
+    words = []
+    for key, value in sorted(given.items()):
+        if isinstance(value, Mapping):
+            words.append(settings_in_words(value, f"{prefix}{key}."))
+        else:
+            words.append(re.sub(r"[^\w.=+-]+", "-", f"{prefix}{key}={value}").strip("-"))
+    if prefix:
+        return ",".join(words)
+    kept = [word for word in words if word and not word.startswith(_CHANGE_NO_RESULT)]
+    name = ",".join(kept)
+    if len(name) <= _LONGEST_NAME:
+        return name
+    return f"{name[:_LONGEST_NAME]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
 class Session(KedroSession):
@@ -158,33 +194,35 @@ class Preflight:
                 dataset.check_made_with(settings)
 
     @hook_impl
-    def before_node_run(self, node: "Node", inputs: dict[str, Any]) -> None:
-        """Refuse data that are not there; only the report goes on, to say what it lacks."""
-        for name, value in inputs.items():
-            if isinstance(value, Missing) and node.namespace != "reporting":
-                raise InputError(f"{name} is not there; make it: {', '.join(value.reasons)}")
-
-    @hook_impl
     def after_pipeline_run(
         self, run_result: dict[str, Any], pipeline: "Pipeline", catalog: "CatalogProtocol"
     ) -> None:
         """Say where the results are and how to look at them."""
-        tables = [name for name in pipeline.all_outputs() if "reporting.tables." in name]
-        folders = {path.parent.parent for name in tables for path in _paths(catalog.get(name))}
-        for folder in sorted(folders):
-            logger.info("tables and figures: %s", _relative(folder, self._project))
-        if not folders:  # no runs either
+        reports = pipeline.all_outputs() & {"reporting.report"}
+        for path in (path for name in reports for path in _paths(catalog.get(name))):
+            logger.info("tables and figures: %s", _relative(path.parent, self._project))
+            logger.info("report:             %s", _relative(path, self._project))
+        if not reports:  # no runs either
             ends = (".raw_logs.quality", ".ground_truth.bias")
             for name in sorted(name for name in pipeline.all_outputs() if name.endswith(ends)):
                 for path in _paths(catalog.get(name)):
                     logger.info("table:              %s", _relative(path, self._project))
-        for name in pipeline.all_outputs() & {"reporting.report"}:
-            for path in _paths(catalog.get(name)):
-                logger.info("report:             %s", _relative(path, self._project))
         if run_result:  # where nothing was run, nothing is new
             for link in _run_links(catalog.get(name) for name in sorted(pipeline.datasets())):
                 logger.info("compare runs:       %s", link)
         logger.info("see the lineage:    kedro viz")
+
+
+class OwnReport:
+    """Gives a command with settings of its own a folder of its own to report in."""
+
+    @hook_impl
+    def after_context_created(self, context: "KedroContext") -> None:
+        """Tell the catalog its name, before it is read."""
+        from omegaconf import OmegaConf  # noqa: PLC0415
+
+        name = settings_in_words(context.config_loader.runtime_params or {})
+        OmegaConf.register_new_resolver(OWN_SETTINGS, lambda: name and f"/{name}", replace=True)
 
 
 class Provenance:

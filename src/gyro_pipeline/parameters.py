@@ -613,6 +613,7 @@ class PublishedSpecification(Parameter):
     )
     noise_density_mdps_rthz: float | None = Field(description="one-sided, mdps/sqrt(Hz)")
     bias_stability_dph: float | None = Field(description="bias instability, deg/h")
+    recording_s: Seconds = Field(description="T of the paper's recordings (section IV-A)")
 
 
 class PublishedHours(Parameter):

@@ -127,8 +127,8 @@ def _fingerprints(pipeline: Pipeline, catalog: CatalogProtocol) -> dict[str, str
 
 def _own_classes(inputs: Iterable[Any]) -> list[str]:
     """Estimators of one's own, ``package.module:Class``, in studies: their code counts as well."""
-    studies = [value for value in inputs if isinstance(value, Mapping) and "estimators" in value]
-    return own_classes(name for study in studies for name in study["estimators"])
+    given = [value.get("estimators") for value in inputs if isinstance(value, Mapping)]
+    return own_classes(name for names in given if isinstance(names, list) for name in names)
 
 
 def _state(name: str, catalog: CatalogProtocol) -> Any:

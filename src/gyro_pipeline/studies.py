@@ -186,10 +186,11 @@ def used_sensors(parameters: Parameters) -> dict[str, list[str]]:
 
 def studies_to_run(parameters: Parameters, pipelines: Sequence[str]) -> dict[str, list[str]]:
     """Sensors of each study that some pipelines run, as ``only`` leaves them."""
+    whole = bool({DEFAULT, "reporting"} & set(pipelines))
     return {
         study: sensors
         for study, sensors in used_sensors(parameters).items()
-        if study in pipelines or (parameters.studies[study].default and DEFAULT in pipelines)
+        if study in pipelines or (parameters.studies[study].default and whole)
     }
 
 
@@ -219,11 +220,6 @@ def check_possible(parameters: Parameters, pipelines: Sequence[str]) -> None:
         for sensor in sensors:
             parameters.check_sensor(f"studies.{study}", sensor)
             _check_rows(parameters, study, sensor)
-    if {"reporting", DEFAULT} & set(pipelines):
-        published = parameters.published
-        named = [row.sensor for row in published.specifications]
-        for sensor in named + [row.sensor for row in published.hours]:
-            parameters.check_sensor("published", sensor)
 
 
 def _check_rows(p: Parameters, study: str, name: str) -> None:

@@ -41,7 +41,8 @@ def leak_study(make_world, make_study, parameters, as_stored):
             for run in runs
         ]
         stored = {"sparkfun_plan": world.plan, "sparkfun_runs": evaluated}
-        return pool_leakage(world.evaluation, **stored).set_index(["leak", "estimator"])
+        given = world.evaluation, study, world.training, {"sparkfun": {"rate_hz": 25}}
+        return pool_leakage(*given, **stored)["results"].set_index(["leak", "estimator"])
 
     return run
 

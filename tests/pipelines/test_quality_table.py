@@ -1,10 +1,7 @@
 import pandas as pd
 import pytest
 
-from gyro_pipeline.conventions import Missing
-from gyro_pipeline.pipelines.reporting.quality import recording_quality
-
-LACKING = Missing(("kedro run --pipeline=ground_truth --params=only.sensor=ng",))
+from gyro_pipeline.pipelines.reporting.recordings import recording_quality
 
 
 def quality(*rows, sensor="dot"):
@@ -32,13 +29,7 @@ def five():
 
 
 def test_counts_come_first_then_what_is_not_simply_kept_the_worst_first(five):
-    table, lacking = recording_quality(
-        dot_quality=five, ng_quality=quality(("kept", None), sensor="ng")
-    )
-    assert lacking == ()
-    other = table.iloc[-1][["Sensor", "Outcome", "Findings"]].tolist()
-    assert other == ["ng", "1 kept, 0 repaired, 0 rejected", "none"]
-    table, _ = recording_quality(dot_quality=five, ng_quality=LACKING)
+    table = recording_quality(five)
     assert table.fillna("").to_dict("list") == {
         "Sensor": ["dot"] * 4,
         "IMU": ["all 5", "3", "4", "1"],
@@ -56,14 +47,10 @@ def test_counts_come_first_then_what_is_not_simply_kept_the_worst_first(five):
 
 
 def test_of_many_the_first_are_listed_and_the_others_counted():
-    table, _ = recording_quality(dot_quality=quality(*[("rejected", "motion")] * 33))
+    table = recording_quality(quality(*[("rejected", "motion")] * 33))
     assert len(table) == 1 + 20 + 1
     assert table.iloc[0]["Rows used"] == "none"
     assert table.iloc[-1].dropna().to_dict() == {
         "Sensor": "dot",
         "Findings": "in 13 further recordings",
     }
-
-
-def test_without_any_table_there_is_none():
-    assert recording_quality(dot_quality=LACKING) == (Missing(()), ())

@@ -1,327 +1,193 @@
-"""What the report says, from small tables with known numbers; and how it is written."""
+"""What the report says of recordings, and how its page is written."""
 
 import base64
 import re
 
 import matplotlib.pyplot as plt
+import numpy as np
 import pandas as pd
 import pytest
 from kedro.io import DatasetError
 
-from gyro_pipeline.conventions import Missing
-from gyro_pipeline.datasets.report_page import ReportFolder, ReportPage
-from gyro_pipeline.datasets.reports import ReportFigure, ReportTable
+from gyro_pipeline.datasets.reports import ReportFigure, ReportPage
+from gyro_pipeline.markup import pipe_table
 from gyro_pipeline.parameters import Only
-from gyro_pipeline.pipelines.reporting.captions import CAPTIONS
-from gyro_pipeline.pipelines.reporting.pipeline import create_pipeline
-from gyro_pipeline.pipelines.reporting.report import write_report
-from gyro_pipeline.tracking import SCORES, StoredRun
+from gyro_pipeline.pipelines.ground_truth.nodes import measure_allan_variance, measure_noise
+from gyro_pipeline.pipelines.reporting.nodes import write_report
+from gyro_pipeline.pipelines.reporting.recordings import describe, drift, start_up
 
-THREE = "tables/augmentation_three_gyroscopes"
-COMMAND = "kedro run --pipeline=augmentation --params=only.sensor=dot"
-TABLE = pd.DataFrame({"Approach": ["<b>Real2Real</b>"], "A %": ["51 [40, 60]"], "Runs": ["run0"]})
+SENSORS = ("dot", "sparkfun", "ng")
+WARM_UP_S, AMPLITUDE = 5.0, 0.02
 
 
-def stored(number, estimator="cnn", simulated="1", oracle_p=0.5, **tags):
-    given = {
-        "kedro_env": "smoke",
-        "mlflow.source.git.commit": "0123456789abcdef",
-        "git_dirty": "True",
-        "gyro-pipeline": "0.1.0",
-        "torch": "2.13.0",
-        "simulated": simulated,
-        "fingerprint": f"fingerprint{number}",
-    }
-    params = {"estimator": estimator, "sensor": "sparkfun", "seed": "0", "window_s": "10.0"}
-    names = ["weights", "truth", "windows", "score", "value", "lo", "hi"]
-    oracle = ("last", "paper", "all", "beats_oracle_p", oracle_p, None, None)
-    scores = pd.DataFrame([oracle] if estimator == "cnn" else [], columns=names)
-    return StoredRun(
-        run_id=f"run{number}",
-        experiment_id="7",
-        study="augmentation",
-        finished=True,
-        trained=True,
-        started_ms=1_700_000_000_000,
-        params=params | {"epochs": "1200"},
-        tags=given | tags,
-        metrics={},
-        fits=frozenset(),
-        load={SCORES: scores}.__getitem__,
-        load_fit={}.__getitem__,
-    )
+@pytest.fixture(scope="module")
+def recordings(make_recordings):
+    """Two IMUs of each sensor, ten recordings of which three test; DOT warms up by 20 mdps."""
+    given = {}
+    for seed, sensor in enumerate(SENSORS):
+        bias = np.random.default_rng(seed).uniform(-1, 1, (2, 1, 3))
+        bias = bias + np.random.default_rng(seed).normal(0, 1e-3, (2, 10, 3))
+        made = make_recordings(bias, 600, 20.0, 0.004, seed, split=(5, 2, 3))
+        made.attrs["sensor"] = sensor
+        given[sensor] = made
+    times_s = np.arange(600) / 20.0
+    given["dot"]["angular_rate"] += np.float32(AMPLITUDE) * np.exp(-times_s / WARM_UP_S)
+    return given
 
 
-def result(number, gain, **changes):
-    """A row over 10 s, where the mean errs by 1 mdps and the ceiling lies at 0.43."""
-    rmse = 1e-3 * (1 - gain / 100)
-    row = {
-        "sensor": "sparkfun", "estimator": "cnn", "method": 2, "real_gyros": 3, "window_s": 10.0,
-        "virtual_gyros": 0, "missing": None, "run_ids": f"run{number}", "simulated": True,
-        "test_rmse_dps_all": rmse, "mean_rmse_dps_all": 1e-3, "ceiling_rmse_dps_all": 0.43e-3,
-        "accuracy_gain_pct_all": gain, "accuracy_gain_pct_all_lo": gain - 10,
-        "accuracy_gain_pct_all_hi": gain + 10, "ceiling_accuracy_gain_pct_all": 57.0,
-        "ceiling_accuracy_gain_pct_all_hi": None, "recording_s": 86.5,
-    }  # fmt: skip
-    return row | changes
+@pytest.fixture(scope="module")
+def described(recordings, make_bias, make_quality, parameters):
+    stored = {}
+    for sensor, made in recordings.items():
+        allan = measure_allan_variance(made)
+        bias = make_bias(made, allan)
+        quality = make_quality(made).assign(sensor=sensor, outcome="kept", findings=None)
+        virtual = made.isel(imu=[0, 0, 0]).assign_coords(imu=[1, 2, 3])
+        virtual = virtual.assign_attrs(train_recordings=6) if sensor == "sparkfun" else None
+        given = made, bias, measure_noise(made, allan, bias), allan, quality
+        tables = describe(*given, parameters().ground_truth, virtual)
+        stored |= {f"{sensor}/{name}": (lambda t=table: t) for name, table in tables.items()}
+    return stored
 
 
-@pytest.fixture
-def rows():
-    """The mean, and networks with 0 and 24 virtual gyroscopes."""
-    return [
-        result(0, 0.0, estimator="mean"),
-        result(1, 50.0),
-        result(2, 54.0, virtual_gyros=24),
-    ]
+@pytest.fixture(scope="module")
+def report(described, parameters):
+    p = parameters("base")
+    given = p.published, p.ground_truth, p.studies, {name: {} for name in p.sensors}
+    return write_report("test", Only(), *given, described)
 
 
-@pytest.fixture
-def write(parameters, rows):
-    """The report's content on these rows, with anything changed."""
-
-    def make(source="simulated", only=None, folder=None, runs=None, **made):
-        base = parameters("base")
-        sensors = {name: sensor.model_dump() for name, sensor in base.sensors.items()}
-        claims = [row for row in base.published.results if row.sensor == "sparkfun"]
-        published = base.published.model_copy(update={"results": claims})
-        start = "augmentation.reporting."
-        none = pd.DataFrame(columns=["source", "run_ids"])
-        given = {
-            f"{start}results": pd.DataFrame(rows),
-            f"{start}measured_elsewhere": none,
-            f"{start}all_runs": runs or [stored(0, "mean"), stored(1), stored(2)],
-            f"{start}tables.three_gyroscopes": TABLE,
-            f"{start}gaps.three_gyroscopes": (),
-        }
-        given |= {name if "." in name else f"{start}{name}": part for name, part in made.items()}
-        return write_report(source, only or Only(), sensors, published, folder or {}, **given)
-
-    return make
+# recordings
 
 
-def item(content, kind, title):
-    (found,) = [one for one in content[kind] if one["title"] == title]
+def test_drift_shows_a_warm_up_that_all_power_ons_share_and_none_where_there_is_none(recordings):
+    warm, still = (drift(recordings[name]).set_index("x") for name in ("dot", "ng"))
+    for axis in "xyz":
+        own = warm[warm.line == axis]
+        times_s = own.index.to_numpy()
+        expected = AMPLITUDE * np.exp(-times_s / WARM_UP_S)
+        expected -= expected[-6:].mean()
+        inside = (own.lo < expected) & (expected < own.hi)
+        assert inside.mean() > 0.8
+        assert own.y.iloc[0] == pytest.approx(expected[0], abs=2e-3)
+    assert ((still.lo < 0) & (0 < still.hi)).mean() > 0.85
+    alone = drift(recordings["ng"].isel(imu=[0], recording=[0]))
+    assert alone.lo.isna().all() and alone.y.notna().all()
+
+
+def test_times_of_a_start_up_are_those_of_white_noise_with_and_without_history(recordings):
+    made = recordings["ng"]
+    noise = pd.DataFrame({"imu": 1, "axis": list("xyz"), "white_dps_rts": 0.004})
+    noise = noise.assign(instability_dps=0.0, random_walk_dps_per_rts=0.0)
+    means = made.angular_rate.mean("sample").to_dataframe("bias_dps").reset_index()
+    row = start_up(made.assign(true_turn_on_spread=("axis", [2e-3] * 3)), means, noise)
+    # (N / sigma)^2, and N^2 (1 / sigma^2 - 1 / tau^2)
+    assert row["mean_s_at_1"] == pytest.approx(16, rel=0.01)
+    assert row["ceiling_s_at_1"] == pytest.approx(16 * (1 - 1 / 4), rel=0.01)
+    assert row["ceiling_s_at_1"] < row["history_s_at_1"] < row["mean_s_at_1"]
+    assert row["mean_s_at_0.5"] == np.inf  # 64 s, of 30
+    assert row["history_recordings"] == 7
+    known = start_up(made.assign(true_turn_on_spread=("axis", [2e-4] * 3)), means, noise)
+    assert known["ceiling_s_at_0.5"] == 0
+    assert np.isnan(start_up(made, means, noise.assign(white_dps_rts=np.nan))["mean_s_at_1"])
+
+
+def test_hours_are_counted_and_what_was_not_read_says_so(report):
+    table = report[0]["dataset_hours"].set_index("Dataset")
+    first, virtual = table.loc["1"], table.loc["3"]
+    # training recordings of all six gyroscopes, test recordings of three, 30 s each
+    assert (first["Training recordings"], first["Test recordings"]) == (6 * 7, 3 * 3)
+    assert first["Train h"] == pytest.approx(6 * 7 * 30 / 3600, abs=0.0051)
+    samples = (6 * 7 + 3 * 3) * 600
+    ends = f"{samples / 145 / 3600:.2f} to {samples / 130 / 3600:.2f}"
+    assert first["At the datasheet's rate h"] == ends
+    assert (virtual["Training recordings"], virtual["Test recordings"]) == (9 * 6, 0)
+    assert virtual["Source"].startswith("virtual, from test")
+    assert table.loc["6", "Note"] == table.loc["4", "Note"] == "not made"
+    assert table.loc["2", "Note"].startswith("the text's 400 recordings")
+    assert table["Paper's total h"][["1", "real", "all"]].tolist() == [24.65, 76.2, 186.6]
+
+
+def test_recordings_of_a_k_fold_train_and_test_and_count_once(recordings, described):
+    counted = described["ng/description"]().iloc[0]
+    assert (counted.train_recordings, counted.test_recordings) == (6 * 7, 3 * 3)
+    from gyro_pipeline.pipelines.reporting.recordings import _counts  # noqa: PLC0415
+
+    row = _counts(recordings["ng"].drop_vars("split"), None)
+    assert (row["train_recordings"], row["test_recordings"], row["all_recordings"]) == (60, 30, 60)
+
+
+def line(ax, label):
+    (found,) = [one for one in ax.lines if str(one.get_label()).startswith(label)]
     return found
 
 
-def sentence(content, words):
-    (found,) = [one for one in content["findings"] if words in one]
-    return found
+def test_datasheets_and_signals_are_shown_from_the_recordings(report, recordings):
+    tables, figures, _ = report
+    table = tables["sensor_specifications"].set_index("Sensor")
+    sparkfun = table.loc["SparkFun"]
+    assert sparkfun["Datasheet N mdps√s"] == pytest.approx(3.8 / np.sqrt(2))
+    assert sparkfun["Datasheet σ mdps"] == pytest.approx(3.8 * np.sqrt(20 / 2))
+    assert float(sparkfun["N mdps√s"].split()[0]) == pytest.approx(4, rel=0.1)
+    assert float(sparkfun["σ mdps"].split()[0]) == pytest.approx(4 * np.sqrt(20), rel=0.03)
+    assert table.loc["Memsense", "N mdps√s"] == "not read"
+    assert tables["start_up"]["Sensor"].tolist() == ["Movella DOT", "SparkFun", "NG"]
+    raw, calibrated = figures["calibrated_signal"].axes[0].lines[:2]
+    samples = recordings["sparkfun"].angular_rate.isel(imu=0, recording=0, axis=0)
+    np.testing.assert_allclose(raw.get_ydata(), samples, rtol=1e-6)
+    assert np.mean(calibrated.get_ydata()) == pytest.approx(0, abs=1e-6)
+    settled = [text.get_text() for text in figures["running_average"].legends[0].get_texts()]
+    assert any(re.fullmatch(r"stays within from \d+\.\d s on", text) for text in settled)
+    convergence = figures["mg_convergence"]
+    titles = [ax.get_title() for ax in convergence.axes]
+    assert [title.split()[0] for title in titles] == ["1", "4"]  # there are six
+    ends = line(convergence.axes[1], "average of all").get_ydata()
+    assert ends[-1] == pytest.approx(0, abs=1e-6)  # each is centred
+    allan = figures["allan_deviation"].axes[0]
+    assert len(allan.lines) == 6 + 1 + 1  # each gyroscope, the fit, the datasheet
+    assert "N = " in allan.texts[0].get_text()
+    assert [ax.get_title() for ax in figures["drift"].axes] == ["Movella DOT", "SparkFun", "NG"]
 
 
-# what is said
-
-
-def test_every_table_and_figure_of_the_paper_has_a_caption():
-    studies = ("augmentation", "real2real", "input_channels", "estimators", "unseen_devices")
-    asked = {"sensors": ["sparkfun"], "inspected": ["sparkfun"]}
-    sensors = ["sparkfun", "dot", "ng", "memsense"]
-    made = create_pipeline(dict.fromkeys(studies, sensors), **asked).all_outputs()
-    places = {
-        f"{kind}/{study.replace('.', '_')}{name}"
-        for study, _, rest in (address.partition("reporting.") for address in made)
-        for kind, _, name in [rest.partition(".")]
-        if kind in ("tables", "figures") and name not in ("results", "comparison")  # long
-    }
-    assert places == CAPTIONS.keys()
-
-
-def test_it_says_what_was_run(write):
-    content, _ = write()
-    facts = dict(content["facts"])
-    assert facts["Data"].startswith("Simulated recordings (source `simulated`)")
-    # 80 recordings of 12 gyroscopes and 20 of 3, of 87 s: the paper's 24.65 h
-    assert facts["Recordings"].startswith("24.6 h")
-    assert facts["Networks"] == "2 trained, of 1200 epochs (the paper: 1200)"
-    assert facts["Code"].startswith("commit `0123456789ab` with uncommitted changes")
-    assert facts["Trained"].startswith("2023-11-14 22:13")
-    assert (facts["Seeds"], facts["Windows"], facts["Environment"]) == ("0", "10 s", "`smoke`")
-    assert content["simulated"] and not content["smoke"]
-    assert write("simulated_smoke")[0]["smoke"]
-
-
-def test_of_a_study_without_networks_it_says_how_many_estimators(write, rows):
-    rows[1:] = [result(1, 60.0, estimator="best_linear")]
-    content, _ = write(runs=[stored(0, "mean"), stored(1, "best_linear")])
-    facts = dict(content["facts"])
-    assert facts["Estimators"] == "1 besides the mean and the network, windows of 10 s"
-    assert not {"Networks", "Seeds", "Windows"} & set(facts)
-    labels = [row["label"] for study in content["studies"] for row in study["rows"]]
-    assert labels == ["sparkfun, running mean, 10 s", "sparkfun, best_linear, 10 s: A 60 %"]
-    assert content["comparison"].empty
-
-
-def test_measured_recordings_are_called_so_and_nothing_is_said_of_a_constant(write, rows):
-    rows[:] = [row | {"simulated": False} for row in rows]
-    content, _ = write("published", runs=[stored(number, simulated="0") for number in range(3)])
-    facts = dict(content["facts"])
-    assert facts["Data"].startswith("Recordings measured on real sensors")
-    assert facts["Recordings"] == "sparkfun: 86.5 s each"
-    assert not content["simulated"]
-    assert not [one for one in content["findings"] if "constant" in one]
-    assert content["comparison"]["Constant, expected"].isna().all()
-
-
-def test_results_on_measured_data_of_another_source_are_named(write):
-    elsewhere = pd.DataFrame([result(9, 10.0, source="published")])
-    runs = [stored(0, "mean"), stored(1), stored(2), stored(9, simulated="0")]
-    content, _ = write(runs=runs, measured_elsewhere=elsewhere)
-    assert dict(content["facts"])["Beside them"].endswith("recordings of published")
-    assert content["simulated"]
-    labels = [row["label"] for row in content["studies"][0]["rows"]]
-    assert labels[-1] == "sparkfun, 3 real, 10 s: A 10 % (published)"
-
-
-def test_findings_are_counted(write):
-    content, _ = write()
-    # 72/57 is within 1 - sqrt(10 / 87) = 66 %, the other four are beyond
-    limit = sentence(content, "exceed the limit")
-    assert limit.startswith("4 of 5 published results exceed")
-    assert "with T = 87 s on sparkfun. It holds" in limit
-    # of 57 and 79, the ceiling is 57; 57 is in 50 +- 10, 79 is not in 54 +- 10
-    assert sentence(content, "training set that was run here") == (
-        "2 published results have a training set that was run here. Beyond the ceiling on these "
-        "data: 1. Within the 95 % interval of ours: 1."
-    )
-    ranked = sentence(content, "At 10 s")
-    assert ranked.startswith("At 10 s, 2 of 2 networks are better than the running mean")
-    assert "A is 50 to 54 %. Their RMSE is 1.07 to 1.16 times the ceiling." in ranked
-    # sqrt(0.31^2 + 3.3^2 / 87) = 0.470 mdps
-    assert "1 of 2 are better than what is expected of a constant" in ranked
-    assert "changes A by +4 points, in 1 comparisons" in sentence(content, "virtual gyroscopes")
-    assert not [one for one in content["findings"] if "Adding real" in one]
-    assert "smallest p value of 2 is 1" in sentence(content, "No estimator beats")
-    assert content["comparison"].iloc[0].to_dict() == {
-        "Sensor": "sparkfun",
-        "Window s": 10.0,
-        "Running mean": 1.0,
-        "Constant, expected": 0.47,
-        "Networks, worst": 0.5,
-        "Networks, best": 0.46,
-        "Ceiling": 0.43,
-        "Networks": 2,
-    }
-
-
-def test_a_network_that_beats_the_oracle_is_called_a_defect(write):
-    content, _ = write(runs=[stored(0, "mean"), stored(1), stored(2, oracle_p=1e-6)])
-    assert sentence(content, "best possible").startswith("DEFECT OF THE EVALUATION: 1 beat")
-
-
-def test_a_run_that_studies_share_counts_once(write, rows):
-    again = pd.DataFrame([row | {"run_ids": f"run{n + 3}"} for n, row in enumerate(rows)])
-    twins = [stored(n + 3, "cnn" if n else "mean", fingerprint=f"fingerprint{n}") for n in range(3)]
-    other = {"real2real.reporting.results": again, "real2real.reporting.all_runs": twins}
-    content, _ = write(**other)
-    assert dict(content["facts"])["Networks"].startswith("2 trained")
-    assert "2 of 2 networks" in sentence(content, "At 10 s")
-    assert [study["name"] for study in content["studies"]] == ["augmentation", "real2real"]
-
-
-def test_what_is_missing_is_shown_and_named(write, rows):
-    rows[2] |= {"missing": COMMAND, "run_ids": None}
-    missing = Missing((COMMAND,))
-    gap = {"tables.three_gyroscopes": missing, "gaps.three_gyroscopes": missing.reasons}
-    content, gaps = write(**{f"augmentation.reporting.{name}": part for name, part in gap.items()})
-    assert gaps == (COMMAND,)
-    shown = item(content, "tables", "Three real gyroscopes")
-    assert shown["table"] is None
-    assert shown["missing"] == [f"{COMMAND} --env=smoke"]
-    other = item(content, "figures", "DOT: 3 real gyroscopes and virtual ones")
-    assert other["missing"] == ["kedro run --pipeline=augmentation --env=smoke"]
-    assert content["studies"][0]["missing"] == [f"{COMMAND} --env=smoke"]
-
-
-def test_without_any_run_the_report_says_so(write, rows):
-    rows[:] = [row | {"missing": COMMAND, "run_ids": None} for row in rows]
-    content, _ = write(runs=[])
-    assert "no finished run" in dict(content["facts"])["Data"]
-    assert len(content["findings"]) == 1  # what holds without runs
-    assert content["comparison"].empty
-
-
-def test_what_others_left_in_the_folder_is_shown(write):
-    folder = {
-        THREE: pd.DataFrame({"old": [1]}),
-        "tables/augmentation_multiple_gyroscopes": TABLE,
-        "tables/warm_up_results": TABLE,
-        "tables/other_devices": TABLE,
-    }
-    content, _ = write(folder=folder)
-    three, twelve = (item(content, "tables", f"{n} real gyroscopes") for n in ("Three", "Twelve"))
-    assert list(three["table"]) == ["Approach", "A %"]
-    assert not three["earlier"] and twelve["earlier"]
-    assert item(content, "results", "All results of the study warm_up")["earlier"]
-    assert [one["title"] for one in content["further"]] == ["Other devices"]
-    # what a page has said it does not say again
-    assert three["caption"].startswith("Windows of 10 s; S and A in percent")
-    assert twelve["caption"] == "To be read like “Three real gyroscopes”."
-
-
-# how it is written
+# the page
 
 
 @pytest.fixture
 def page(tmp_path):
-    return ReportPage(str(tmp_path / "report"))
+    return ReportPage(str(tmp_path / "simulated" / "report.html"), str(tmp_path / "report.html"))
 
 
-@pytest.fixture
-def figure(tmp_path):
-    dataset = ReportFigure(str(tmp_path / "simulated" / "figures" / "augmentation_dot_3_real"))
-    dataset.save(plt.subplots()[0])
-    return dataset.load()
-
-
-def test_the_page_needs_no_other_file_and_its_text_says_the_same(write, page, figure, tmp_path):
-    name = "augmentation.reporting.figures.dot_3_real"
-    content, _ = write(folder={"tables/<i>x": TABLE}, source="<u>`a`", **{name: figure})
-    page.save(content)
-    html = (tmp_path / "report.html").read_text()
+def test_the_page_needs_no_other_file_and_a_list_links_to_all_reports(page, tmp_path):
+    figure = ReportFigure(str(tmp_path / "simulated" / "figures" / "<i>dot 3.png"))
+    figure.save(plt.subplots()[0])
+    hostile = (
+        "<img src=x onerror=alert(1)> ![x](http://evil/x) [y](javascript:alert(1)) &lt; `c` *b*"
+    )
+    table = pipe_table(pd.DataFrame({"File": [hostile, "# _a_ | b"], "n": [1.25, np.nan]}))
+    page.save(f"# A title\n\n## The answer\n\n{table}\n![a plot](figures/%3Ci%3Edot%203.png)\n")
+    html = (tmp_path / "simulated" / "report.html").read_text()
     (picture,) = re.findall(r'src="([^"]*)"', html)
-    assert base64.b64decode(picture.removeprefix("data:image/png;base64,")) == figure.read_bytes()
-    assert not re.search(r"<(script|link|iframe|b|i|u)>|@import|url\(", html)  # all is escaped
-    assert "&lt;b&gt;Real2Real" in html
-    links = re.findall(r'href="([^"]*)"', html)
-    assert "http://127.0.0.1:5000/#/experiments/7/runs/run1" in links
-    assert {link for link in links if "127.0.0.1" not in link and link[0] != "#"} == {
-        "../../README.md",
-        "../../docs/how_it_works.md",
-        "../../docs/honest_protocol.md",
-        "../../docs/honest_protocol.md#the-ceiling",
-    }
-    inside = {link[1:] for link in links if link[0] == "#"}
-    assert inside and inside <= set(re.findall(r'id="([^"]*)"', html))
-    text = (tmp_path / "report.md").read_text()
-    assert "](simulated/figures/augmentation_dot_3_real.png)" in text
-    assert "| <b>Real2Real</b> | 51 [40, 60] |" in text
-    assert "**Not made**:\n\n- Twelve real gyroscopes: run `kedro run --pipeline=augm" in text
-    assert "`7/run1`" in text
-    for finding in content["findings"]:
-        assert finding in text
+    assert base64.b64decode(picture.removeprefix("data:image/png;base64,")) == (
+        figure.load().read_bytes()
+    )
+    assert not re.search(
+        r"<(script|link|iframe|i|em|code)>|@import|url\(|javascript:alert\(1\)\"", html
+    )
+    assert "&lt;img src=x onerror=alert(1)&gt; ![x](http://evil/x) [y](javascript" in html
+    assert "&amp;lt; `c` *b*</td>" in html and "# _a_ | b</td>" in html
+    assert re.findall(r'href="([^"]*)"', html) == ["#the-answer"]
+    assert 'id="the-answer"' in html and "<title>A title</title>" in html
+    for folder in ("only.sensor=dot", "../logs"):
+        other = tmp_path / "simulated" / folder / "report.html"
+        ReportPage(str(other), str(tmp_path / "report.html")).save("# Another\n")
+    links = re.findall(r'href="([^"]*)"', (tmp_path / "report.html").read_text())
+    names = ("logs", "simulated", "simulated/only.sensor=dot")
+    assert links == [f"{name}/report.html" for name in names]
+    assert page.load().startswith("# A title")
 
 
-def test_a_narrowed_run_says_why_something_is_missing(write, rows, page, tmp_path):
-    rows[2] |= {"missing": COMMAND, "run_ids": None}
-    page.save(write(only=Only(sensor="sparkfun", window_s=10))[0])
-    for suffix in ("html", "md"):
-        text = (tmp_path / f"report.{suffix}").read_text()
-        assert "since this run was narrowed to sensor=sparkfun, window_s=10.0:" in text
-        assert "- Twelve real gyroscopes\n" in text or "<li>Twelve real gyroscopes</li>" in text
-        assert COMMAND not in text
-
-
-def test_the_folder_gives_all_tables_and_figures(tmp_path, figure, page):
-    folder = ReportFolder(str(tmp_path / "simulated"))
-    ReportTable(str(tmp_path / "simulated" / "tables" / "window_0.5s")).save(TABLE)
-    (tmp_path / "simulated" / "tables" / ".half.csv").touch()
-    found = folder.load()
-    assert found.keys() == {"tables/window_0.5s", "figures/augmentation_dot_3_real"}
-    pd.testing.assert_frame_equal(found["tables/window_0.5s"], TABLE)
-    assert found["figures/augmentation_dot_3_real"] == figure
-    assert ReportFolder(str(tmp_path / "none")).load() == {}
-    with pytest.raises(DatasetError, match="one by one"):
-        folder.save(TABLE)
-    with pytest.raises(DatasetError, match="open it in a browser"):
-        page.load()
+def test_a_picture_that_is_not_there_is_refused_and_nothing_half_written(page, tmp_path):
+    page.save("# First\n")
+    with pytest.raises(DatasetError, match="no such picture"):
+        page.save("# Second\n\n![x](figures/none.png)\n")
+    assert "First" in (tmp_path / "simulated" / "report.html").read_text()

@@ -1,28 +1,35 @@
-"""What people read: tables and figures, each in the formats they are used in."""
+"""What people read: tables, figures and the page that shows them."""
 
 import base64
+import re
+import unicodedata
+from collections.abc import MutableMapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import matplotlib as mpl
 import pandas as pd
-from kedro.io import AbstractDataset
-from kedro_datasets._typing import ImagePreview, TablePreview
+from jinja2 import Environment, PackageLoader
+from kedro.io import AbstractDataset, DatasetError
+from markdown_it import MarkdownIt
+from markdown_it.renderer import RendererHTML
+from markdown_it.token import Token
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
-from gyro_pipeline.conventions import InputError, Missing
 from gyro_pipeline.datasets.atomic import replacing
-from gyro_pipeline.datasets.tables import preview_table, read_table, write_table
+from gyro_pipeline.datasets.tables import read_table, write_table
+from gyro_pipeline.markup import pipe_table, plain
 
 _PNG_DPI = 160
-_WITHOUT_EXPONENT = 1e4
-_SENTENCE = 40  # characters
-
 _LONGEST = 35
 _BROKEN = r"p{4cm}"
 """How LaTeX sets columns with texts of more characters than that."""
+
+_FORMULA = re.compile(r"[=@\t\r]|[+-](?![\d.,\s\[\]+\-%/]*$)")
+"""A text that a spreadsheet would compute; one of digits and signs alone it would not."""
 
 _LATEX = str.maketrans(
     {
@@ -53,151 +60,180 @@ _LATEX = str.maketrans(
 )
 
 
-class ReportTable(AbstractDataset[pd.DataFrame | Missing, pd.DataFrame | Missing]):
+class ReportTable(AbstractDataset[pd.DataFrame, pd.DataFrame]):
     """Writes a table as CSV with all digits, and as Markdown and LaTeX to be read.
 
     In the latter two, numbers have four significant digits and a missing value is a dash. LaTeX
-    needs the package ``booktabs``.
+    needs the package ``booktabs``; a character that it has no form for is a question mark. In the
+    CSV file a text that a spreadsheet would take for a formula has an apostrophe before it.
 
     Args:
-        filepath: Their common path, without a suffix.
+        filepath: The CSV file; the others lie beside it.
         metadata: For other tools, such as Kedro-Viz.
     """
 
     def __init__(self, filepath: str, metadata: dict[str, Any] | None = None) -> None:
-        self._csv, self._md, self._tex = _with_suffixes(filepath, ".csv", ".md", ".tex")
+        self._path = Path(filepath)
         self.metadata = metadata
 
-    def load(self) -> pd.DataFrame | Missing:
-        """Read the table, all digits of it; Missing where it was not made."""
-        return read_table(self._csv) if self._csv.is_file() else Missing(())
+    def load(self) -> pd.DataFrame:
+        """Read the table, all digits of it."""
+        return read_table(self._path)
 
-    def save(self, data: pd.DataFrame | Missing) -> None:
-        """Write the three files, or remove those of a result that can no longer be made.
+    def save(self, data: pd.DataFrame) -> None:
+        """Write the three files.
 
         Args:
             data: The table; its index is not written.
-
-        Raises:
-            InputError: As the cause of Kedro's ``DatasetError``, a character that LaTeX lacks.
         """
-        if isinstance(data, Missing):
-            _remove(self._csv, self._md, self._tex)
-            return
-        markdown, latex = to_markdown(data), to_latex(data)
-        with replacing(self._csv) as temporary:
-            write_table(data, temporary)
-        for path, text in ((self._md, markdown), (self._tex, latex)):
-            with replacing(path) as temporary:
+        texts = {".md": pipe_table(data), ".tex": to_latex(data)}
+        with replacing(self._path) as temporary:
+            write_table(data.map(_no_formula).rename(columns=_no_formula), temporary)
+        for suffix, text in texts.items():
+            with replacing(self._path.with_name(self._path.stem + suffix)) as temporary:
                 temporary.write_text(text, encoding="utf-8")
 
-    def preview(self, nrows: int = 40) -> TablePreview:
-        """Show the first rows in Kedro-Viz.
-
-        Args:
-            nrows: How many.
-
-        Returns:
-            Columns and rows as Kedro-Viz takes them.
-        """
-        return preview_table(self._csv, nrows)
-
     def _exists(self) -> bool:
-        return all(path.is_file() for path in (self._csv, self._md, self._tex))
+        return self._path.is_file()
 
     def _describe(self) -> dict[str, Any]:
-        return {"filepath": str(self._csv.with_suffix(""))}
+        return {"filepath": str(self._path)}
 
 
-class ReportFigure(AbstractDataset[Figure | Missing, Path | Missing]):
+class ReportFigure(AbstractDataset[Figure, Path]):
     """Writes a figure as PNG and SVG; the same figure gives the same bytes.
 
     Args:
-        filepath: Their common path, without a suffix.
+        filepath: The PNG file; the other lies beside it.
         metadata: For other tools, such as Kedro-Viz.
     """
 
     def __init__(self, filepath: str, metadata: dict[str, Any] | None = None) -> None:
-        self._png, self._svg = _with_suffixes(filepath, ".png", ".svg")
+        self._path = Path(filepath)
         self.metadata = metadata
 
-    def load(self) -> Path | Missing:
-        """Name the PNG file, to be shown elsewhere; Missing where it was not made."""
-        return self._png if self._png.is_file() else Missing(())
+    def load(self) -> Path:
+        """Name the PNG file, to be shown elsewhere."""
+        return self._path
 
-    def save(self, data: Figure | Missing) -> None:
-        """Write both files and close the figure, or remove those that can no longer be made.
+    def save(self, data: Figure) -> None:
+        """Write both files and close the figure.
 
         Args:
             data: The figure.
         """
-        if isinstance(data, Missing):
-            _remove(self._png, self._svg)
-            return
         with mpl.rc_context({"svg.hashsalt": "gyro_pipeline"}):
-            with replacing(self._png) as temporary:
+            with replacing(self._path) as temporary:
                 data.savefig(temporary, dpi=_PNG_DPI)
-            with replacing(self._svg) as temporary:
+            with replacing(self._path.with_name(f"{self._path.stem}.svg")) as temporary:
                 data.savefig(temporary, metadata={"Date": None})
         plt.close(data)
 
-    def preview(self) -> ImagePreview:
-        """Show the figure in Kedro-Viz.
-
-        Returns:
-            The PNG file in base 64.
-        """
-        return ImagePreview(base64.b64encode(self._png.read_bytes()).decode("ascii"))
-
     def _exists(self) -> bool:
-        return self._png.is_file() and self._svg.is_file()
+        return self._path.is_file()
 
     def _describe(self) -> dict[str, Any]:
-        return {"filepath": str(self._png.with_suffix(""))}
+        return {"filepath": str(self._path)}
 
 
-def to_markdown(table: pd.DataFrame) -> str:
-    """Write a table as Markdown.
-
-    Args:
-        table: Its index is not written.
-
-    Returns:
-        Lines of a pipe table; numeric columns are aligned to the right.
-    """
-    rules = ["---:" if right else "---" for right in _numeric(table)]
-    rows = [list(table.columns.map(str)), rules, *_texts(table)]
-    cells = [[cell.replace("|", "\\|").replace("\n", " ") for cell in row] for row in rows]
-    return "".join(f"| {' | '.join(row)} |\n" for row in cells)
-
-
-def to_html(table: pd.DataFrame) -> str:
-    """Write a table as HTML.
+class ReportPage(AbstractDataset[str, str]):
+    """Writes a report as Markdown, as one HTML file that needs no other, and a list of all reports.
 
     Args:
-        table: Its index is not written.
-
-    Returns:
-        A ``table`` with everything in it escaped. Cells of numeric columns have the class
-        ``number``, sentences the class ``long``.
+        filepath: The HTML file, in the folder of its source; the Markdown file lies beside it.
+        all_reports: An HTML file above those folders, which links to the reports in all of them.
+        metadata: For other tools, such as Kedro-Viz.
     """
-    numeric = _numeric(table)
 
-    def row(tag: str, texts: list[str]) -> str:
-        classes = [
-            "number" if right else "long" if len(text) > _SENTENCE else ""
-            for right, text in zip(numeric, texts, strict=True)
+    def __init__(
+        self, filepath: str, all_reports: str, metadata: dict[str, Any] | None = None
+    ) -> None:
+        self._path, self._all = Path(filepath), Path(all_reports)
+        self.metadata = metadata
+
+    def load(self) -> str:
+        """Read the Markdown."""
+        return self._path.with_suffix(".md").read_text(encoding="utf-8")
+
+    def save(self, data: str) -> None:
+        """Write the report in both formats, and the list of all reports anew.
+
+        Args:
+            data: The page as Markdown. Pictures are files beside it.
+        """
+        self._write(self._path.with_suffix(".md"), data)
+        self._write(self._path, to_html(data, self._path.parent))
+        pages = self._all.parent.rglob(self._path.name)
+        lines = [
+            f"- [{name}]({name}/{self._path.name})"
+            for name in sorted(
+                page.parent.relative_to(self._all.parent).as_posix() for page in pages
+            )
+            if name != "."
         ]
-        return "".join(
-            f'<{tag} class="{kind}">{escape(text)}</{tag}>'
-            if kind
-            else f"<{tag}>{escape(text)}</{tag}>"
-            for kind, text in zip(classes, texts, strict=True)
-        )
+        listed = "# Rapid gyroscope calibration: all reports\n\n" + "\n".join(lines) + "\n"
+        self._write(self._all, to_html(listed, self._all.parent))
 
-    head = row("th", list(table.columns.map(str)))
-    body = "\n".join(f"<tr>{row('td', texts)}</tr>" for texts in _texts(table))
-    return f"<table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody>\n</table>"
+    @staticmethod
+    def _write(path: Path, text: str) -> None:
+        with replacing(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+
+    def _exists(self) -> bool:
+        return self._path.is_file() and self._path.with_suffix(".md").is_file()
+
+    def _describe(self) -> dict[str, Any]:
+        return {"filepath": str(self._path)}
+
+
+def to_html(markdown: str, folder: Path) -> str:
+    """A page that needs no other file.
+
+    HTML in the text is shown as it is written, never taken for markup.
+
+    Args:
+        markdown: The text. It begins with a heading, the title of the page.
+        folder: Where pictures are looked for.
+
+    Raises:
+        DatasetError: A picture is not there.
+    """
+    parser = MarkdownIt("commonmark", {"html": False}).enable("table")
+    parser.add_render_rule("image", _embedded)
+    parser.add_render_rule("table_open", lambda *_: '<div class="wide" tabindex="0">\n<table>\n')
+    parser.add_render_rule("table_close", lambda *_: "</table>\n</div>\n")
+    tokens = parser.parse(markdown)
+    headings = [
+        (opening, text.content)
+        for opening, text in zip(tokens, tokens[1:], strict=False)
+        if opening.type == "heading_open"
+    ]
+    for opening, text in headings:
+        opening.attrSet("id", re.sub(r"\W+", "-", text.lower()).strip("-"))
+    body = parser.renderer.render(tokens, parser.options, {"folder": folder})
+    contents = [(opening.attrGet("id"), text) for opening, text in headings if opening.tag == "h2"]
+    environment = Environment(
+        loader=PackageLoader("gyro_pipeline", "datasets"), autoescape=True, trim_blocks=True
+    )
+    title = re.sub(r"\\(?=\W)", "", headings[0][1]) if headings else "Report"
+    page = environment.get_template("page.html.j2")
+    return page.render(title=title, body=body, contents=contents)
+
+
+def _embedded(
+    renderer: RendererHTML,
+    tokens: Sequence[Token],
+    place: int,
+    options: Any,
+    env: MutableMapping[str, Any],
+) -> str:
+    """A picture as an address that holds it."""
+    name, words = unquote(str(tokens[place].attrGet("src"))), tokens[place].content
+    path = Path(env["folder"]) / name
+    if ":" in name or not path.is_file():
+        raise DatasetError(f"{path}: no such picture")
+    content = base64.b64encode(path.read_bytes()).decode("ascii")
+    return f'<img src="data:image/png;base64,{content}" alt="Figure: {escape(words)}">'
 
 
 def to_latex(table: pd.DataFrame) -> str:
@@ -209,15 +245,15 @@ def to_latex(table: pd.DataFrame) -> str:
     Returns:
         A ``tabular`` with the rules of the package ``booktabs``, for a plain article. Long texts
         are broken into lines.
-
-    Raises:
-        InputError: A character that a plain article cannot set.
     """
-    rows = [list(table.columns.map(str)), *_texts(table)]
+    rows = [list(table.columns.map(str))]
+    rows += [[plain(value) for value in row] for row in table.itertuples(index=False, name=None)]
     long = [max(map(len, column)) > _LONGEST for column in zip(*rows, strict=True)]
     alignment = "".join(
         _BROKEN if broken else "r" if right else "l"
-        for broken, right in zip(long, _numeric(table), strict=True)
+        for broken, right in zip(
+            long, [pd.api.types.is_numeric_dtype(dtype) for dtype in table.dtypes], strict=True
+        )
     )
     head, *body = [" & ".join(_latex(cell) for cell in row) + r" \\" for row in rows]
     begin = rf"\begin{{tabular}}{{{alignment}}}"
@@ -225,35 +261,15 @@ def to_latex(table: pd.DataFrame) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _texts(table: pd.DataFrame) -> list[list[str]]:
-    return [[_text(value) for value in row] for row in table.itertuples(index=False, name=None)]
-
-
-def _text(value: Any) -> str:
-    if pd.isna(value):
-        return "–"
-    if not isinstance(value, float):
-        return str(value)
-    return f"{value:.4g}" if abs(value) < _WITHOUT_EXPONENT else f"{value:.0f}"
-
-
 def _latex(text: str) -> str:
-    escaped = text.translate(_LATEX)
-    if not escaped.isascii():
-        unknown = sorted({character for character in escaped if not character.isascii()})
-        raise InputError(f"{text!r}: no LaTeX form is known for {unknown}; write it in ASCII")
-    return escaped
+    letters = (
+        unicodedata.normalize("NFKD", character)[0] if character.isalpha() else character
+        for character in text
+        if not unicodedata.combining(character)
+    )
+    known = (c if c.isascii() or ord(c) in _LATEX else "?" for c in letters)
+    return "".join(known).translate(_LATEX)
 
 
-def _numeric(table: pd.DataFrame) -> list[bool]:
-    return [pd.api.types.is_numeric_dtype(dtype) for dtype in table.dtypes]
-
-
-def _with_suffixes(filepath: str, *suffixes: str) -> list[Path]:
-    # not Path.with_suffix, which would cut a name such as "window_0.5s"
-    return [Path(filepath + suffix) for suffix in suffixes]
-
-
-def _remove(*paths: Path) -> None:
-    for path in paths:
-        path.unlink(missing_ok=True)
+def _no_formula(value: Any) -> Any:
+    return f"'{value}" if isinstance(value, str) and _FORMULA.match(value) else value

@@ -13,10 +13,12 @@ from typing import Any
 
 from kedro.io import AbstractDataset
 
-from gyro_pipeline.conventions import InputError, Missing
+from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.atomic import replacing
 
 Record = dict[str, Any]
+
+_REPAIR = "run the pipeline that makes it again"
 
 _digests: dict[tuple[int, ...], str] = {}
 """Of files by their identity, which a rename keeps: each is read once by a process."""
@@ -27,8 +29,6 @@ class StoredFile(AbstractDataset[Any, Any]):
 
     Args:
         filepath: The file.
-        made_by: The command that makes it. Where it is given and there is no file, ``load``
-            returns it as :class:`Missing`, so that a report can say what it lacks.
         metadata: For other tools, such as Kedro-Viz.
 
     Attributes:
@@ -36,11 +36,8 @@ class StoredFile(AbstractDataset[Any, Any]):
         sources: The stored files that it is made from; likewise.
     """
 
-    def __init__(
-        self, filepath: str, made_by: str | None = None, metadata: dict[str, Any] | None = None
-    ) -> None:
+    def __init__(self, filepath: str, metadata: dict[str, Any] | None = None) -> None:
         self._filepath = Path(filepath)
-        self._made_by = made_by
         self.metadata = metadata
         self.settings: Mapping[str, Any] = {}
         self.sources: Sequence[StoredFile] = ()
@@ -55,9 +52,7 @@ class StoredFile(AbstractDataset[Any, Any]):
             InputError: As the cause of Kedro's ``DatasetError``, a file that is not what was
                 written.
         """
-        if self._made_by and not self._exists():
-            return Missing((self._made_by,))
-        check_content(self._filepath, self._made_by)
+        check_content(self._filepath)
         return self._read(self._filepath)
 
     def save(self, data: Any) -> None:
@@ -86,7 +81,7 @@ class StoredFile(AbstractDataset[Any, Any]):
         """
         problem = _difference(self._filepath, settings)
         if problem and self._exists():
-            raise InputError(f"{problem}; {_advice(self._filepath, self._made_by)}")
+            raise InputError(f"{problem}; {_REPAIR}")
 
     def _read(self, path: Path) -> Any:
         raise NotImplementedError
@@ -118,26 +113,24 @@ class StoredFile(AbstractDataset[Any, Any]):
         return {"filepath": str(self._filepath)}
 
 
-def check_content(path: Path, made_by: str | None = None) -> str:
+def check_content(path: Path) -> str:
     """The digest of a file that is what was written.
 
     Args:
         path: The file.
-        made_by: The command that makes it.
 
     Raises:
-        FileNotFoundError: There is no such file.
-        InputError: It was changed since, is damaged, or has no record.
+        InputError: It is not there, was changed since, is damaged, or has no record.
     """
+    if not path.exists():
+        raise InputError(f"{path} is not there; first run what makes it, such as kedro run")
     recorded, digest = record_of(path), digest_of(path)
     if recorded is None or digest != recorded["digest"]:
         recorded = record_of(path)  # a run may have replaced both meanwhile
         digest = digest_of(path)
     if recorded is None or digest != recorded["digest"]:
         what = "has no record of how it was made" if recorded is None else "is damaged or changed"
-        raise InputError(
-            f"{path}: {what}, so it may not be what was written; {_advice(path, made_by)}"
-        )
+        raise InputError(f"{path}: {what}, so it may not be what was written; {_REPAIR}")
     return digest
 
 
@@ -205,10 +198,6 @@ def _at(tree: Any, name: tuple[str, ...]) -> Any:
     for key in name:
         tree = tree.get(key) if isinstance(tree, Mapping) else None
     return tree
-
-
-def _advice(path: Path, made_by: str | None) -> str:
-    return f"type {made_by}" if made_by else "run the pipeline that makes it again"
 
 
 def _record_path(path: Path) -> Path:

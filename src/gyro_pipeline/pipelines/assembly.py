@@ -1,6 +1,8 @@
 """The pipelines that the parameters ask for, put together from the stages: a table of contents."""
 
-from kedro.pipeline import Pipeline
+from collections.abc import Iterable
+
+from kedro.pipeline import Node, Pipeline
 
 from gyro_pipeline.parameters import Parameters
 from gyro_pipeline.pipelines import (
@@ -12,25 +14,24 @@ from gyro_pipeline.pipelines import (
     virtual_gyros,
     windowed_splits,
 )
-from gyro_pipeline.studies import LEAKAGE, used_sensors
+from gyro_pipeline.studies import used_sensors
 
 
 def assemble(parameters: Parameters) -> dict[str, Pipeline]:
     """All pipelines; each study ends by writing its own tables and figures."""
-    sensors = used_sensors(parameters)
-    every_sensor = {
-        study: asked.sensors_among(parameters.sensors)
-        for study, asked in parameters.studies.items()
+    left = used_sensors(parameters)
+    # where nothing is left, a check says so
+    whole = {
+        name: study.sensors_among(parameters.sensors) for name, study in parameters.studies.items()
     }
-    default = [study for study, asked in parameters.studies.items() if asked.default]
-    wanted = parameters.only.sensor
-    pipelines = {
-        study: _runs(parameters, {study: sensors[study]})
-        + reporting.create_pipeline({study: every_sensor[study]}, inspected=[*parameters.sensors])
-        for study in parameters.studies
-        if study != LEAKAGE
-    }
-    known = [sensor for sensor in parameters.sensors if wanted in (None, sensor)]
+    default = [name for name, study in parameters.studies.items() if study.default]
+    shown = left if any(left[name] for name in default) else whole
+    known = [name for name in parameters.sensors if parameters.only.sensor in (None, name)]
+    pipelines = {name: _study(parameters, {name: left[name] or whole[name]}) for name in whole}
+    pipelines["__default__"] = _study(parameters, {name: shown[name] for name in default})
+    pipelines["reporting"] = Pipeline(
+        [node for node in pipelines["__default__"].nodes if not _makes_runs(node)]
+    )
     pipelines["ground_truth"] = sum(
         (_measured(sensor) + ground_truth.create_report(sensor) for sensor in known), Pipeline([])
     )
@@ -38,24 +39,25 @@ def assemble(parameters: Parameters) -> dict[str, Pipeline]:
         (
             _measured(sensor) + virtual_gyros.create_pipeline(sensor)
             for sensor in known
-            if sensor in _virtual_sensors(parameters)
+            if sensor in _virtual_sensors(parameters, parameters.studies)
         ),
         Pipeline([]),
     )
-    published = parameters.published
-    pipelines["reporting"] = reporting.create_pipeline(
-        {study: every_sensor[study] for study in default},
-        sensors=[row.sensor for row in published.specifications],
-        virtual=[row.sensor for row in published.hours if row.virtual],
-        inspected=[*parameters.sensors],
-    )
-    if LEAKAGE in parameters.studies:  # its report is its own, and never without nodes
-        shown = sensors[LEAKAGE] or every_sensor[LEAKAGE]
-        leaks = reporting.create_leakage_pipeline(shown)
-        pipelines[LEAKAGE] = _runs(parameters, {LEAKAGE: sensors[LEAKAGE]}) + leaks
-    runs = _runs(parameters, {study: sensors[study] for study in default})
-    pipelines["__default__"] = runs + pipelines["reporting"]
     return pipelines
+
+
+def _study(parameters: Parameters, studies: dict[str, list[str]]) -> Pipeline:
+    """From raw logs to the report of some studies; nothing where none is left."""
+    sensors = list(dict.fromkeys(sensor for own in studies.values() for sensor in own))
+    if not sensors:
+        return Pipeline([])
+    virtual = _virtual_sensors(parameters, studies)
+    return _runs(parameters, studies) + reporting.create_pipeline(studies, sensors, [*virtual])
+
+
+def _makes_runs(node: Node) -> bool:
+    """Whether a node trains or evaluates."""
+    return any(name.endswith((".training.runs", ".evaluation.runs")) for name in node.outputs)
 
 
 def _runs(parameters: Parameters, studies: dict[str, list[str]]) -> Pipeline:
@@ -77,11 +79,11 @@ def _measured(sensor: str) -> Pipeline:
     return raw_logs.create_pipeline(sensor) + ground_truth.create_pipeline(sensor)
 
 
-def _virtual_sensors(parameters: Parameters) -> set[str]:
-    """Sensors of which some study trains on virtual gyroscopes."""
+def _virtual_sensors(parameters: Parameters, studies: Iterable[str]) -> set[str]:
+    """Sensors of which some of these studies trains on virtual gyroscopes."""
     return {
         sensor
-        for study in parameters.studies.values()
+        for study in (parameters.studies[name] for name in studies)
         for sensor in study.sensors_among(parameters.sensors)
         if any(study.grid_of(sensor).virtual_gyros)
     }

@@ -1,5 +1,5 @@
-"""The paper's tables and figures, from tracked runs alone."""
+"""The report: the paper's tables and figures, from tracked runs and recordings alone."""
 
-from gyro_pipeline.pipelines.reporting.pipeline import create_leakage_pipeline, create_pipeline
+from gyro_pipeline.pipelines.reporting.pipeline import create_pipeline
 
-__all__ = ["create_leakage_pipeline", "create_pipeline"]
+__all__ = ["create_pipeline"]

@@ -1,4 +1,4 @@
-"""The figures of results: one function each, results in, a figure out."""
+"""The figures of results: one function each, with its caption beside it."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,132 +8,316 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from gyro_pipeline.conventions import ALL, FIRST, LEAVE_ONE_DEVICE_OUT, MDPS, PAPER, Missing
-from gyro_pipeline.parameters import Published, PublishedResult
+from gyro_pipeline.conventions import ALL, FIRST, MDPS, PAPER
+from gyro_pipeline.estimators import DEFAULT, ORIENTATION_NOTE
+from gyro_pipeline.parameters import PublishedResult
 from gyro_pipeline.physics.ceiling import best_saving, ceiling_rmse, running_mean_rmse
+from gyro_pipeline.pipelines.reporting.exhibits import (
+    Exhibit,
+    Material,
+    ends,
+    gyroscopes,
+    label,
+    window_words,
+)
+from gyro_pipeline.pipelines.reporting.results import column
 from gyro_pipeline.pipelines.reporting.style import (
     CEILING,
     COLOURS,
     LOOK,
     MARKERS,
     estimator_look,
+    plain_ticks,
+    reach,
     share_legend,
 )
-from gyro_pipeline.pipelines.reporting.tables import measured_elsewhere, source_of
-from gyro_pipeline.studies import CNN, MEAN
+from gyro_pipeline.pipelines.reporting.tables import WAYS, in_full, published_claim
+from gyro_pipeline.studies import CNN, CONSTANT, MEAN
 
-_TITLES = {ALL: "all windows (main result)", FIRST: "first window (the paper's way)"}
 _TICKS_S = (1, 2, 5, 10, 20, 30, 60, 100)
-_SHIFT = 0.11
-"""Points of one window stand side by side: so much apart, relative to the time."""
-
-_LEAST_SPAN = 2.5
-"""Of an axis of errors, largest over smallest."""
-
-_COMMON_SPREAD_MDPS = 10
-"""Turn-on spread that is common for consumer parts."""
-
+_SHIFT = 0.11  # points of one window stand side by side: so much apart, relative to the time
+_LEAST_SPAN = 2.5  # of an axis of errors, largest over smallest
+_COMMON_SPREAD_MDPS = 10  # turn-on spread that is common for consumer parts
 _SPREADS_MDPS = np.geomspace(0.03, 30, 200)
-_SAVINGS_PCT = (-25.0, 100.0)
-"""Savings outside are drawn at the edge, as arrows."""
+_SAVINGS_PCT = (-25.0, 100.0)  # savings outside are drawn at the edge, as arrows
+_GAINS_PCT = (-30.0, 102.0)
+_ON_CURVE = (
+    "Left: all windows, the main result. Right: the first window of each recording, the paper's "
+    "way. The line is the running mean against its length. Filled markers are the networks with "
+    "95 % intervals, hollow ones the error that a published gain would mean on these data, bars "
+    "the ceiling: what is expected of the best estimator under the noise model. Lower is better."
+)
 
 
-def sparkfun_3_real(
-    results: pd.DataFrame, curves: pd.DataFrame, published: Published
-) -> Figure | Missing:
+def forest(material: Material) -> Exhibit | None:
+    """The paper's results beside ours: accuracy gains with intervals, a row for each."""
+    claims = material.claims
+    if not any(material.result(claim, CNN) is not None for claim in claims):
+        return None
+    with LOOK():
+        figure = Figure(figsize=(10.5, 1.9 + 0.42 * len(claims)), layout="constrained")
+        axes = figure.subplots(1, 2, sharey=True)
+        for ax, windows in zip(axes, (ALL, FIRST), strict=True):
+            for place, claim in enumerate(claims):
+                _draw_claim(ax, material, claim, place, windows)
+            ax.axvline(0, color="black", lw=1)
+            ax.set(title=window_words(windows), xlim=_GAINS_PCT, xlabel="accuracy gain A [%]")
+            ax.grid(False, axis="y")
+        names = [f"{material.sensor_name(one.sensor)}, {gyroscopes(one)}" for one in claims]
+        axes[0].set_yticks(range(len(claims)), names)
+        axes[0].set_ylim(len(claims) - 0.5, -0.5)
+        share_legend(figure, axes, columns=5)
+        figure.suptitle(f"Published and ours, windows of 10 s; {material.source_name}")
+    caption = (
+        "A row for each published result. A, the accuracy gain, is how much smaller the error is "
+        "than that of the mean of the same window: 0 is the running mean, 100 no error. Bars are "
+        "95 % intervals over recordings. Beyond the ceiling is what white noise without drift "
+        "does not allow."
+    )
+    return Exhibit("forest", "The paper's ten rows and ours", caption, figure)
+
+
+def _draw_claim(
+    ax: Axes, material: Material, claim: PublishedResult, place: int, windows: str
+) -> None:
+    gain = "accuracy_gain_pct"
+    rows = [
+        (CNN, COLOURS[0], "o", -0.2),
+        (CONSTANT, COLOURS[1], "s", 0.0),
+        (DEFAULT, COLOURS[2], "^", 0.2),
+    ]
+    for name, colour, marker, shift in rows:
+        value, lo, hi = ends(material.result(claim, name), gain, windows)
+        if np.isnan(value):
+            continue
+        shown, outside = np.clip(value, _GAINS_PCT[0] + 2, None), value < _GAINS_PCT[0]
+        ax.errorbar(
+            [shown], [place + shift],
+            xerr=None if outside else reach([value], [lo], [hi]),
+            fmt="<" if outside else marker, color=colour, ms=4.5, capsize=2, lw=1.2,
+            label=label(name),
+        )  # fmt: skip
+    if material.result(claim, CNN) is None:
+        ax.text(2, place, material.status(claim), color="grey", va="center", fontsize=8)
+    limit, lo, hi = ends(material.result(claim, CNN), f"ceiling_{gain}", windows)
+    if not np.isnan(limit):
+        span = (lo, hi) if not np.isnan(lo) else (limit - 0.4, limit + 0.4)
+        ax.fill_betweenx([place - 0.42, place + 0.42], *span, color=CEILING, alpha=0.35, lw=0)
+        ax.plot([limit] * 2, [place - 0.42, place + 0.42], color=CEILING, lw=1.8, label="ceiling")
+    ax.plot(claim.accuracy_gain_pct, place, "D", mfc="none", mec="black", ms=7, label="published")
+
+
+# the paper's figures
+
+
+def sparkfun_3_real(material: Material) -> Exhibit | None:
     """SparkFun, 3 real and virtual gyroscopes (paper, section IV-E, first figure)."""
-    return _augmentation(results, curves, published, "sparkfun", 3)
+    return _augmentation(material, "sparkfun", 3, "IV-E")
 
 
-def sparkfun_12_real(
-    results: pd.DataFrame, curves: pd.DataFrame, published: Published
-) -> Figure | Missing:
+def sparkfun_12_real(material: Material) -> Exhibit | None:
     """SparkFun, 12 real and virtual gyroscopes (paper, section IV-E, second figure)."""
-    return _augmentation(results, curves, published, "sparkfun", 12)
+    return _augmentation(material, "sparkfun", 12, "IV-E")
 
 
-def dot_3_real(
-    results: pd.DataFrame, curves: pd.DataFrame, published: Published
-) -> Figure | Missing:
+def dot_3_real(material: Material) -> Exhibit | None:
     """Movella DOT, 3 real and virtual gyroscopes (paper, section IV-F, first figure)."""
-    return _augmentation(results, curves, published, "dot", 3)
+    return _augmentation(material, "dot", 3, "IV-F")
 
 
-def dot_12_real(
-    results: pd.DataFrame, curves: pd.DataFrame, published: Published
-) -> Figure | Missing:
+def dot_12_real(material: Material) -> Exhibit | None:
     """Movella DOT, 12 real and virtual gyroscopes (paper, section IV-F, second figure)."""
-    return _augmentation(results, curves, published, "dot", 12)
+    return _augmentation(material, "dot", 12, "IV-F")
 
 
-def input_channels(results: pd.DataFrame, curves: pd.DataFrame) -> Figure | Missing:
-    """Method 1, more gyroscopes as input channels, SparkFun (paper, section IV-C, figure)."""
-    title = "sparkfun: Method 1, gyroscopes as input channels"
-    return _on_curve(_of(results, "sparkfun"), curves, [], "real_gyros", title)
+def _augmentation(material: Material, sensor: str, real: int, section: str) -> Exhibit | None:
+    rows = material.of("augmentation", sensor=sensor)
+    rows = rows[(rows.real_gyros == real) | (rows.estimator == MEAN)]
+    claims = material.published.of_networks(sensor, real_gyros=real)
+    title = f"{material.sensor_name(sensor)}: {real} real gyroscopes and virtual ones"
+    name = f"augmentation_{sensor}_{real}_real"
+    return _on_curve(material, rows, claims, "virtual_gyros", (name, title, section))
 
 
-def training_data(
-    results: pd.DataFrame, curves: pd.DataFrame, published: Published
-) -> Figure | Missing:
-    """Method 2, more gyroscopes as training data, SparkFun (paper, section IV-D, first figure)."""
-    claims = published.of_networks("sparkfun", virtual_gyros=0)
-    title = "sparkfun: Method 2, gyroscopes as training data"
-    return _on_curve(_of(results, "sparkfun"), curves, claims, "real_gyros", title)
+def input_channels(material: Material) -> Exhibit | None:
+    """Method 1, more gyroscopes as input channels (paper, section IV-C, figure)."""
+    rows = material.of("input_channels", sensor="sparkfun")
+    title = "Method 1: more gyroscopes as input channels"
+    words = ("input_channels_input_channels", title, "IV-C")
+    return _on_curve(material, rows, [], "real_gyros", words)
 
 
-def gyroscopes_10s(results: pd.DataFrame, published: Published) -> Figure | Missing:
+def training_data(material: Material) -> Exhibit | None:
+    """Method 2, more gyroscopes as training data (paper, section IV-D, first figure)."""
+    rows = material.of("real2real", sensor="sparkfun")
+    claims = material.published.of_networks("sparkfun", virtual_gyros=0)
+    words = ("real2real_training_data", "Method 2: more gyroscopes as training data", "IV-D")
+    return _on_curve(material, rows, claims, "real_gyros", words)
+
+
+def _on_curve(
+    material: Material,
+    rows: pd.DataFrame,
+    claims: Sequence[PublishedResult],
+    by: str,
+    words: tuple[str, str, str],
+) -> Exhibit | None:
+    """Running-mean RMSE against its length, with the networks' points at theirs.
+
+    Args:
+        material: For the curve.
+        rows: Results of one sensor; those that are not there have no point.
+        claims: The paper's results for the same networks.
+        by: What the networks differ in, ``real_gyros`` or ``virtual_gyros``.
+        words: Name, title and the paper's section.
+    """
+    rows = rows[rows.status.isna()]
+    if rows[rows.estimator == CNN].empty:
+        return None
+    name, title, section = words
+    first = rows.iloc[0]
+    curves = material.curves
+    curves = curves[(curves.study == first.study) & (curves.sensor == first.sensor)]
+    with LOOK():
+        figure = Figure(figsize=(9.5, 4.8), layout="constrained")
+        axes = figure.subplots(1, 2, sharey=True)
+        for ax, windows in zip(axes, (ALL, FIRST), strict=True):
+            _draw_panel(ax, rows, curves[curves.windows == windows], windows, claims, by)
+        axes[0].set_ylabel("RMSE against the recording's mean [mdps]")
+        share_legend(figure, axes, columns=3)
+        figure.suptitle(f"{title}; {material.source_name}")
+    return Exhibit(name, title, f"{_ON_CURVE} Paper, section {section}.", figure)
+
+
+def _draw_panel(  # noqa: PLR0917 - what a panel shows
+    ax: Axes,
+    results: pd.DataFrame,
+    curve: pd.DataFrame,
+    windows: str,
+    claims: Sequence[PublishedResult],
+    by: str,
+) -> None:
+    kind = by.removesuffix("_gyros")
+    ax.plot(curve.time_s, curve.rmse_dps / MDPS, color="black", lw=1.2, label="running mean")
+    limits = results[results.estimator == MEAN].sort_values("window_s")
+    bars = limits[column("ceiling_rmse_dps", windows)] / MDPS
+    ax.plot(limits.window_s, bars, "_", color=CEILING, ms=30, mew=2, label="ceiling")
+    networks = results[results.estimator == CNN]
+    sizes = sorted(networks[by].unique())
+    for i, size in enumerate(sizes):
+        rows = networks[networks[by] == size]
+        shift = 1 + _SHIFT * (i - (len(sizes) - 1) / 2)
+        base = column("test_rmse_dps", windows)
+        rmse, lo, hi = (rows[f"{base}{end}"] / MDPS for end in ("", "_lo", "_hi"))
+        ax.errorbar(
+            rows.window_s * shift, rmse, yerr=reach(rmse, lo, hi),
+            fmt=MARKERS[i], color=COLOURS[i], capsize=2.5, ms=5,
+            label=f"network, {size} {kind}, 95 % interval",
+        )  # fmt: skip
+        for claim in [claim for claim in claims if getattr(claim, by) == size][:1]:
+            means = rows[rows.window_s == claim.window_s][column("mean_rmse_dps", windows)] / MDPS
+            ax.plot(
+                [claim.window_s * shift] * len(means), means * (1 - claim.accuracy_gain_pct / 100),
+                MARKERS[i], color=COLOURS[i], ms=9, mfc="none", label=f"published, {size} {kind}",
+            )  # fmt: skip
+    _time_axis(ax, float(curve.time_s.max()))
+    ax.set(yscale="log", title=window_words(windows))
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    ax.yaxis.set_major_formatter("{x:g}")
+    # The curve against the recording's own mean ends at 0, which has no logarithm.
+    ax.set_ylim(0.08, 1.5 * (curve.rmse_dps / MDPS)[curve.time_s >= _TICKS_S[0]].max())
+
+
+def _time_axis(ax: Axes, recording_s: float) -> None:
+    ax.set(
+        xscale="log",
+        xlabel="calibration time [s], points of a window side by side",
+        xlim=(1, 1.02 * recording_s),
+    )
+    ax.set_xticks([t for t in _TICKS_S if t <= recording_s], minor=False)
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.minorticks_off()
+
+
+def gyroscopes_10s(material: Material) -> Exhibit | None:
     """RMSE at 10 s against the number of gyroscopes (paper, section IV-D, second figure)."""
-    claims = published.of_networks("sparkfun", virtual_gyros=0)
-    window_s = claims[0].window_s
-    shown = _of(results, "sparkfun").query("window_s == @window_s")
-    if lacking := tuple(shown.missing.dropna()):
-        return Missing(lacking)
+    claims = material.published.of_networks("sparkfun", virtual_gyros=0)
+    rows = material.made[material.made.study == "real2real"]
+    rows = rows[(rows.sensor == "sparkfun") & (rows.estimator == CNN)]
+    rows = rows[rows.window_s == claims[0].window_s] if claims else rows[:0]
+    if rows.empty:
+        return None
     with LOOK():
         figure = Figure(figsize=(9.5, 4.2), layout="constrained")
         axes = figure.subplots(1, 2, sharey=True)
         for ax, windows in zip(axes, (ALL, FIRST), strict=True):
-            _draw_bars(ax, shown, claims, windows)
+            _draw_bars(ax, rows.sort_values("real_gyros"), claims, windows)
         axes[0].set_ylabel("RMSE against the recording's mean [mdps]")
         share_legend(figure, axes, columns=4)
-        figure.suptitle(
-            f"sparkfun: Method 2, {window_s:g} s of calibration; {source_of(shown.iloc[0])}"
-        )
-    return figure
+        title = "Method 2: error at 10 s against the number of gyroscopes"
+        figure.suptitle(f"{title}; {material.source_name}")
+    caption = "Left: all windows, the main result. Right: the paper's way. Lower is better."
+    caption += " Paper, section IV-D."
+    return Exhibit("real2real_gyroscopes_10s", title, caption, figure)
 
 
-def saving_against_turn_on_spread(
-    results: pd.DataFrame, elsewhere: pd.DataFrame, published: Published
-) -> Figure | Missing:
+def _draw_bars(
+    ax: Axes, networks: pd.DataFrame, claims: Sequence[PublishedResult], windows: str
+) -> None:
+    places, base = np.arange(len(networks)), column("test_rmse_dps", windows)
+    rmse, lo, hi = (networks[f"{base}{end}"] / MDPS for end in ("", "_lo", "_hi"))
+    bars: dict[str, Any] = {"yerr": reach(rmse, lo, hi), "color": COLOURS[0], "capsize": 3}
+    ax.bar(places, rmse, 0.6, label="network, 95 % interval", **bars)
+    mean = float(networks[column("mean_rmse_dps", windows)].iloc[0]) / MDPS
+    ax.axhline(mean, color="black", lw=1.5, label="model-based: running mean")
+    limit = float(networks[column("ceiling_rmse_dps", windows)].iloc[0]) / MDPS
+    ax.axhline(limit, color=CEILING, ls="--", lw=1.5, label="ceiling")
+    gains = {claim.real_gyros: claim.accuracy_gain_pct for claim in claims}
+    known = [i for i, gyros in enumerate(networks.real_gyros) if gyros in gains]
+    stated = [mean * (1 - gains[networks.real_gyros.iloc[i]] / 100) for i in known]
+    ax.plot(known, stated, "D", color=COLOURS[1], ms=9, mfc="none", mew=1.8, label="published")
+    ax.set_xticks(places, networks.real_gyros.astype(str).tolist())
+    ax.set(xlabel="gyroscopes in the training set", title=window_words(windows))
+    ax.set_axisbelow(True)
+    ax.grid(False, axis="x")
+
+
+# what can be saved
+
+
+def saving_against_turn_on_spread(material: Material) -> Exhibit | None:
     """What can be saved at 10 s against the turn-on spread, and what the networks save.
 
     A sensor's curve is the ceiling with its N and T and one spread on all axes. A network stands
     at the spread that gives its own ceiling: the sensor's, where its axes have one.
-
-    Args:
-        results: Networks on real recordings.
-        elsewhere: On measured data of other sources.
-        published: For the paper's savings and the number of gyroscopes they are for.
     """
-    claims = published.of_table("generalization")
-    window_s = claims[0].window_s
-    shown = results[(results.window_s == window_s) & (results.estimator == CNN)]
-    if lacking := tuple(shown.missing.dropna()):
-        return Missing(lacking)
+    rows = material.made[(material.made.study == "real2real") & (material.made.estimator == CNN)]
+    claims = material.published.of_table("generalization")
+    rows = rows[rows.window_s.isin([claim.window_s for claim in claims])]
+    claims = [claim for claim in claims if (rows.sensor == claim.sensor).any()]
+    if not claims:
+        return None
     with LOOK():
-        figure = Figure(figsize=(9.5, 7.2), layout="constrained")
-        axes = figure.subplots(2, 2, sharex=True, sharey=True).ravel()
-        for ax, claim in zip(axes, claims, strict=True):
-            own = shown[shown.sensor == claim.sensor].sort_values("real_gyros")
-            _draw_savings(ax, own, measured_elsewhere(elsewhere, claim), claim)
-        for ax in axes[::2]:
+        high = -(-len(claims) // 2)
+        figure = Figure(figsize=(9.5, 1.2 + 3 * high), layout="constrained")
+        axes = figure.subplots(high, min(2, len(claims)), sharex=True, sharey=True, squeeze=False)
+        for ax, claim in zip(axes.ravel(), claims, strict=False):
+            _draw_savings(ax, rows[rows.sensor == claim.sensor].sort_values("real_gyros"), claim)
+        for ax in axes[:, 0]:
             ax.set_ylabel("time saving S, all windows [%]")
-        for ax in axes[2:]:
+        for ax in axes[-1]:
             ax.set_xlabel("turn-on spread τ [mdps], points of a sensor side by side")
-        share_legend(figure, axes, columns=3)
-        figure.suptitle(f"What {window_s:g} s can save; {source_of(shown.iloc[0])}")
-    return figure
+        share_legend(figure, axes.ravel(), columns=3)
+        figure.suptitle(f"What 10 s can save; {material.source_name}")
+    caption = (
+        "The turn-on spread τ is what the bias changes from one power-on to the next; it decides "
+        "how much can be gained. The line is the ceiling of a sensor with that spread under white "
+        "noise without drift, markers are what the networks save, with 95 % intervals."
+    )
+    name = "real2real_saving_against_turn_on_spread"
+    return Exhibit(name, "What can be saved, against the turn-on spread", caption, figure)
 
 
 def equal_spread(row: pd.Series, bound: str = "") -> float:
@@ -167,262 +351,138 @@ def _best_saving_pct(row: pd.Series, spreads_dps: NDArray[np.float64]) -> NDArra
     return 100 * best_saving(rho, row.window_s / row.recording_s)
 
 
-def estimators(results: pd.DataFrame, elsewhere: pd.DataFrame, sensor: str) -> Figure | Missing:
-    """RMSE of all estimators against the window length.
+def _draw_savings(ax: Axes, own: pd.DataFrame, claim: PublishedResult) -> None:
+    curve = _best_saving_pct(own.iloc[0], _SPREADS_MDPS * MDPS)
+    ax.plot(_SPREADS_MDPS, curve, color=CEILING, lw=1.5, label="ceiling")
+    ax.axhline(claim.time_saving_pct, color="black", ls=":", label="the paper's saving")
+    common = f"common for consumer parts: {_COMMON_SPREAD_MDPS} mdps"
+    ax.axvline(_COMMON_SPREAD_MDPS, color="grey", ls="--", lw=1, label=common)
+    for i, (_, row) in enumerate(own.iterrows()):
+        shift = 1 + 0.14 * (i - (len(own) - 1) / 2)
+        _draw_saving(ax, row, shift, COLOURS[i], MARKERS[i])
+    ax.set(xscale="log", xlim=(_SPREADS_MDPS[0], _SPREADS_MDPS[-1]), ylim=_SAVINGS_PCT)
+    ax.set_title(f"{claim.sensor}; the paper's with {claim.real_gyros} gyroscopes")
+    ax.xaxis.set_major_formatter("{x:g}")
 
-    Args:
-        results: From ``pool_results``.
-        elsewhere: From ``pool_measured_elsewhere``.
-        sensor: Whose.
 
-    Returns:
-        A row of panels for each source of the recordings.
-    """
-    own = _of(results, sensor)
-    if lacking := tuple(own.missing.dropna()):
-        return Missing(lacking)
-    sources = [own, *(rows for _, rows in _of(elsewhere, sensor).groupby("source"))]
+def _draw_saving(ax: Axes, row: pd.Series, shift: float, colour: str, marker: str) -> None:
+    spreads = np.array([equal_spread(row, bound) for bound in ("", "_hi", "_lo")]) / MDPS
+    x = np.clip(spreads * shift, _SPREADS_MDPS[0], _SPREADS_MDPS[-1])
+    saving, lo, hi = (
+        float(np.clip(value, *_SAVINGS_PCT)) for value in ends(row, "time_saving_pct", ALL)
+    )
+    outside = {_SAVINGS_PCT[0]: "v", _SAVINGS_PCT[1]: "^"}
+    ax.errorbar(
+        x[0], saving, yerr=reach([saving], [lo], [hi]), xerr=reach(x[:1], x[1:2], x[2:]),
+        fmt=outside.get(saving, marker), color=colour, capsize=2.5, ms=5, clip_on=False,
+        label=f"network, {row.real_gyros} real, 95 % interval",
+    )  # fmt: skip
+
+
+# estimators
+
+
+def estimators(material: Material, study: str, sensor: str) -> Exhibit | None:
+    """RMSE of all estimators of a study against the window length, with the ceiling."""
+    rows = material.made[(material.made.study == study) & (material.made.sensor == sensor)]
+    if rows.empty:
+        return None
     with LOOK():
-        figure = Figure(figsize=(10, 1.6 + 4 * len(sources)), layout="constrained")
-        axes = figure.subplots(len(sources), 2, squeeze=False)
-        for (left, right), rows in zip(axes, sources, strict=True):
-            _draw_estimators(left, right, rows)
-        share_legend(figure, axes.ravel(), columns=4)
-        unseen = own.protocol.iloc[0] == LEAVE_ONE_DEVICE_OUT
-        whose = f"{sensor}, unseen devices" if unseen else sensor
-        figure.suptitle(f"{whose}: error against window length, all windows")
-    return figure
+        figure = Figure(figsize=(10, 5.6), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        _draw_estimators(left, right, rows)
+        share_legend(figure, (left, right), columns=4)
+        title = f"{material.sensor_name(sensor)}, {study.replace('_', ' ')}: error against window"
+        figure.suptitle(f"{title}, all windows; {material.source_name}")
+    caption = (
+        "Left: error over all windows. Right: the same relative to the running mean. Relatives "
+        "share a colour, filled markers are the recommended estimators. The dashed line is the "
+        "ceiling, on measured data an estimate. Lower is better. Estimators in black need no "
+        f"training recordings; each of the others {ORIENTATION_NOTE}."
+    )
+    return Exhibit(f"{study}_{sensor}", title, caption, figure)
 
 
 def _draw_estimators(left: Axes, right: Axes, rows: pd.DataFrame) -> None:
     means = rows[rows.estimator == MEAN].set_index("window_s").sort_index()
-    for place, (name, own) in enumerate(rows.groupby("estimator", sort=False)):
+    names = [in_full(row, rows) for _, row in rows.iterrows()]
+    named = dict(zip(names, rows.estimator, strict=True))
+    for place, (name, estimator) in enumerate(named.items()):
+        own = rows[[one == name for one in names]].drop_duplicates("window_s")
         rmse = own.set_index("window_s").test_rmse_dps_all.sort_index()
-        look = estimator_look(str(name), bool(own.recommended.any()))
-        shift = 1 + 0.015 * (place - rows.estimator.nunique() / 2)
-        for ax, values in ((left, rmse / MDPS), (right, rmse / means.test_rmse_dps_all)):
-            ax.plot(values.index * shift, values, **look)
-    limit = means.ceiling_rmse_dps_all
+        look = estimator_look(estimator, bool(own.recommended.any()))
+        shift = 1 + 0.015 * (place - len(named) / 2)
+        ratio = rmse / means.test_rmse_dps_all.reindex(rmse.index)
+        for ax, values in ((left, rmse / MDPS), (right, ratio)):
+            ax.plot(values.index * shift, values, label=name, **look)
+    limit = means.ceiling_rmse_dps_all.astype(float)
     for ax, values in ((left, limit / MDPS), (right, limit / means.test_rmse_dps_all)):
-        ax.plot(values.index, values, color=CEILING, lw=2, ls="--", label="ceiling")
+        dash = "--" if len(values) > 1 else "_"
+        ax.plot(values.index, values, dash, color=CEILING, lw=2, ms=30, mew=2, label="ceiling")
         ax.set(xscale="log", yscale="log", xlabel="window length [s], points side by side")
         ax.set_xticks(means.index.tolist(), minor=False)
         low, high = ax.get_ylim()
         widen = max(np.sqrt(_LEAST_SPAN * low / high), 1)  # what differs by little must look so
         ax.set_ylim(low / widen, high * widen)
         ax.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
-        for axis in (ax.xaxis, ax.yaxis):
-            axis.set_major_formatter("{x:g}")
-        ax.minorticks_off()
-    title = source_of(rows.iloc[0])
-    left.set(title=title, ylabel="RMSE against the recording's mean [mdps]")
-    right.set(title=title, ylabel="RMSE / RMSE of the running mean")
+        plain_ticks(ax)
+    left.set_ylabel("RMSE against the recording's mean [mdps]")
+    right.set_ylabel("RMSE / RMSE of the running mean")
 
 
-def _of(results: pd.DataFrame, sensor: str) -> pd.DataFrame:
-    return results[results.sensor == sensor]
+# the leak study
 
 
-def _augmentation(
-    results: pd.DataFrame, curves: pd.DataFrame, published: Published, sensor: str, real: int
-) -> Figure | Missing:
-    of_sensor = _of(results, sensor)
-    shown = of_sensor[(of_sensor.real_gyros == real) | (of_sensor.estimator == MEAN)]
-    claims = published.of_networks(sensor, real_gyros=real)
-    title = f"{sensor}: {real} real gyroscopes and virtual ones"
-    return _on_curve(shown, curves, claims, "virtual_gyros", title)
-
-
-def _on_curve(
-    shown: pd.DataFrame,
-    curves: pd.DataFrame,
-    claims: Sequence[PublishedResult],
-    by: str,
-    title: str,
-) -> Figure | Missing:
-    """Running-mean RMSE against its length, with the networks' points at theirs.
-
-    Args:
-        shown: The running mean and the networks of one sensor.
-        curves: The running mean's, of all sensors.
-        claims: The paper's results for the same networks.
-        by: What the networks differ in, ``real_gyros`` or ``virtual_gyros``.
-        title: Without the source.
-    """
-    if lacking := tuple(shown.missing.dropna()):
-        return Missing(lacking)
-    first = shown.iloc[0]
-    curve = _of(curves, first.sensor)
+def leakage_against_stride(material: Material) -> Exhibit | None:
+    """A against the window stride, for the honest split and for each leak."""
+    if material.leaks.empty:
+        return None
+    sensors = list(dict.fromkeys(material.leaks.sensor))
     with LOOK():
-        figure = Figure(figsize=(9.5, 4.8), layout="constrained")
-        axes = figure.subplots(1, 2, sharey=True)
-        for ax, windows in zip(axes, (ALL, FIRST), strict=True):
-            _draw_panel(ax, shown, curve[curve.windows == windows], windows, claims, by)
-        axes[0].set_ylabel("RMSE against the recording's mean [mdps]")
+        figure = Figure(figsize=(9.5, 1.2 + 4.4 * len(sensors)), layout="constrained")
+        axes = figure.subplots(len(sensors), 1, squeeze=False)[:, 0]
+        for ax, sensor in zip(axes, sensors, strict=True):
+            _draw_leaks(ax, material, material.leaks[material.leaks.sensor == sensor])
         share_legend(figure, axes, columns=3)
-        figure.suptitle(f"{title}; {source_of(first)}")
-    return figure
-
-
-def _draw_panel(  # noqa: PLR0917 - what a panel shows
-    ax: Axes,
-    results: pd.DataFrame,
-    curve: pd.DataFrame,
-    windows: str,
-    claims: Sequence[PublishedResult],
-    by: str,
-) -> None:
-    suffix, kind = _suffix(windows), by.removesuffix("_gyros")
-    ax.plot(curve.time_s, curve.rmse_dps / MDPS, color="black", lw=1.2, label="running mean")
-    limits = results[results.estimator == MEAN].sort_values("window_s")
-    ax.plot(
-        limits.window_s,
-        limits.ceiling_rmse_dps / MDPS,
-        **_bar(CEILING),
-        label="ceiling: expected of the best possible",
+    caption = (
+        "Windows that start a whole number of the network's hops apart share most of what it sees. "
+        "Split at random, they are near-duplicates that can be learned by heart."
     )
-    networks = results[results.estimator == CNN]
-    sizes = sorted(networks[by].unique())
-    for i, size in enumerate(sizes):
-        rows = networks[networks[by] == size]
-        shift = 1 + _SHIFT * (i - (len(sizes) - 1) / 2)
-        rmse, lo, hi = (rows[f"test_rmse_dps{suffix}{end}"] / MDPS for end in ("", "_lo", "_hi"))
+    title = "Trained with leaks on purpose: accuracy gain against the window stride"
+    return Exhibit("leakage_accuracy_against_stride", title, caption, figure)
+
+
+def _draw_leaks(ax: Axes, material: Material, results: pd.DataFrame) -> None:
+    first, strides = results.iloc[0], np.sort(results.window_stride_s.unique())
+    styles = [*zip(COLOURS, MARKERS, strict=True)]
+    for i, ((leak, estimator), name) in enumerate(WAYS.items()):
+        rows = results[(results.leak == leak) & (results.estimator == estimator)]
+        rows = rows.sort_values("window_stride_s")
+        gain, lo, hi = (rows[f"accuracy_gain_pct{end}"] for end in ("", "_lo", "_hi"))
         ax.errorbar(
-            rows.window_s * shift,
-            rmse,
-            yerr=_reach(rmse, lo, hi),
-            fmt=MARKERS[i],
-            color=COLOURS[i],
-            capsize=2.5,
-            ms=5,
-            label=f"network, {size} {kind}, 95 % interval",
-        )
-        for claim in [claim for claim in claims if getattr(claim, by) == size][:1]:
-            mean = rows[rows.window_s == claim.window_s][f"mean_rmse_dps{suffix}"] / MDPS
-            ax.plot(
-                claim.window_s * shift,
-                mean * (1 - claim.accuracy_gain_pct / 100),
-                **_hollow(COLOURS[i], MARKERS[i]),
-                label=f"published, {size} {kind}",
-            )
-    _time_axis(ax, float(curve.time_s.max()))
-    ax.set(yscale="log", title=_TITLES[windows])
-    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    ax.yaxis.set_major_formatter("{x:g}")
-    # The curve against the recording's own mean ends at 0, which has no logarithm.
-    ax.set_ylim(0.08, 1.5 * (curve.rmse_dps / MDPS)[curve.time_s >= _TICKS_S[0]].max())
-
-
-def _draw_bars(
-    ax: Axes, shown: pd.DataFrame, claims: Sequence[PublishedResult], windows: str
-) -> None:
-    suffix = _suffix(windows)
-    networks = shown[shown.estimator == CNN].sort_values("real_gyros")
-    places = np.arange(len(networks))
-    rmse, lo, hi = (networks[f"test_rmse_dps{suffix}{end}"] / MDPS for end in ("", "_lo", "_hi"))
-    ax.bar(
-        places,
-        rmse,
-        0.6,
-        yerr=_reach(rmse, lo, hi),
-        color=COLOURS[0],
-        capsize=3,
-        label="network, 95 % interval",
-    )
-    mean = float(networks[f"mean_rmse_dps{suffix}"].iloc[0]) / MDPS
-    ax.axhline(mean, color="black", lw=1.5, label="model-based: running mean")
-    limit = float(networks.ceiling_rmse_dps.iloc[0]) / MDPS
-    ax.axhline(limit, color=CEILING, ls="--", lw=1.5, label="ceiling: expected of the best")
-    gains = {claim.real_gyros: claim.accuracy_gain_pct for claim in claims}
-    known = [i for i, gyros in enumerate(networks.real_gyros) if gyros in gains]
-    stated = [mean * (1 - gains[networks.real_gyros.iloc[i]] / 100) for i in known]
-    ax.plot(known, stated, **_hollow(COLOURS[1], "D"), mew=1.8, label="published")
-    ax.set_xticks(places, networks.real_gyros.astype(str).tolist())
-    ax.set(xlabel="gyroscopes in the training set", title=_TITLES[windows])
-    ax.set_axisbelow(True)
+            np.searchsorted(strides, rows.window_stride_s) + 0.09 * (i - len(WAYS) // 2),
+            gain, yerr=reach(gain, lo, hi), color=styles[i][0], marker=styles[i][1],
+            ls=":" if estimator != CNN else "-", lw=1, ms=5, capsize=2.5, label=name,
+        )  # fmt: skip
+    limit, claim = first.ceiling_accuracy_gain_pct, published_claim(material, first)
+    ax.axhline(limit, color=CEILING, ls="--", label="ceiling")
+    ax.axhline(0, color="black", lw=1, label="running mean")
+    if claim is not None:
+        words = f"published, {claim.real_gyros} gyroscopes"
+        ax.axhline(claim.accuracy_gain_pct, color="black", ls=":", label=words)
+    hops = results.drop_duplicates("window_stride_s").set_index("window_stride_s").hops
+    ax.set_xticks(np.arange(len(strides)), [_stride_label(s, hops[s]) for s in strides])
     ax.grid(False, axis="x")
-
-
-def _draw_savings(
-    ax: Axes, own: pd.DataFrame, others: Sequence[pd.Series], claim: PublishedResult
-) -> None:
-    curve = _best_saving_pct(own.iloc[0], _SPREADS_MDPS * MDPS)
-    ax.plot(_SPREADS_MDPS, curve, color=CEILING, lw=1.5, label="ceiling")
-    ax.axhline(
-        claim.time_saving_pct,
-        color="black",
-        ls=":",
-        label="the paper's saving",
-    )
-    ax.axvline(
-        _COMMON_SPREAD_MDPS, color="grey", ls="--", lw=1, label="common for consumer parts: 10 mdps"
-    )
-    for i, (_, row) in enumerate(own.iterrows()):
-        shift = 1 + 0.14 * (i - (len(own) - 1) / 2)
-        label = f"network, {row.real_gyros} real, 95 % interval"
-        _draw_saving(ax, row, shift, COLOURS[i], MARKERS[i], label)
-    for row in others:
-        split = "k-fold" if row.folds > 1 else "hold-out"
-        label = f"network, {row.real_gyros} real, source {source_of(row)}, {split}"
-        _draw_saving(ax, row, 1, "black", "*", label)
     ax.set(
-        xscale="log",
-        xlim=(_SPREADS_MDPS[0], _SPREADS_MDPS[-1]),
-        ylim=_SAVINGS_PCT,
-        title=f"{claim.sensor}; the paper's with {claim.real_gyros} gyroscopes",
-    )
-    ax.xaxis.set_major_formatter("{x:g}")
-
-
-def _draw_saving(  # noqa: PLR0917 - what a point shows
-    ax: Axes, row: pd.Series, shift: float, colour: str, marker: str, label: str
-) -> None:
-    spreads = np.array([equal_spread(row, bound) for bound in ("", "_hi", "_lo")]) / MDPS
-    x = np.clip(spreads * shift, _SPREADS_MDPS[0], _SPREADS_MDPS[-1])
-    saving, lo, hi = (
-        float(np.clip(row[f"time_saving_pct_{ALL}{end}"], *_SAVINGS_PCT))
-        for end in ("", "_lo", "_hi")
-    )
-    outside = {_SAVINGS_PCT[0]: "v", _SAVINGS_PCT[1]: "^"}
-    ax.errorbar(
-        x[0],
-        saving,
-        yerr=_reach([saving], [lo], [hi]),
-        xerr=_reach(x[:1], x[1:2], x[2:]),
-        fmt=outside.get(saving, marker),
-        color=colour,
-        capsize=2.5,
-        ms=9 if marker == "*" else 5,
-        clip_on=False,
-        label=label,
+        xlabel="window stride [s], ways of one stride side by side",
+        ylabel="accuracy gain A in the test windows [%]",
+        title=f"{first.sensor}, {first.window_s:g} s windows of {first.recordings} recordings; "
+        f"{material.source_name}; 95 % intervals",
     )
 
 
-def _reach(values: ArrayLike, lo: ArrayLike, hi: ArrayLike) -> NDArray[np.float64]:
-    """Lengths of error bars, shape (2, n); a bootstrap interval need not hold its value."""
-    given = np.asarray(values, np.float64)
-    lengths = [given - np.asarray(lo, np.float64), np.asarray(hi, np.float64) - given]
-    return np.maximum(lengths, 0.0)
-
-
-def _suffix(windows: str) -> str:
-    return "" if windows == FIRST else f"_{windows}"
-
-
-def _time_axis(ax: Axes, recording_s: float) -> None:
-    ax.set(
-        xscale="log",
-        xlabel="calibration time [s], points of a window side by side",
-        xlim=(1, 1.02 * recording_s),
-    )
-    ax.set_xticks([t for t in _TICKS_S if t <= recording_s], minor=False)
-    ax.xaxis.set_major_formatter("{x:g}")
-    ax.minorticks_off()
-
-
-def _bar(colour: str) -> dict[str, Any]:
-    return {"color": colour, "marker": "_", "ms": 30, "mew": 2, "ls": ""}
-
-
-def _hollow(colour: str, marker: str) -> dict[str, Any]:
-    return {"color": colour, "marker": marker, "ms": 9, "mfc": "none", "ls": ""}
+def _stride_label(stride_s: float, hops: float) -> str:
+    if np.isnan(hops):
+        return f"{stride_s:g}"
+    whole = abs(hops - round(hops)) < 0.01  # noqa: PLR2004 - so near to a whole number, it is one
+    return f"{stride_s:g}\n{'= ' if whole else ''}{hops:.3g} hop{'s' if hops > 1.01 else ''}"  # noqa: PLR2004

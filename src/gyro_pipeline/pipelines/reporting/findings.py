@@ -1,136 +1,198 @@
 """What follows from the results: sentences computed from them, whatever they are."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
 
 from gyro_pipeline.conventions import ALL, MDPS
-from gyro_pipeline.parameters import Published, PublishedResult, Sensor
-from gyro_pipeline.physics.ceiling import best_gain, pooled
-from gyro_pipeline.pipelines.reporting.results import column, scores_of
+from gyro_pipeline.estimators import DEFAULT
+from gyro_pipeline.parameters import PublishedResult
+from gyro_pipeline.physics.ceiling import best_gain
+from gyro_pipeline.pipelines.reporting.exhibits import Material, label
+from gyro_pipeline.pipelines.reporting.results import column
 from gyro_pipeline.protocol.scores import holm
-from gyro_pipeline.studies import MEAN
-from gyro_pipeline.tracking import FINGERPRINT, StoredRun
+from gyro_pipeline.studies import CNN, CONSTANT, MEAN
 
-_RMSE = column("test_rmse_dps", ALL)
 _GAIN = column("accuracy_gain_pct", ALL)
+_RMSE = column("test_rmse_dps", ALL)
 _CEILING = column("ceiling_rmse_dps", ALL)
 _CEILING_GAIN = column("ceiling_accuracy_gain_pct", ALL)
+
 _SIGNIFICANT = 0.001
 """Of the oracle check after Holm's correction; tests/test_ceiling.py holds the same."""
+
+_TIME_CONSTANTS_S = (5.0, 60.0)
+"""Of the warm-ups whose amplitude is computed."""
 
 _CELL = ["sensor", "window_s"]
 _TRAINED_ON = ["method", "real_gyros", "virtual_gyros"]
 
 
-def compare(networks: pd.DataFrame, sensors: Mapping[str, Sensor]) -> pd.DataFrame:
-    """Networks between the running mean and the ceiling, in mdps.
-
-    Args:
-        networks: Results of networks that were made.
-        sensors: As configured.
-
-    Returns:
-        A row per sensor and window: RMSE over all windows.
-    """
-    rows = []
-    for (sensor, window_s), group in networks.groupby(_CELL, sort=False):
-        rmse = group[_RMSE] / MDPS
-        row = {"Sensor": sensor, "Window s": window_s}
-        row |= {"Running mean": group[column("mean_rmse_dps", ALL)].iloc[0] / MDPS}
-        row |= {"Constant, expected": _constant(group, sensors[str(sensor)]) / MDPS}
-        row |= {"Networks, worst": rmse.max(), "Networks, best": rmse.min()}
-        row |= {"Ceiling": group[_CEILING].iloc[0] / MDPS, "Networks": len(group)}
-        rows.append(row)
-    columns = ["Running mean", "Constant, expected", "Networks, worst", "Networks, best", "Ceiling"]
-    return pd.DataFrame(rows).round(dict.fromkeys(columns, 3))
+def distinct(material: Material) -> pd.DataFrame:
+    """Results that are there, where studies share a training once."""
+    return material.made.drop_duplicates(["estimator", "window_s", "sensor", "fingerprints"])
 
 
-def find(
-    networks: pd.DataFrame,
-    runs: Sequence[StoredRun],
-    published: Published,
-    sensors: Mapping[str, Sensor],
-) -> list[str]:
-    """Say what the results mean, each sentence from the numbers at hand.
-
-    Args:
-        networks: Results of networks that were made, each training once.
-        runs: Those that the results were made from.
-        published: The paper's results.
-        sensors: As configured.
-
-    Returns:
-        One paragraph each, without those for which there is nothing to count.
-    """
-    told = [_beyond_any_ceiling(published.results, sensors)]
-    if not networks.empty:
-        told += [_beyond_this_ceiling(networks, published.results)]
-        for window_s, of_window in networks.groupby("window_s"):
-            told += [_ranked(float(str(window_s)), of_window, sensors)]
-        told += [
-            _more_data(networks, "virtual_gyros", "virtual gyroscopes to the same real ones"),
-            _more_data(networks[networks.method == 2], "real_gyros", "real gyroscopes"),  # noqa: PLR2004
-        ]
-    told += [_oracle_check(runs)]
-    return [paragraph for paragraph in told if paragraph]
+def answer(material: Material) -> list[str]:
+    """The answer in three sentences; fewer where there is less to say."""
+    rows = distinct(material)
+    told = [_networks(rows) or _estimators(rows), _published(material), _explanations(material)]
+    return [sentence for sentence in told if sentence]
 
 
-def _beyond_any_ceiling(published: Sequence[PublishedResult], sensors: Mapping[str, Sensor]) -> str:
-    lengths = {
-        name: sensor.recording_s
-        for name, sensor in sensors.items()
-        if sensor.recording_s is not None
-    }
-    known = [one for one in published if one.sensor in lengths]
-    limits = [100 * best_gain(np.sqrt(one.window_s / lengths[one.sensor])) for one in known]
-    beyond = sum(one.accuracy_gain_pct > a for one, a in zip(known, limits, strict=True))
-    names = dict.fromkeys(one.sensor for one in known)
-    listed = ", ".join(f"{lengths[name]:g} s on {name}" for name in names)
-    return (
-        f"{beyond} of {len(known)} published results exceed the limit A = 1 − √(T0/T), with T = "
-        f"{listed}. It holds for white noise even if the bias is known exactly, and no training "
-        "set can move it."
-    )
+def findings(material: Material) -> list[str]:
+    """What else follows, a sentence each."""
+    rows = distinct(material)
+    networks = rows[rows.estimator == CNN]
+    told = [
+        *(_ranked(float(str(window)), group) for window, group in networks.groupby("window_s")),
+        _matched(material),
+        _more_data(networks, "virtual_gyros", "virtual gyroscopes to the same real ones"),
+        _more_data(networks[networks.method == 2], "real_gyros", "real gyroscopes"),  # noqa: PLR2004
+        _below_ceiling(rows),
+        _oracle_check(rows),
+    ]
+    return [sentence for sentence in told if sentence]
 
 
-def _beyond_this_ceiling(networks: pd.DataFrame, published: Sequence[PublishedResult]) -> str:
-    claims = pd.DataFrame([one.model_dump() for one in published])
-    ours = networks[(networks.method == 2) | (networks.real_gyros == 3)]  # noqa: PLR2004
-    both = claims.merge(ours, on=[*_CELL, "real_gyros", "virtual_gyros"], suffixes=("", "_first"))
-    if both.empty:
+def _networks(rows: pd.DataFrame) -> str:
+    """What the network gains at the shortest window, and what a constant and a filter do."""
+    networks = rows[rows.estimator == CNN]
+    if networks.empty:
         return ""
-    claimed = both.accuracy_gain_pct
-    bound = both[f"{_CEILING_GAIN}_hi"].astype(float).fillna(both[_CEILING_GAIN])
-    inside = (both[f"{_GAIN}_lo"] <= claimed) & (claimed <= both[f"{_GAIN}_hi"])
+    window_s = networks.window_s.min()
+    here = rows[rows.window_s == window_s]
+    parts = [
+        f"Over all windows of {window_s:g} s the paper's network is {_gain(here, CNN)} % more "
+        "accurate than the mean of the window"
+    ]
+    if (here.estimator == CONSTANT).any():
+        parts.append(
+            "a constant, the device's known mean returned without a look at the window, "
+            f"{_gain(here, CONSTANT)} %"
+        )
+    if (here.estimator == DEFAULT).any():
+        parts.append(f"the {label(DEFAULT)} predictor {_gain(here, DEFAULT)} %")
+    parts.append(f"and the ceiling is {_range(here[_CEILING_GAIN].dropna())} %")
+    return f"{', '.join(parts)}."
+
+
+def _gain(rows: pd.DataFrame, estimator: str) -> str:
+    return _range(rows[rows.estimator == estimator][_GAIN])
+
+
+def _estimators(rows: pd.DataFrame) -> str:
+    """Of a study without networks: what its recommended estimators reach."""
+    good = rows[rows.recommended.fillna(False).astype(bool)]
+    good = good if len(good) else rows[rows.estimator != MEAN]
+    if good.empty or _GAIN not in good:
+        return ""
+    window_s = good.window_s.min()
+    best = good[good.window_s == window_s].sort_values(_RMSE).iloc[0]
+    ratio = 1 - best[[_GAIN, f"{_GAIN}_hi", f"{_GAIN}_lo"]].astype(float) / 100
     return (
-        f"{len(both)} published results have a training set that was run here. Beyond the ceiling "
-        f"on these data: {(claimed > bound.round()).sum()}. Within the 95 % interval of ours: "
-        f"{inside.sum()}."
+        f"Over all windows of {window_s:g} s on {best.sensor} the error of {label(best.estimator)} "
+        f"is {ratio.iloc[0]:.2f} times that of the mean [{ratio.iloc[1]:.2f}, "
+        f"{ratio.iloc[2]:.2f}], the smallest of {good.estimator.nunique()} recommended estimators; "
+        f"the ceiling is {1 - best[_CEILING_GAIN] / 100:.2f}."
     )
 
 
-def _ranked(window_s: float, networks: pd.DataFrame, sensors: Mapping[str, Sensor]) -> str:
+def beyond_white_noise(material: Material) -> list[PublishedResult]:
+    """Published results that exceed A = 1 - sqrt(T0/T), with the paper's T."""
+    lengths = {sheet.sensor: sheet.recording_s for sheet in material.published.specifications}
+    return [
+        claim
+        for claim in material.claims
+        if claim.accuracy_gain_pct
+        > 100 * best_gain(np.sqrt(claim.window_s / lengths[claim.sensor]))
+    ]
+
+
+def _published(material: Material) -> str:
+    if not material.claims:
+        return ""
+    beyond = beyond_white_noise(material)
+    return (
+        f"{len(beyond)} of {len(material.claims)} published gains on these sensors "
+        f"{'is' if len(beyond) == 1 else 'are'} beyond "
+        "what white noise without drift allows, A = 1 − √(T0/T), even if the bias is known exactly."
+    )
+
+
+def _explanations(material: Material) -> str:
+    """What would put the published gains within reach, the innocent explanation first."""
+    beyond = beyond_white_noise(material)
+    if not beyond:
+        return ""
+    needed: dict[str, list[float]] = {}
+    for claim in beyond:
+        row = material.result(claim, CNN)
+        if row is not None:
+            amplitudes = [warm_up_needed(row, claim, time_s) for time_s in _TIME_CONSTANTS_S]
+            needed.setdefault(material.sensor_name(claim.sensor), []).extend(amplitudes)
+    sizes = "; ".join(f"{name} {min(a):.2g} to {max(a):.2g}" for name, a in needed.items())
+    amount = f" ({sizes} mdps at power-on, for time constants of 5 to 60 s)" if sizes else ""
+    return (
+        f"Three things would put them within reach: a warm-up{amount}, which a constant could take "
+        "off as well; another truth than the mean of the recording; or a leak between training and "
+        "test. The mean rate against time after power-on, on measured data, tells the first from "
+        "the others."
+    )
+
+
+def warm_up_needed(row: pd.Series, claim: PublishedResult, time_constant_s: float) -> float:
+    """Amplitude of a warm-up that makes a published gain the ceiling, in mdps.
+
+    A warm-up a exp(-t / c) moves the mean of the first t seconds by a c/t (1 - exp(-t / c)). The
+    running mean of the window then errs by the difference of that at T0 and at T as well; whoever
+    knows the device takes it off. So (1 - A)^2 (mean^2 + error^2) = ceiling^2.
+
+    Args:
+        row: Our result, for the ceiling of the sensor without warm-up (first windows).
+        claim: The published one.
+        time_constant_s: c.
+    """
+
+    def moved(time_s: float) -> float:
+        return time_constant_s / time_s * (1 - np.exp(-time_s / time_constant_s))
+
+    ceiling = row.ceiling_rmse_dps / MDPS
+    mean = ceiling / (1 - row.ceiling_accuracy_gain_pct / 100)
+    error2 = (ceiling / (1 - claim.accuracy_gain_pct / 100)) ** 2 - mean**2
+    return float(np.sqrt(max(error2, 0)) / (moved(claim.window_s) - moved(row.recording_s)))
+
+
+def _ranked(window_s: float, networks: pd.DataFrame) -> str:
     better, worse = (networks[f"{_GAIN}_lo"] > 0).sum(), (networks[f"{_GAIN}_hi"] < 0).sum()
-    ratio = networks[_RMSE] / networks[_CEILING]
     told = (
         f"At {window_s:g} s, {better} of {len(networks)} networks are better than the running mean "
         f"with their whole interval and {worse} are worse with it; A is {_range(networks[_GAIN])} "
-        f"%. Their RMSE is {_range(ratio, '.2f')} times the ceiling."
+        f"%. Their RMSE is {_range(networks[_RMSE] / networks[_CEILING], '.2f')} times the ceiling."
     )
-    constants = [
-        _constant(networks[networks.sensor == sensor], sensors[str(sensor)])
-        for sensor in networks.sensor
-    ]
-    known = np.isfinite(constants)
-    if known.any():
-        below = (networks[_RMSE][known] < np.array(constants)[known]).sum()
+    key = f"less_{CONSTANT}_dps"
+    if key in networks and networks[key].notna().any():
+        paired = networks[networks[key].notna()]
+        better, worse = (paired[f"{key}_hi"] < 0).sum(), (paired[f"{key}_lo"] > 0).sum()
         told += (
-            f" {below} of {known.sum()} are better than what is expected of a constant, the "
-            "device's known mean, returned without looking at the window."
+            f" In pairs on the same windows, {better} of {len(paired)} are better than the "
+            f"constant with their whole interval and {worse} worse."
         )
     return told
+
+
+def _matched(material: Material) -> str:
+    """How many published gains are within the intervals of ours."""
+    rows = [(claim, material.result(claim, CNN)) for claim in material.claims]
+    both = [(claim, row) for claim, row in rows if row is not None]
+    if not both:
+        return ""
+    inside = sum(row[f"{_GAIN}_lo"] <= c.accuracy_gain_pct <= row[f"{_GAIN}_hi"] for c, row in both)
+    return (
+        f"{len(both)} published results have a training set that was run here; {inside} of them "
+        "are within the 95 % interval of ours, over all windows."
+    )
 
 
 def _more_data(networks: pd.DataFrame, count: str, what: str) -> str:
@@ -149,41 +211,39 @@ def _more_data(networks: pd.DataFrame, count: str, what: str) -> str:
     )
 
 
-def _oracle_check(runs: Sequence[StoredRun]) -> str:
-    others = [run for run in runs if run.params["estimator"] != MEAN]
-    key = ("beats_oracle_p", ALL, "value")
-    different = {run.tags[FINGERPRINT]: run for run in others}  # studies share some runs
-    scores = {name: scores_of(run) for name, run in different.items()}
-    checked = [of_run[key] for of_run in scores.values() if key in of_run]
-    if not checked:
+def _below_ceiling(rows: pd.DataFrame) -> str:
+    if f"{_GAIN}_lo" not in rows:
         return ""
-    corrected = holm(checked)
+    limits = rows[f"{_CEILING_GAIN}_hi"].astype(float).fillna(rows[_CEILING_GAIN].astype(float))
+    beyond = rows[rows[f"{_GAIN}_lo"] > limits]
+    if beyond.empty:
+        return ""
+    names = ", ".join(
+        f"{label(row.estimator)} on {row.sensor} at {row.window_s:g} s"
+        for _, row in beyond.iterrows()
+    )
+    return (
+        f"Beyond their ceiling with the whole interval: {names}. The ceiling is the linear "
+        "optimum, axis by axis, for exchangeable power-ons; correlated axes, biases that follow "
+        "one another or other noise leave more to gain."
+    )
+
+
+def _oracle_check(rows: pd.DataFrame) -> str:
+    checked = rows[rows.beats_oracle_p.notna() & ~rows.estimator.isin([MEAN, "cnn_best"])]
+    checked = checked.drop_duplicates("fingerprints")
+    if checked.empty:
+        return ""
+    corrected = holm(checked.beats_oracle_p.tolist())
     beaten = int((corrected < _SIGNIFICANT).sum())
     verdict = "No estimator beats" if not beaten else f"DEFECT OF THE EVALUATION: {beaten} beat"
     return (
-        f"{verdict} the best possible estimator on the same windows significantly: the smallest p "
-        f"value of {len(checked)} is {corrected.min():.2g} after Holm's correction."
+        f"{verdict} the oracle, which knows what was drawn, on the same windows significantly: the "
+        f"smallest p value of {len(checked)} is {corrected.min():.2g} after Holm's correction."
     )
 
 
-def _constant(networks: pd.DataFrame, sensor: Sensor) -> float:
-    """RMSE expected of the device's own mean on simulated white noise, else NaN; deg/s.
-
-    The bias of a power-on and the averaging of the truth scatter about it: tau^2 + N^2 / T.
-    """
-    if sensor.simulated is None or sensor.recording_s is None or not networks.simulated.all():
-        return np.nan
-    if sensor.simulated.flicker_mdps:
-        return np.nan
-    tau, noise = (
-        MDPS * np.asarray(values)
-        for values in (sensor.simulated.turn_on_spread_mdps, sensor.simulated.noise_mdps_rts)
-    )
-    return float(pooled(np.sqrt(tau**2 + noise**2 / sensor.recording_s)))
-
-
-def _range(values: pd.Series, form: str = ".0f") -> str:
-    lowest, highest = (
-        f"{value:{form}}".replace("-", "−") for value in (values.min(), values.max())
-    )
+def _range(values: pd.Series | Sequence[float], form: str = ".0f") -> str:
+    series = pd.Series(values, dtype=float)
+    lowest, highest = (f"{v:{form}}".replace("-", "−") for v in (series.min(), series.max()))
     return lowest if lowest == highest else f"{lowest} to {highest}"

@@ -1,206 +1,269 @@
-"""Nodes of the reporting stage: tracked runs to results, and what a report lacks."""
+"""The report of a source: its tables, its figures, and the page that shows them, as Markdown."""
 
-import logging
-from collections.abc import Callable, Iterable
-from functools import wraps
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import pandas as pd
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from matplotlib.figure import Figure
 
-from gyro_pipeline.conventions import InputError, Missing
-from gyro_pipeline.parameters import Evaluation, Only, Splits, Study, Training, VirtualGyros
-from gyro_pipeline.pipelines.reporting.results import (
-    ROW,
-    Finder,
-    Settings,
-    pool,
-    pooled_curve,
-    rows_of,
-    why_unused,
-)
-from gyro_pipeline.studies import LEFT_OUT, RunSpec, planned, run_spec, study_rows
-from gyro_pipeline.tracking import StoredRun
+from gyro_pipeline.conventions import AXES
+from gyro_pipeline.estimators import DEFAULT, ESTIMATORS, estimator_class
+from gyro_pipeline.markup import escape, pipe_table
+from gyro_pipeline.parameters import GroundTruth, Only, Published, Study
+from gyro_pipeline.pipelines.reporting import figures, signals, tables
+from gyro_pipeline.pipelines.reporting.exhibits import PREMISE, Exhibit, Material, label
+from gyro_pipeline.pipelines.reporting.findings import answer, findings
+from gyro_pipeline.pipelines.reporting.results import CNN_BEST, NOT_RUN, ROW
+from gyro_pipeline.studies import CNN, CONSTANT, LEAKAGE, MEAN
 
-logger = logging.getLogger(__name__)
+Tables = Mapping[str, Callable[[], pd.DataFrame]]
+_OF_THE_PAPER = ("augmentation", "real2real", "input_channels")
+"""Studies that the paper has tables or figures of; others have a figure and a table per sensor."""
 
-Reasons = tuple[str, ...]
-
-_CURVES = ["sensor", "windows", "time_s", "rmse_dps"]
-_UNUSED = ["run_id", *RunSpec.names(), "why"]
+_BASE = ("base", "local")
+_COLUMNS = [*ROW, "study", "status", "run_ids", "fingerprints", "env", "simulated"]
+_COLUMNS += ["recommended", "beats_oracle_p"]
+"""Of results, also where none was made."""
 
 
-def pool_results(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
-    study: Study,
+def write_report(
     source: str,
-    windows_s: list[float],
-    seeds: list[int],
-    training: Training,
-    splits: Splits,
-    virtual_gyros: VirtualGyros,
-    evaluation: Evaluation,
-    **stored: Any,
-) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
-    """Pool the study's tracked runs into one row per result.
+    only: Only,
+    published: Published,
+    ground_truth: GroundTruth,
+    studies: dict[str, Any],
+    sensors: dict[str, Any],
+    earlier: Tables,
+    **made: Tables,
+) -> tuple[dict[str, pd.DataFrame], dict[str, Figure], str]:
+    """Make the tables, the figures and the page of a source.
 
     Args:
-        study: Its whole grid, whatever ``only`` says: older runs count as long as their settings
-            are the current ones.
-        source: Only runs on logs from there.
-        windows_s: Calibration times, seconds.
-        seeds: All of them make up a row.
-        training: Hyper-parameters that a run must have been made with.
-        splits: Likewise.
-        virtual_gyros: Likewise.
-        evaluation: Resamples and seed of the intervals.
-        **stored: For each sensor its runs, ``<sensor>_runs``, and the last plan of them,
-            ``<sensor>_plan``, which says what cannot be made.
+        source: Where the logs come from.
+        only: What the run was narrowed to.
+        published: What the paper states.
+        ground_truth: The tolerance that figures show.
+        studies: As configured, to say what was not run.
+        sensors: Likewise.
+        earlier: Pooled results and descriptions of this source that are stored, by
+            ``<study or sensor>/<table>``.
+        **made: Those of this run, by study or sensor.
 
     Returns:
-        Results, a row per estimator, sensor, window and training set, ``missing`` holding the
-        command that makes what is missing (else none); running-mean curves with columns
-        ``sensor, windows, time_s, rmse_dps``; and the finished runs that no result uses, with
-        columns ``run_id``, those of a run's spec, and ``why``.
+        Tables by name, figures by name, and the page as Markdown.
     """
-    runs = [run for name, own in stored.items() if name.endswith("_runs") for run in own]
-    settings = Settings(study, training, splits, virtual_gyros, evaluation)
-    sensors = [name.removesuffix("_runs") for name in stored if name.endswith("_runs")]
-    plans = [
-        part
-        for name, part in stored.items()
-        if name.endswith("_plan") and isinstance(part, pd.DataFrame)
-    ]
-    left_out = _left_out(plans)
-    fingerprints = {spec: key for plan in plans for key, spec in planned(plan).items()}
-    specs = [
-        spec
-        for spec in _specs(study, sensors, source, windows_s, seeds)
-        if run_spec(spec, study.unseen_devices) not in left_out
-    ]
-    results, means = pool(rows_of(specs), runs, settings, fingerprints)
-    used = {run_id for row in results for run_id in (row["run_ids"] or "").split()}
-    unused = [
-        {"run_id": run.run_id, "why": why_unused(run, specs, settings)} | dict(run.params)
-        for run in runs
-        if run.finished and run.run_id not in used
-    ]
-    if unused:
-        logger.info(
-            "%s: %d older runs with other settings or data are in the store and not used",
-            *(study.experiment, len(unused)),
-        )
-    curves = [pd.DataFrame(columns=_CURVES), *map(pooled_curve, means.values())]
-    return (
-        pd.DataFrame(results).assign(protocol=study.protocol),
-        pd.concat(curves[1:] or curves),
-        pd.DataFrame(unused, columns=_UNUSED),
-    )
-
-
-def pool_measured_elsewhere(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
-    study: Study,
-    source: str,
-    windows_s: list[float],
-    seeds: list[int],
-    training: Training,
-    splits: Splits,
-    virtual_gyros: VirtualGyros,
-    evaluation: Evaluation,
-    all_runs: list[StoredRun],
-) -> pd.DataFrame:
-    """Results on measured data of other sources, as far as they are there.
-
-    Args:
-        study: Its grid.
-        source: The report's own, which is left out.
-        windows_s: Calibration times, seconds.
-        seeds: Those of them that were trained make up a row.
-        training: Hyper-parameters that a run must have been made with.
-        splits: Likewise.
-        virtual_gyros: Likewise.
-        evaluation: Resamples and seed of the intervals.
-        all_runs: The study's runs on logs from anywhere.
-
-    Returns:
-        Rows like those of :func:`pool_results`, none of them missing; often no row at all.
-    """
-    runs = [run for run in all_runs if run.tags["simulated"] == "0"]
-    settings = Settings(study, training, splits, virtual_gyros, evaluation)
-    results, run_of = [], Finder(runs, settings)
-    for other in sorted({run.params["source"] for run in runs} - {source}):
-        sensors = study.sensors_among({run.params["sensor"] for run in runs})
-        rows = []
-        for row in rows_of(_specs(study, sensors, other, windows_s, seeds)):
-            made = [spec for spec in row if run_of([spec])]
-            rows += [made] if made and run_of(made) else []
-        results += [row for row in pool(rows, runs, settings)[0] if row["run_ids"]]
-    columns = None if results else [*ROW, "missing", "run_ids"]
-    return pd.DataFrame(results, columns=columns).assign(protocol=study.protocol)
-
-
-def or_missing(make: Callable[..., Any]) -> Callable[..., Any]:
-    """Make a table or figure a node: what it makes, and the commands that make what it lacks.
-
-    Args:
-        make: Returns the table or figure, or :class:`Missing` where it finds no run for a result.
-            It is not called if an input is Missing, a recording that is not there.
-    """
-
-    @wraps(make)
-    def node(*inputs: Any, **named: Any) -> tuple[Any, Reasons]:
-        given = [*inputs, *named.values()]
-        lacking = [reason for one in given if isinstance(one, Missing) for reason in one.reasons]
-        made = Missing(tuple(lacking)) if lacking else make(*inputs, **named)
-        return made, made.reasons if isinstance(made, Missing) else ()
-
-    return node
-
-
-def missing_results(results: pd.DataFrame) -> Reasons:
-    """Commands that make the results of a study that are not there."""
-    return tuple(results.missing.dropna())
-
-
-def refuse_gaps(only: Only, *reasons: Reasons) -> None:
-    """Fail once all that can be written is written, naming the commands that make the rest.
-
-    Args:
-        only: A run that was narrowed on purpose does not fail.
-        *reasons: What each table and figure lacks.
-
-    Raises:
-        InputError: If a run or a recording is missing.
-    """
-    commands = dict.fromkeys(command for missing in reasons for command in missing)
-    if not commands:
-        return
-    if only != Only():
-        logger.info(
-            "narrowed by only: %d results or recordings are not there yet; "
-            "`kedro run --pipeline=reporting` lists them",
-            len(commands),
-        )
-        return
-    raise InputError(
-        f"{len(commands)} results or recordings are not there, or were made with other settings; "
-        "tables and figures that need them were not made. Run (with this report's --env, if it has "
-        "one)\n  " + "\n  ".join(commands)
-    )
-
-
-def _specs(
-    study: Study, sensors: Iterable[str], source: str, windows_s: list[float], seeds: list[int]
-) -> list[RunSpec]:
-    return [
-        spec
-        for sensor in sensors
-        for spec in study_rows(study, sensor, source, windows_s, seeds, Only())
-    ]
-
-
-def _left_out(plans: Iterable[pd.DataFrame]) -> set[RunSpec]:
-    """Runs that cannot be made, by the last plans."""
-    return {
-        RunSpec(**{name: row[name] for name in RunSpec.names()})
-        for plan in plans
-        for row in plan[plan[LEFT_OUT].notna()].to_dict("records")
+    fresh = {f"{name}/{table}": load for name, own in made.items() for table, load in own.items()}
+    material = _material(source, published, dict(earlier) | fresh)
+    exhibits = {
+        "drift": _made([signals.drift(material)]),
+        "forest": _made([figures.forest(material)]),
+        "start_up": _made([tables.start_up(material)]),
+        "tables": _tables(material),
+        "figures": _figures(material, ground_truth),
+        "files": _files(material),
     }
+    shown = [exhibit for part in exhibits.values() for exhibit in part]
+    page = _page().render(
+        exhibits,
+        material=material,
+        source=material.source_name,
+        smoke="smoke" in source,
+        premise=PREMISE,
+        answer=answer(material),
+        findings=findings(material),
+        explained=_explained(material.made.estimator),
+        facts=_facts(material, only, set(made)),
+        missing=_missing(material, only, studies, sensors),
+        runs=_runs(material),
+    )
+    return (
+        {one.name: one.content for one in shown if isinstance(one.content, pd.DataFrame)},
+        {one.name: one.content for one in shown if isinstance(one.content, Figure)},
+        page,
+    )
+
+
+def _material(source: str, published: Published, stored: Tables) -> Material:
+    def gathered(table: str, columns: Sequence[str]) -> pd.DataFrame:
+        parts = [
+            load()
+            for address, load in stored.items()
+            if address.endswith(f"/{table}") and not address.startswith(f"{LEAKAGE}/")
+        ]
+        parts = [part for part in parts if len(part)]
+        return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=[*columns])
+
+    results = gathered("results", _COLUMNS)
+    leaks = stored.get(f"{LEAKAGE}/results", pd.DataFrame)
+    return Material(
+        source=source,
+        published=published,
+        results=results.reindex(columns=results.columns.union(_COLUMNS, sort=False)),
+        curves=gathered("curves", ["study", "sensor"]),
+        leaks=leaks(),
+        sensors=gathered("description", ["sensor"]),
+        quality=gathered("quality", []),
+        signals=gathered("signals", ["sensor", "figure"]),
+    )
+
+
+def _tables(material: Material) -> list[Exhibit]:
+    compared = [tables.ratios(material, study, sensor) for study, sensor in _compared(material)]
+    return _made([
+        tables.three_gyroscopes(material),
+        tables.multiple_gyroscopes(material),
+        tables.generalization(material),
+        *compared,
+        tables.sensor_specifications(material),
+        tables.recording_quality(material),
+        tables.dataset_hours(material),
+        tables.leakage_results(material),
+    ])  # fmt: skip
+
+
+def _figures(material: Material, ground_truth: GroundTruth) -> list[Exhibit]:
+    compared = [
+        figures.estimators(material, study, sensor) for study, sensor in _compared(material)
+    ]
+    return _made([
+        *compared,
+        figures.saving_against_turn_on_spread(material),
+        figures.input_channels(material),
+        figures.training_data(material),
+        figures.gyroscopes_10s(material),
+        figures.sparkfun_3_real(material),
+        figures.sparkfun_12_real(material),
+        figures.dot_3_real(material),
+        figures.dot_12_real(material),
+        signals.allan_deviation(material),
+        signals.running_average(material, ground_truth),
+        signals.calibrated_signal(material),
+        signals.mg_convergence(material, ground_truth),
+        figures.leakage_against_stride(material),
+    ])  # fmt: skip
+
+
+def _files(material: Material) -> list[Exhibit]:
+    """Tables that are too long for the page."""
+    studies = material.results.study.unique().tolist()
+    made = [tables.results_table(material, study) for study in studies]
+    others = dict.fromkeys(study for study, _ in _compared(material))
+    return _made(made + [tables.comparison(material, study) for study in others])
+
+
+def _made(exhibits: Iterable[Exhibit | None]) -> list[Exhibit]:
+    return [exhibit for exhibit in exhibits if exhibit is not None]
+
+
+def _compared(material: Material) -> list[tuple[str, str]]:
+    """Studies that compare estimators, and their sensors."""
+    rows = material.results[~material.results.study.isin(_OF_THE_PAPER)]
+    return list(dict.fromkeys(zip(rows.study, rows.sensor, strict=True)))
+
+
+def _explained(estimators: Iterable[str]) -> list[tuple[str, str]]:
+    """A sentence on each estimator that is shown, those of the first figure first."""
+    first = [MEAN, CNN, CONSTANT, DEFAULT]
+    shown = {*estimators} - {CNN_BEST}
+    names = [name for name in (*first, *ESTIMATORS, *sorted(shown)) if name in shown]
+    return [(label(name), _sentence(name)) for name in dict.fromkeys(names)]
+
+
+def _sentence(name: str) -> str:
+    first = " ".join((estimator_class(name).__doc__ or "No description.").split("\n\n")[0].split())
+    _, options = ESTIMATORS.get(name, (name, {}))
+    words = [
+        f"{key}={value}".removesuffix("=True").replace("_", " ") for key, value in options.items()
+    ]
+    return first + (f" With {', '.join(words)}." if words else "")
+
+
+def _facts(material: Material, only: Only, fresh: set[str]) -> list[tuple[str, str]]:
+    """What was run, in plain words."""
+    rows = material.made
+    facts = {"Data": _data(material)}
+    if len(material.sensors):
+        facts["Recordings"] = "; ".join(
+            f"{material.sensor_name(row.sensor)}: {row.imus} IMUs, "
+            f"{row.all_recordings / len(AXES):.0f} "
+            f"recordings used of {row.median_samples / row.rate_hz:.4g} s"
+            for _, row in material.sensors.iterrows()
+        )
+    if len(rows):
+        networks = rows[rows.estimator == CNN].drop_duplicates("fingerprints")
+        epochs = ", ".join(f"{one:.0f}" for one in sorted(networks.epochs.dropna().unique()))
+        if len(networks):
+            facts["Networks"] = f"{len(networks)}, of {epochs} epochs (the paper: 1200)"
+            facts["Seeds"] = f"{networks.seeds.max():.0f}"
+        facts["Windows"] = ", ".join(f"{one:g}" for one in sorted(rows.window_s.unique())) + " s"
+        facts["Trained"] = f"{rows.started.min()} to {rows.started.max()} UTC"
+        facts["Code"] = "; ".join(sorted(rows.code.unique()))
+        facts["Environment"] = ", ".join(sorted(rows.env.unique()))
+    narrowed = ", ".join(f"{k}={v}" for k, v in only.model_dump(exclude_none=True).items())
+    if narrowed:
+        facts["Narrowed to"] = narrowed
+    old = [study for study in material.results.study.unique() if study not in fresh]
+    if old:
+        facts["From earlier runs"] = ", ".join(old)
+    return [*facts.items()]
+
+
+def _data(material: Material) -> str:
+    if material.simulated:
+        return (
+            f"Simulated recordings (source {material.source}): this program drew the biases and "
+            "the noise, in place of the authors' files. Nothing was measured on a real sensor."
+        )
+    return f"Recordings measured on real sensors (source {material.source})."
+
+
+def _missing(
+    material: Material, only: Only, studies: Mapping[str, Any], sensors: Iterable[str]
+) -> pd.DataFrame:
+    """The fewest commands that make what is not there, and what each makes."""
+    envs = {env for env in material.made.env.dropna() if env not in _BASE}
+    env = f" --env={envs.pop()}" if len(envs) == 1 else ""
+    makes: dict[str, list[str]] = {}
+    for name, given in studies.items():
+        study = Study.model_validate(given)
+        known = [one for one in study.sensors_among(sensors) if only.sensor in (None, one)]
+        rows = material.of(name)
+        lacking = int((rows.status == NOT_RUN).sum())
+        there = len(rows) > 0 or (name == LEAKAGE and len(material.leaks) > 0)
+        if not known or (there and not lacking):
+            continue
+        command = f"kedro run{'' if study.default else f' --pipeline={name}'}{env}"
+        words = f"{lacking} of {len(rows)} results of {name}" if there else f"the study {name}"
+        makes.setdefault(command, []).append(words)
+    rows_of = [{"Command": command, "Makes": ", ".join(words)} for command, words in makes.items()]
+    return pd.DataFrame(rows_of, columns=["Command", "Makes"])
+
+
+def _runs(material: Material) -> list[dict[str, Any]]:
+    """Where the runs of each study are."""
+    return [
+        {
+            "study": study,
+            "results": len(rows),
+            "runs": rows.run_ids.str.split().explode().nunique(),
+            "experiment": str(rows.experiment_id.iloc[0]),
+        }
+        for study, rows in material.made.groupby("study", sort=False)
+    ]
+
+
+def _page() -> Any:
+    environment = Environment(
+        loader=PackageLoader("gyro_pipeline", "pipelines/reporting"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        autoescape=False,  # of HTML: what is rendered is Markdown, escaped by the filter below
+    )
+    environment.filters |= {"md": escape, "pipes": pipe_table}
+    environment.filters["seen"] = lambda exhibit: (
+        exhibit.content if exhibit.shown is None else exhibit.content[[*exhibit.shown]]
+    )
+    environment.tests["table"] = lambda exhibit: isinstance(exhibit.content, pd.DataFrame)
+    return environment.get_template("report.md.j2")

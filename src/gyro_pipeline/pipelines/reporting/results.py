@@ -1,7 +1,9 @@
 """From tracked runs to one row per result: seeds pooled, with intervals."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import logging
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from functools import cache, cached_property
 from itertools import groupby
 from typing import Any
@@ -10,8 +12,8 @@ import numpy as np
 import pandas as pd
 
 from gyro_pipeline.conventions import ALL, BEST, FIRST, LAST, PAPER
-from gyro_pipeline.estimators import DEFAULT, estimator_class
-from gyro_pipeline.parameters import Evaluation, Splits, Study, Training, VirtualGyros
+from gyro_pipeline.estimators import DEFAULT
+from gyro_pipeline.parameters import Only, Study
 from gyro_pipeline.protocol.scores import (
     Estimate,
     SquaredErrors,
@@ -24,120 +26,259 @@ from gyro_pipeline.protocol.scores import (
     score,
     squared_errors,
 )
-from gyro_pipeline.studies import CNN, MEAN, RunSpec, run_params, run_spec
+from gyro_pipeline.studies import CNN, CONSTANT, LEFT_OUT, MEAN, RunSpec, planned, run_spec
+from gyro_pipeline.studies import study_rows as rows_of_study
 from gyro_pipeline.tracking import CURVE, ERRORS, SCORES, StoredRun
+
+logger = logging.getLogger(__name__)
 
 ROW = ["sensor", "source", "estimator", "method", "real_gyros", "virtual_gyros", "window_s"]
 """What names a result."""
 
-CNN_BEST = "cnn_best"
-"""In a comparison of estimators: the paper's network at its best validation epoch."""
+NOT_RUN = "not run"
+"""The status of a result that no finished run has; one that is there has none."""
 
-COVERAGES = ["coverage_1sigma_pct", "coverage_2sigma_pct"]
+CNN_BEST = "cnn_best"
+"""The paper's network at its best validation epoch, where that was stored."""
 
 CEILINGS = ["ceiling_rmse_dps", "ceiling_time_saving_pct", "ceiling_accuracy_gain_pct"]
+OTHERS = ["coverage_1sigma_pct", "coverage_2sigma_pct", "beats_oracle_p"]
+REFERENCES = (MEAN, DEFAULT, CONSTANT)
+"""What every estimator is compared with, in pairs over recordings."""
+
+_CURVES = ["study", "sensor", "windows", "time_s", "rmse_dps"]
+_ENDS = {"": "value", "_lo": "lo", "_hi": "hi"}
 
 
-def column(score_name: str, windows: str = FIRST, bound: str = "") -> str:
-    """Name of a column of results.
-
-    Args:
-        score_name: Such as ``test_rmse_dps``.
-        windows: ``first`` or ``all``; the latter is named.
-        bound: ``lo`` or ``hi`` for an end of the 95 % interval.
-    """
-    return "_".join([score_name, *([ALL] if windows == ALL else []), *([bound] if bound else [])])
+def column(name: str, windows: str = FIRST) -> str:
+    """Name of a column of results; that of first windows is the plain name of the score."""
+    return f"{name}_{ALL}" if windows == ALL else name
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What the runs of a study must have been made with.
-
-    Attributes:
-        study, training, splits, virtual_gyros: The parameters.
-        evaluation: Resamples and seed of the intervals.
-    """
-
-    study: Study
-    training: Training
-    splits: Splits
-    virtual_gyros: VirtualGyros
-    evaluation: Evaluation
-
-    def spec(self, row: RunSpec) -> RunSpec:
-        """The run that makes a row."""
-        return run_spec(row, self.study.unseen_devices)
-
-    def params(self, row: RunSpec) -> dict[str, str]:
-        """Parameters of the run that makes a row, as the store has them, but how many folds."""
-        spec = self.spec(row)
-        made = run_params(spec, self.study, self.training, self.splits, self.virtual_gyros)
-        return {name: str(value) for name, value in made.items() if name != "folds"}
-
-
-def pool(
-    rows: Iterable[Sequence[RunSpec]],
-    runs: Sequence[StoredRun],
-    settings: Settings,
-    fingerprints: Mapping[RunSpec, str] | None = None,
-) -> tuple[list[dict[str, Any]], dict[str, StoredRun]]:
-    """Results of some rows.
+def pool_results(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
+    study: Study,
+    source: str,
+    windows_s: list[float],
+    seeds: list[int],
+    only: Only,
+    **stored: Any,
+) -> dict[str, pd.DataFrame]:
+    """Pool the runs that a study's plans ask for into one row per result.
 
     Args:
-        rows: From :func:`rows_of`; the running mean of a window before others.
-        runs: Finished ones count, newest first.
-        settings: What they must have been made with.
-        fingerprints: Of runs, by the last plans.
+        study: Its grid.
+        source: Where the logs come from.
+        windows_s: Calibration times, seconds.
+        seeds: All of them make up a row.
+        only: What the grid is narrowed to.
+        **stored: For each sensor its plan, ``<sensor>_plan``, and its runs, ``<sensor>_runs``.
 
     Returns:
-        A result for each row, with ``missing``, the command that makes it where its runs are not
-        all there; and a run of the running mean by sensor.
+        ``results``, a row per estimator, sensor, window and training set, with ``status``: none,
+        or why there is no result; and ``curves`` of the running mean, with columns ``study,
+        sensor, windows, time_s, rmse_dps``.
     """
-    evaluation = settings.evaluation
+    sensors = [name.removesuffix("_plan") for name in stored if name.endswith("_plan")]
+    plan = pd.concat([stored[f"{sensor}_plan"] for sensor in sensors])
+    runs = [run for sensor in sensors for run in stored[f"{sensor}_runs"] if run.finished]
+    finder = Finder(plan, runs, study.unseen_devices)
     results: list[dict[str, Any]] = []
-    means: dict[tuple[str, float], RunningMeans] = {}
-    defaults: dict[tuple[str, float], pd.DataFrame] = {}
-    run_of = Finder(runs, settings, fingerprints)
-    of_rows = [(row, run_of(row)) for row in rows]
-    for seeds, found in of_rows:
-        if found and seeds[0].estimator == DEFAULT:
-            defaults[seeds[0].sensor, seeds[0].window_s] = _errors(found)
-    for seeds, stored in of_rows:
-        spec = seeds[0]
-        key = spec.sensor, spec.window_s
-        found = [replace(run, load=cache(run.load)) for run in stored]
-        row = {name: getattr(spec, name) for name in ROW} | {"missing": None, "run_ids": None}
-        if not found or (spec.estimator != MEAN and key not in means):
-            results.append(row | {"missing": command_for(seeds)})
-            continue
-        if spec.estimator == MEAN:
-            means[key] = RunningMeans(found[0], evaluation)
-            row |= mean_row(found[0])
-            if key in defaults:
-                row |= differences(found, {DEFAULT: defaults[key]}, evaluation)
-        else:
-            row |= network_row(found, means[key], spec.window_s)
-            if key in defaults:
-                references = {MEAN: means[key].errors, DEFAULT: defaults[key]}
-                row |= differences(found, references, evaluation)
-        scores = scores_of(found[0])
-        row |= {name: scores.get((name, ALL, "value")) for name in COVERAGES}
-        tags = found[0].tags
-        row["simulated"] = tags["simulated"] == "1"
-        row["recommended"] = tags.get("recommended") == "True"
-        row["uses_prior"] = "uses_prior" in tags
-        row["folds"] = int(found[0].params["folds"])
-        row["run_ids"] = " ".join(run.run_id for run in found)
-        results.append(row)
-        best = [best_epoch(run) for run in found if spec.estimator == CNN]
-        if key in defaults and best and all(len(run.load(ERRORS)) for run in best):
-            figures = network_row(best, means[key], spec.window_s)
-            less = differences(best, references, evaluation)
-            results.append(row | figures | less | {"estimator": CNN_BEST})
-    return results, {sensor: mean.run for (sensor, _), mean in reversed(means.items())}
+    curves = [pd.DataFrame(columns=_CURVES)]
+    for sensor in sensors:
+        specs = rows_of_study(study, sensor, source, windows_s, seeds, only)
+        for window_s in dict.fromkeys(spec.window_s for spec in specs):
+            cell = Cell([spec for spec in specs if spec.window_s == window_s], finder)
+            results += cell.results()
+        curves += [] if cell.mean is None else [pooled_curve(cell.mean)]
+    more = len({run.fingerprint for run in runs} - finder.planned)
+    if more:
+        logger.info(
+            "%s: %d finished runs with other settings or data are in the store and not used",
+            *(study.experiment, more),
+        )
+    made = curves[1:] or curves
+    return {"results": pd.DataFrame(results), "curves": pd.concat(made)}
 
 
-def scores_of(run: StoredRun) -> dict[tuple[str, str, str], float]:
+class Finder:
+    """Finds the finished runs of rows by the fingerprints that the plans give them.
+
+    Args:
+        plan: Of all sensors.
+        runs: Finished ones, newest first.
+        unseen_devices: Whether the tested devices are unseen ones.
+    """
+
+    def __init__(self, plan: pd.DataFrame, runs: Sequence[StoredRun], unseen_devices: bool) -> None:
+        self._keys = {spec: key for key, spec in planned(plan).items()}
+        self._left_out = {
+            RunSpec(**{name: row[name] for name in RunSpec.names()}): str(row[LEFT_OUT])
+            for row in plan[plan[LEFT_OUT].notna()].to_dict("records")
+        }
+        self._runs = {run.fingerprint: replace(run, load=cache(run.load)) for run in reversed(runs)}
+        self._unseen_devices = unseen_devices
+
+    @property
+    def planned(self) -> set[str]:
+        """Fingerprints of the runs that the plans ask for."""
+        return set(self._keys.values())
+
+    def __call__(self, row: Iterable[RunSpec]) -> tuple[list[StoredRun], str]:
+        """The runs of all seeds of a row, or none and the reason."""
+        specs = dict.fromkeys(run_spec(spec, self._unseen_devices) for spec in row)
+        reasons = [self._left_out[spec] for spec in specs if self._left_out.get(spec)]
+        found = [self._runs.get(self._keys.get(spec, "")) for spec in specs]
+        runs = [run for run in found if run is not None]
+        return (runs, "") if len(runs) == len(specs) else ([], reasons[0] if reasons else NOT_RUN)
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """The results of one sensor and window, which all stand beside one running mean.
+
+    Attributes:
+        specs: Its rows, a spec for every seed.
+        find: Gives the runs of a row.
+    """
+
+    specs: Sequence[RunSpec]
+    find: Finder
+
+    @cached_property
+    def _rows(self) -> list[tuple[list[RunSpec], list[StoredRun], str]]:
+        key = lambda spec: tuple(getattr(spec, name) for name in ROW)  # noqa: E731
+        groups = [list(group) for _, group in groupby(self.specs, key)]
+        return [(group, *self.find(group)) for group in groups]
+
+    @cached_property
+    def mean(self) -> StoredRun | None:
+        """The run of the running mean; None where there is none."""
+        means = [runs[0] for specs, runs, _ in self._rows if runs and specs[0].estimator == MEAN]
+        return means[0] if means else None
+
+    @cached_property
+    def _references(self) -> dict[str, pd.DataFrame]:
+        return {
+            name: errors_of(runs)
+            for name in REFERENCES
+            for specs, runs, _ in self._rows
+            if runs and specs[0].estimator == name
+        }
+
+    @cached_property
+    def _weights(self) -> np.ndarray:
+        """Of recordings, or devices, with each left out in turn."""
+        return leave_one_out(clusters(self._references[MEAN]).nunique())
+
+    @cached_property
+    def _squares(self) -> dict[str, SquaredErrors]:
+        """Squared errors of the running mean for all and for first windows."""
+        errors = self._references[MEAN]
+        return {windows: squared_errors(errors, PAPER, windows) for windows in (ALL, FIRST)}
+
+    @cached_property
+    def _curves(self) -> dict[str, WeightedCurve]:
+        """Its RMSE against its length, likewise."""
+        assert self.mean is not None
+        table = self.mean.load(CURVE)
+        curves = {windows: curve_errors(table, PAPER, windows) for windows in (ALL, FIRST)}
+        return {windows: curve.of(self._weights) for windows, curve in curves.items()}
+
+    def results(self) -> list[dict[str, Any]]:
+        """One for each row; without the running mean there is none to compare with."""
+        results = []
+        for specs, runs, problem in self._rows:
+            name = {key: getattr(specs[0], key) for key in ("study", "protocol", *ROW)}
+            if not runs or self.mean is None:
+                results.append(name | {"status": problem or NOT_RUN, "run_ids": None})
+                continue
+            results.append(name | self._result(specs[0], runs))
+            best = [best_epoch(run) for run in runs if specs[0].estimator == CNN]
+            if best and all(len(run.load(ERRORS)) for run in best):
+                results.append(
+                    results[-1] | self._figures(best, specs[0].window_s) | {"estimator": CNN_BEST}
+                )
+        return results
+
+    def _result(self, spec: RunSpec, runs: Sequence[StoredRun]) -> dict[str, Any]:
+        assert self.mean is not None
+        tags, scores = runs[0].tags, scores_of(runs[0])
+        row = mean_row(self.mean)
+        if spec.estimator != MEAN:
+            row |= self._figures(runs, spec.window_s)
+        elif DEFAULT in self._references:
+            row |= self._differences(runs)
+        return row | {
+            **{name: scores.get((name, ALL, "value")) for name in OTHERS},
+            "simulated": tags["simulated"] == "1",
+            "recommended": tags.get("recommended") == "True",
+            "uses_prior": "uses_prior" in tags,
+            "folds": int(runs[0].params["folds"]),
+            "status": None,
+            "run_ids": " ".join(run.run_id for run in runs),
+            "fingerprints": " ".join(sorted(run.fingerprint for run in runs)),
+            **_provenance(runs),
+        }
+
+    def _figures(self, runs: Sequence[StoredRun], window_s: float) -> dict[str, Any]:
+        """Figures of merit of all seeds pooled, with intervals over recordings.
+
+        Squared errors are averaged over seeds; ``_seed_sd`` is the standard deviation over the
+        seeds' own figures, and None for one seed.
+        """
+        errors = [errors_of([run]) for run in runs]
+        tested = self._references[MEAN].reindex(columns=["imu", "recording"], fill_value=0)
+        row: dict[str, Any] = {"seeds": len(errors), "recordings": len(tested.drop_duplicates())}
+        for windows in (ALL, FIRST):
+            pooled = self._scores(pd.concat(errors), windows, window_s)
+            single = [self._scores(table, windows, window_s) for table in errors[1:] and errors]
+            for base, estimate in pooled.items():
+                name = column(base, windows)
+                row |= {name + end: getattr(estimate, key) for end, key in _ENDS.items()}
+                values = [scores[base].value for scores in single]
+                spread = np.std(values, ddof=1) if values and np.isfinite(values).all() else None
+                row[f"{name}_seed_sd"] = spread
+        return row | self._differences(runs)
+
+    def _scores(self, errors: pd.DataFrame, windows: str, window_s: float) -> dict[str, Estimate]:
+        own, reference = squared_errors(errors, PAPER, windows), self._squares[windows]
+        return score(own, reference, self._curves[windows], window_s, self._weights)
+
+    def _differences(self, runs: Sequence[StoredRun]) -> dict[str, Any]:
+        """Errors less those of the references on all the same windows, paired over recordings.
+
+        ``less_<name>_dps`` is a difference of RMSEs against the mean of the recording;
+        ``less_<name>_dps2_<truth>`` one of mean squares against the other truths, whose own noise
+        may leave none to take the root of.
+        """
+        table = errors_of(runs)
+        row: dict[str, Any] = {}
+        for truth in table.truth.unique():
+            own = squared_errors(table, truth, ALL)
+            for name, errors in self._references.items():
+                compare = rmse_difference if truth == PAPER else paired_difference
+                less = compare(own, squared_errors(errors, truth, ALL), self._weights)
+                key = f"less_{name}_dps" + ("" if truth == PAPER else f"2_{truth}")
+                row |= {key + end: getattr(less, part) for end, part in _ENDS.items()}
+        return row
+
+
+def _provenance(runs: Sequence[StoredRun]) -> dict[str, Any]:
+    """Where, when and with which code runs were made; a commit says little if files had changed."""
+    tags, newest = runs[0].tags, max(run.started_ms for run in runs)
+    commit = tags.get("mlflow.source.git.commit", "")[:12] or "unknown"
+    changed = " with uncommitted changes" if tags.get("git_dirty") == "True" else ""
+    versions = f"gyro-pipeline {tags.get('gyro-pipeline')}, torch {tags.get('torch')}"
+    return {
+        "experiment_id": runs[0].experiment_id,
+        "env": tags.get("kedro_env"),
+        "started": f"{datetime.fromtimestamp(newest / 1000, UTC):%Y-%m-%d %H:%M}",
+        "code": f"commit {commit}{changed}, {versions}",
+        "epochs": runs[0].params.get("epochs"),
+    }
+
+
+def scores_of(run: StoredRun) -> Mapping[tuple[str, str, str], float]:
     """Scores of a run at the last epoch against the paper's truth.
 
     Returns:
@@ -148,9 +289,20 @@ def scores_of(run: StoredRun) -> dict[tuple[str, str, str], float]:
     return {
         (row.score, row.windows, end): float(getattr(row, end))
         for row in table.itertuples()
-        for end in ("value", "lo", "hi")
+        for end in _ENDS.values()
         if pd.notna(getattr(row, end))
     }
+
+
+def mean_row(mean: StoredRun) -> dict[str, Any]:
+    """Errors and ceilings of a window from the run of its running mean."""
+    row: dict[str, Any] = {"recording_s": float(mean.load(CURVE).time_s.max())}
+    scores = scores_of(mean)
+    for windows in (ALL, FIRST):
+        for name in ["test_rmse_dps", *CEILINGS]:
+            for end, key in _ENDS.items():
+                row[column(name, windows) + end] = scores.get((name, windows, key))
+    return row
 
 
 def best_epoch(run: StoredRun) -> StoredRun:
@@ -160,211 +312,10 @@ def best_epoch(run: StoredRun) -> StoredRun:
     return replace(run, load={ERRORS: errors}.__getitem__)
 
 
-def command_for(row: Sequence[RunSpec]) -> str:
-    """The command that makes the runs of a row."""
-    spec = row[0]
-    only = {"sensor": spec.sensor, "window_s": f"{spec.window_s:g}"}
-    if estimator_class(spec.estimator).uses in ("real", "all"):
-        only |= {"real_gyros": str(spec.real_gyros), "virtual_gyros": str(spec.virtual_gyros)}
-    if len(row) == 1 and estimator_class(spec.estimator).seeded:
-        only["seed"] = str(spec.seed)
-    params = ",".join(f"only.{key}={value}" for key, value in only.items())
-    return f"kedro run --pipeline={spec.study} --params={params}"
-
-
-def rows_of(specs: Sequence[RunSpec]) -> Iterator[list[RunSpec]]:
-    """Specs that differ only in their seed: one row."""
-    key = lambda spec: tuple(getattr(spec, name) for name in ROW)  # noqa: E731
-    for _, group in groupby(specs, key):
-        yield list(group)
-
-
-class Finder:
-    """Finds the finished runs that make rows: by their fingerprints, where a plan has them.
-
-    Rows that the last plan left out, as a run was narrowed, are made by the newest runs with the
-    parameters of today.
-
-    Args:
-        runs: Finished ones count, newest first.
-        settings: What they must have been made with.
-        planned: Fingerprints by the last plans.
-    """
-
-    def __init__(
-        self,
-        runs: Sequence[StoredRun],
-        settings: Settings,
-        planned: Mapping[RunSpec, str] | None = None,
-    ) -> None:
-        self._settings, self._planned = settings, planned or {}
-        self._by_fingerprint = {run.fingerprint: run for run in reversed(runs) if run.finished}
-        self._runs: dict[frozenset[tuple[str, str]], StoredRun] = {}
-        for run in runs:
-            if run.finished:
-                params = {(key, value) for key, value in run.params.items() if key != "folds"}
-                self._runs.setdefault(frozenset(params), run)
-
-    def __call__(self, row: Sequence[RunSpec]) -> list[StoredRun]:
-        """The runs of all seeds of a row; none if any is missing, or of other data."""
-        specs = dict.fromkeys(self._settings.spec(one) for one in row)
-        found = [run for spec in specs if (run := self._find(spec)) is not None]
-        alike = len({run.tags["data_hash"] for run in found}) == 1
-        return found if alike and len(found) == len(specs) else []
-
-    def _find(self, spec: RunSpec) -> StoredRun | None:
-        params = self._settings.params(spec)
-        if spec in self._planned:
-            planned = self._by_fingerprint.get(self._planned[spec])
-            # the plan may be older than the settings; those of the splits may change nothing
-            asked = {key: value for key, value in params.items() if key not in Splits.model_fields}
-            if planned is None or asked.items() <= planned.params.items():
-                return planned
-        return self._runs.get(frozenset(params.items()))
-
-
-def why_unused(run: StoredRun, specs: Sequence[RunSpec], settings: Settings) -> str:
-    """Why a finished run that no result uses is not used.
-
-    Args:
-        run: It.
-        specs: All rows of its study.
-        settings: The current ones.
-    """
-    fields = {name: run.params.get(name) for name in RunSpec.names()}
-    for spec in specs:
-        expected = settings.params(spec)
-        if all(expected[name] == value for name, value in fields.items()):
-            changed = [
-                f"{key} {run.params.get(key)}, now {expected.get(key)}"
-                for key in sorted({*run.params, *expected} - {"folds"})
-                if run.params.get(key) != expected.get(key)
-            ]
-            if changed:
-                return "other settings: " + "; ".join(changed)
-            return "a newer run, other data, or a result that is not complete"
-    return "not in the study's grid"
-
-
-def mean_row(mean: StoredRun) -> dict[str, Any]:
-    """The result of the running mean, from its own run."""
-    row: dict[str, Any] = {"recording_s": float(mean.load(CURVE).time_s.max())}
-    scores, ends = scores_of(mean), {"value": "", "lo": "lo", "hi": "hi"}
-    for windows in (ALL, FIRST):
-        for name in ["test_rmse_dps", *CEILINGS]:
-            for end, bound in ends.items():
-                row[column(name, windows, bound)] = scores.get((name, windows, end))
-    return row
-
-
-@dataclass(frozen=True, eq=False)
-class RunningMeans:
-    """The running mean of one window, which all rows of that window are held against.
-
-    Attributes:
-        run: Its run.
-        evaluation: Resamples and seed of the intervals.
-    """
-
-    run: StoredRun
-    evaluation: Evaluation
-
-    @cached_property
-    def errors(self) -> pd.DataFrame:
-        """Its errors."""
-        return _errors([self.run])
-
-    @cached_property
-    def weights(self) -> np.ndarray:
-        """Of recordings, or devices, in each resample."""
-        return _resampled(self.errors, self.evaluation)
-
-    @cached_property
-    def squares(self) -> dict[str, SquaredErrors]:
-        """Squared errors for all and for first windows."""
-        return {windows: squared_errors(self.errors, PAPER, windows) for windows in (ALL, FIRST)}
-
-    @cached_property
-    def curves(self) -> dict[str, WeightedCurve]:
-        """Its RMSE against its length, likewise."""
-        curve = self.run.load(CURVE)
-        curves = {windows: curve_errors(curve, PAPER, windows) for windows in (ALL, FIRST)}
-        return {windows: curve.of(self.weights) for windows, curve in curves.items()}
-
-    def scores(self, errors: pd.DataFrame, windows: str, window_s: float) -> dict[str, Estimate]:
-        """Figures of merit of others' errors in the same windows."""
-        own, reference = squared_errors(errors, PAPER, windows), self.squares[windows]
-        return score(own, reference, self.curves[windows], window_s, self.weights)
-
-
-def _resampled(errors: pd.DataFrame, evaluation: Evaluation) -> np.ndarray:
-    return leave_one_out(clusters(errors).nunique())
-
-
-def network_row(runs: Sequence[StoredRun], mean: RunningMeans, window_s: float) -> dict[str, Any]:
-    """One row of a table: errors of all seeds pooled, networks at the last epoch.
-
-    Args:
-        runs: All seeds.
-        mean: The running mean on the same recordings.
-        window_s: T0, seconds.
-
-    Returns:
-        Figures of merit for all and for first windows, each with its interval over recordings of
-        the squared errors averaged over seeds; the ceiling; T as ``recording_s``; and the standard
-        deviation over the seeds' own figures (None for one seed).
-    """
-    errors = {seed: _errors(group) for seed, group in _by_seed(runs)}
-    tested = mean.errors.get("imu", pd.Series(0, mean.errors.index))
-    places = pd.DataFrame({"imu": tested, "recording": mean.errors.recording}).drop_duplicates()
-    row: dict[str, Any] = {"seeds": len(errors), "recordings": len(places)}
-    for windows in (ALL, FIRST):
-        pooled = mean.scores(pd.concat(errors.values()), windows, window_s)
-        of_seeds = errors.values() if len(errors) > 1 else ()
-        single = [mean.scores(table, windows, window_s) for table in of_seeds]
-        for base, estimate in pooled.items():
-            row[column(base, windows)] = estimate.value
-            row[column(base, windows, "lo")] = estimate.lo
-            row[column(base, windows, "hi")] = estimate.hi
-            values = [one[base].value for one in single]
-            several = len(values) > 1 and np.isfinite(values).all()
-            row[column(base, windows) + "_seed_sd"] = np.std(values, ddof=1) if several else None
-    limits = mean_row(mean.run)
-    return row | {k: v for k, v in limits.items() if k.startswith(("ceiling", "recording_s"))}
-
-
-def differences(
-    runs: Sequence[StoredRun], references: Mapping[str, pd.DataFrame], evaluation: Evaluation
-) -> dict[str, Any]:
-    """Errors less those of other estimators on all the same windows, paired over recordings.
-
-    Args:
-        runs: All seeds of the row.
-        references: Errors by the names of the others.
-        evaluation: Resamples and seed of the intervals.
-
-    Returns:
-        ``less_<name>_dps``, of the RMSEs against the mean of the recording, and
-        ``less_<name>_dps2_<truth>``, of the mean squares against the other truths, whose own noise
-        may leave none to take the root of. Each with its interval, ``_lo`` and ``_hi``.
-    """
-    table = _errors(runs)
-    weights = _resampled(table, evaluation)
-    row: dict[str, Any] = {}
-    for truth in table.truth.unique():
-        own = squared_errors(table, truth, ALL)
-        for name, errors in references.items():
-            other = squared_errors(errors, truth, ALL)
-            if truth == PAPER:
-                less, key = rmse_difference(own, other, weights), f"less_{name}_dps"
-            else:
-                less, key = paired_difference(own, other, weights), f"less_{name}_dps2_{truth}"
-            row |= {key + end: value for end, value in _ends(less).items()}
-    return row
-
-
-def _ends(estimate: Estimate) -> dict[str, float | None]:
-    return {"": estimate.value, "_lo": estimate.lo, "_hi": estimate.hi}
+def errors_of(runs: Iterable[StoredRun], weights: str = LAST) -> pd.DataFrame:
+    """Errors of some runs, one after the other."""
+    table = pd.concat([run.load(ERRORS) for run in runs])
+    return table[table.weights == weights]
 
 
 def pooled_curve(mean: StoredRun) -> pd.DataFrame:
@@ -374,27 +325,12 @@ def pooled_curve(mean: StoredRun) -> pd.DataFrame:
         mean: Its run.
 
     Returns:
-        Columns ``sensor, windows, time_s, rmse_dps``.
+        Columns ``study, sensor, windows, time_s, rmse_dps``.
     """
-    parts = []
-    table = mean.load(CURVE)
+    parts, table = [], mean.load(CURVE)
     for windows in (FIRST, ALL):
         curve = curve_errors(table, PAPER, windows)
-        mse = curve.squares.mean(np.ones((1, len(curve.squares.sums))))[0]
-        parts.append(
-            pd.DataFrame({"windows": windows, "time_s": curve.times_s, "rmse_dps": np.sqrt(mse)})
-        )
-    pooled = pd.concat(parts)
-    pooled.insert(0, "sensor", mean.params["sensor"])
-    return pooled
-
-
-def _errors(runs: Sequence[StoredRun]) -> pd.DataFrame:
-    tables = pd.concat([run.load(ERRORS) for run in runs])
-    return tables[tables.weights == LAST]
-
-
-def _by_seed(runs: Sequence[StoredRun]) -> Iterator[tuple[str, list[StoredRun]]]:
-    key = lambda run: run.params["seed"]  # noqa: E731
-    for seed, group in groupby(sorted(runs, key=key), key):
-        yield seed, list(group)
+        rmse = curve.of(np.ones((1, len(curve.squares.sums)))).rmse[0]
+        parts.append(pd.DataFrame({"windows": windows, "time_s": curve.times_s, "rmse_dps": rmse}))
+    whose = {name: mean.params[name] for name in ("study", "sensor")}
+    return pd.concat(parts).assign(**whose)[_CURVES]

@@ -1,248 +1,226 @@
-"""The figures of signals: one function each, stored recordings in, a figure out."""
+"""The figures of recordings: one function each, drawn from what ``describe`` made of them."""
 
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
-from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import AXES, MDPS
-from gyro_pipeline.parameters import GroundTruth, Published
-from gyro_pipeline.physics.allan import FLICKER_FLOOR, SHORTEST_FIT_SAMPLES
-from gyro_pipeline.physics.bias import fill_masked, settling_time_s
-from gyro_pipeline.pipelines.reporting.style import CEILING, COLOURS, LOOK, share_legend
-from gyro_pipeline.pipelines.reporting.tables import source_name
+from gyro_pipeline.parameters import GroundTruth
+from gyro_pipeline.pipelines.reporting.exhibits import Exhibit, Material
+from gyro_pipeline.pipelines.reporting.recordings import GYROSCOPES
+from gyro_pipeline.pipelines.reporting.style import (
+    CEILING,
+    COLOURS,
+    LOOK,
+    plain_ticks,
+    share_legend,
+)
 
-_GYROSCOPES = (1, 4, 10)
-_FROM_S = 1.0
-"""A running mean of less is mostly off the figure."""
-
-_POINTS = 1300
-"""More points of a running mean would not be seen."""
-
+_FROM_S = 1.0  # a running mean of less is mostly off the figure
 _HOUR_S = 3600
+_TOLERANCE = "The band is the tolerance around the mean of the recording, which counts as truth."
 
 
-def running_average(
-    recordings: xr.Dataset, bias: pd.DataFrame, ground_truth: GroundTruth
-) -> Figure:
-    """Running average of one gyroscope until it has converged (paper, section II, first figure).
+def drift(material: Material) -> Exhibit | None:
+    """Mean rate against time after power-on, over all recordings of each sensor."""
+    lines = material.signals[material.signals.figure == "drift"]
+    if lines.empty:
+        return None
+    figure, panels = _panels(material, sharey=False)
+    with LOOK():
+        for ax, sensor in panels:
+            own = lines[lines.sensor == sensor]
+            for axis, colour in zip(AXES, COLOURS, strict=False):
+                line = own[own.line == axis]
+                ax.plot(line.x, line.y / MDPS, color=colour, lw=1.4, label=f"axis {axis}")
+                ax.fill_between(
+                    line.x, line.lo / MDPS, line.hi / MDPS, color=colour, alpha=0.18, lw=0
+                )
+            for _, line in own[~own.line.isin(AXES)].groupby("line"):  # a fitted warm-up
+                ax.plot(
+                    line.x, line.y / MDPS, color="black", ls="--", lw=1, label=line.line.iloc[0]
+                )
+            ax.axhline(0, color="black", lw=0.8)
+            ax.set(title=material.sensor_name(sensor), xlabel="time after power-on [s]")
+            ax.set_ylabel("mean rate less its end [mdps]")
+        share_legend(figure, [ax for ax, _ in panels], columns=4)
+        figure.suptitle(f"Mean rate against time after power-on; {material.source_name}")
+    caption = (
+        "The mean over all recordings, each centred by its last quarter, with its 95 % interval. A "
+        "line at 0 is a bias that does not move; one that starts off it is a warm-up, which an "
+        "estimator that knows the device, a constant included, can take off. White noise without "
+        "drift, the premise of the ceiling, means a line at 0."
+    )
+    return Exhibit("drift", "Does the rate drift after power-on?", caption, figure)
 
-    Args:
-        recordings: Of the sensor shown; its first recording of IMU 1's first axis is taken.
-        bias: Their ground truth, for the bias and the settling time.
-        ground_truth: The tolerance.
-    """
-    one = _first(bias)
-    times_s, means = _running_mean(_samples(recordings, one), recordings.attrs["rate_hz"])
-    value, tolerance = one.bias_dps / MDPS, ground_truth.tolerance_mdps
+
+def allan_deviation(material: Material) -> Exhibit | None:
+    """Allan deviation of every gyroscope, and the fitted N, B and K (IEEE Std 952)."""
+    lines = material.signals[material.signals.figure == "allan"]
+    if lines.empty:
+        return None
+    sheets = {sheet.sensor: sheet for sheet in material.published.specifications}
+    figure, panels = _panels(material, sharey=True)
+    with LOOK():
+        for ax, sensor in panels:
+            _draw_allan(ax, lines[lines.sensor == sensor], _described(material, sensor))
+            sheet = sheets.get(sensor)
+            if sheet is not None and sheet.noise_density_mdps_rthz is not None:
+                times_s = np.sort(lines[lines.sensor == sensor].x.unique())
+                stated = sheet.noise_density_mdps_rthz / np.sqrt(2) / np.sqrt(times_s)
+                ax.plot(times_s, stated, "k:", label="white noise of the datasheet")
+            ax.set(title=material.sensor_name(sensor), xlabel="averaging time [s]")
+            ax.set_ylabel("Allan deviation [mdps]")
+        share_legend(figure, [ax for ax, _ in panels], columns=3)
+        figure.suptitle(f"Overlapping Allan deviation; {material.source_name}")
+    caption = (
+        "How much averages of a length differ. White noise falls as 1/√t; flicker noise (B) and "
+        "random walk (K) bend the curve upwards. The dashed line is the fit over all gyroscopes."
+    )
+    return Exhibit("allan_deviation", "Allan deviation of every gyroscope", caption, figure)
+
+
+def _draw_allan(ax: Axes, lines: Any, row: pd.Series) -> None:
+    fit = lines.line.str.startswith("fit")
+    for _, gyroscope in lines[~fit].groupby("line"):
+        ax.plot(gyroscope.x, gyroscope.y / MDPS, color=COLOURS[0], lw=0.7, alpha=0.6,
+                label="each gyroscope")  # fmt: skip
+    ax.plot(lines.x[fit], lines.y[fit] / MDPS, color=CEILING, ls="--", label="fit of N, B, K")
+    text = (
+        f"N = {row.white_dps_rts / MDPS:.2f} mdps·√s\nB = {row.instability_dps * _HOUR_S:.2g} "
+        f"deg/h\nK = {row.random_walk_dps_per_rts / MDPS:.2g} mdps/√s"
+    )
+    ax.text(0.04, 0.06, text, transform=ax.transAxes)
+    ax.set(xscale="log", yscale="log")
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    plain_ticks(ax)
+
+
+def running_average(material: Material, ground_truth: GroundTruth) -> Exhibit | None:
+    """Running average of one gyroscope until it has converged (paper, section II)."""
+    lines = _first(material)
+    if lines is None:
+        return None
+    mean, settled = (lines[lines.figure == name] for name in ("running average", "bias"))
+    settled_s, bias = float(settled.x.iloc[0]), float(settled.y.iloc[0]) / MDPS
+    tolerance = ground_truth.tolerance_mdps
     with LOOK():
         figure = Figure(figsize=(8.5, 4.2), layout="constrained")
         ax = figure.subplots()
-        ax.plot(times_s, means / MDPS, color=COLOURS[0], label="running average")
-        ax.axhline(value, color="black", lw=1, label="ground truth: mean of the recording")
-        ax.axhspan(
-            value - tolerance,
-            value + tolerance,
-            color=COLOURS[2],
-            alpha=0.2,
-            lw=0,
-            label=f"± {tolerance:g} mdps",
-        )
-        ax.axvline(
-            one.settling_time_s,
-            color=CEILING,
-            ls="--",
-            label=f"stays within from {one.settling_time_s:.1f} s on",
-        )
-        _limit(ax, (means / MDPS)[times_s >= _FROM_S] - value, tolerance, value)
-        ax.set(xlim=(0, times_s[-1]), xlabel="time [s]", ylabel="angular rate [mdps]")
+        ax.plot(mean.x, mean.y / MDPS, color=COLOURS[0], label="running average")
+        ax.axhline(bias, color="black", lw=1, label="ground truth: mean of the recording")
+        _band(ax, bias, tolerance, f"± {tolerance:g} mdps")
+        words = f"stays within from {settled_s:.1f} s on"
+        ax.axvline(settled_s, color=CEILING, ls="--", label=words)
+        _limit(ax, (mean.y[mean.x >= _FROM_S] / MDPS - bias).to_numpy(), tolerance, bias)
+        ax.set(xlim=(0, mean.x.max()), xlabel="time [s]", ylabel="angular rate [mdps]")
         share_legend(figure, [ax], columns=2)
-        figure.suptitle(f"Running average of one gyroscope: {_name(recordings, one)}")
-    return figure
+        figure.suptitle(f"Running average of one gyroscope: {_whose(material, mean)}")
+    caption = f"{_TOLERANCE} Paper, section II."
+    return Exhibit("running_average", "Running average of one gyroscope", caption, figure)
 
 
-def calibrated_signal(recordings: xr.Dataset, bias: pd.DataFrame) -> Figure:
-    """Raw and calibrated signal of the same gyroscope (paper, section II, second figure).
-
-    Args:
-        recordings: As for :func:`running_average`.
-        bias: Their ground truth.
-    """
-    one = _first(bias)
-    samples = _samples(recordings, one)
-    times_s = np.arange(len(samples)) / recordings.attrs["rate_hz"]
+def calibrated_signal(material: Material) -> Exhibit | None:
+    """Raw and calibrated signal of the same gyroscope (paper, section II, second figure)."""
+    lines = _first(material)
+    if lines is None:
+        return None
+    raw, bias = lines[lines.figure == "signal"], float(lines[lines.figure == "bias"].y.iloc[0])
     with LOOK():
         figure = Figure(figsize=(8.5, 4.2), layout="constrained")
         ax = figure.subplots()
         # as pixels also in the SVG, which would hold every sample otherwise
-        style: dict[str, Any] = {"lw": 0.4, "rasterized": True}
-        ax.plot(times_s, samples, color=COLOURS[0], label="raw", **style)
-        ax.plot(times_s, samples - one.bias_dps, color=COLOURS[2], label="calibrated", **style)
-        ax.axhline(one.bias_dps, color=COLOURS[1], lw=2, label="bias")
+        for name, y, colour in (
+            ("raw", raw.y, COLOURS[0]),
+            ("calibrated", raw.y - bias, COLOURS[2]),
+        ):
+            ax.plot(raw.x, y, color=colour, lw=0.4, rasterized=True, label=name)
+        ax.axhline(bias, color=COLOURS[1], lw=2, label="bias")
         ax.axhline(0, color="black", lw=1)
-        ax.set(xlim=(0, times_s[-1]), xlabel="time [s]", ylabel="angular rate [deg/s]")
+        ax.set(xlim=(0, raw.x.max()), xlabel="time [s]", ylabel="angular rate [deg/s]")
         share_legend(figure, [ax], columns=3)
         for line in figure.legends[0].get_lines():
             line.set_linewidth(2)
-        figure.suptitle(f"Raw and calibrated signal: {_name(recordings, one)}")
-    return figure
+        mean = lines[lines.figure == "running average"]
+        figure.suptitle(f"Raw and calibrated signal: {_whose(material, mean)}")
+    caption = "Calibrated is the raw signal less the bias. Paper, section II."
+    title = "Raw and calibrated signal of the same gyroscope"
+    return Exhibit("calibrated_signal", title, caption, figure)
 
 
-def mg_convergence(recordings: xr.Dataset, bias: pd.DataFrame, ground_truth: GroundTruth) -> Figure:
-    """Running average over several gyroscopes (paper, section III-A, figure of MG convergence).
-
-    Each gyroscope is centred by its own ground truth before they are averaged: biases of several
-    deg/s would hide everything else.
-
-    Args:
-        recordings: Of the sensor shown; its first recording is taken.
-        bias: Their ground truth.
-        ground_truth: The tolerance.
-    """
-    one, rate_hz = _first(bias), recordings.attrs["rate_hz"]
-    rates = recordings.angular_rate.sel(recording=one.recording).transpose("imu", "axis", "sample")
-    lengths = recordings["samples"].sel(recording=one.recording).to_numpy()
-    samples = rates.to_numpy()[lengths > 0, :, : lengths[lengths > 0].min()].astype(np.float64)
-    samples = fill_masked(samples.reshape(-1, samples.shape[-1]))
-    centred = samples - samples.mean(axis=1, keepdims=True)
-    counts = [count for count in _GYROSCOPES if count <= len(centred)]
+def mg_convergence(material: Material, ground_truth: GroundTruth) -> Exhibit | None:
+    """Running average over several gyroscopes (paper, section III-A, figure of MG convergence)."""
+    lines = _first(material)
+    if lines is None:
+        return None
     tolerance = ground_truth.tolerance_mdps
+    together = [lines[lines.figure == f"convergence {count}"] for count in GYROSCOPES]
+    counts = [count for count, line in zip(GYROSCOPES, together, strict=True) if len(line)]
+    each = lines[lines.figure == "convergence"]
+    alone = np.reshape(each.y / MDPS, (-1, len(together[0])))
     with LOOK():
         figure = Figure(figsize=(9.5, 3.6), layout="constrained")
         axes = figure.subplots(1, len(counts), sharex=True, sharey=True, squeeze=False)[0]
-        for ax, count in zip(axes, counts, strict=True):
-            for gyroscope in centred[:count]:
-                times_s, alone = _running_mean(gyroscope, rate_hz)
-                ax.plot(times_s, alone / MDPS, color="grey", lw=0.5, alpha=0.6, label="each alone")
-            together = centred[:count].mean(axis=0)
-            times_s, means = _running_mean(together, rate_hz)
-            ax.plot(times_s, means / MDPS, color=COLOURS[0], lw=1.8, label="average of all")
-            ax.axhspan(
-                -tolerance,
-                tolerance,
-                color=COLOURS[2],
-                alpha=0.2,
-                lw=0,
-                label=f"± {tolerance:g} mdps; settled: stays within from then on",
-            )
-            settled = float(settling_time_s(together, rate_hz, tolerance * MDPS))
+        for ax, count, line in zip(axes, counts, together, strict=False):
+            for single in alone[:count]:
+                ax.plot(line.x, single, color="grey", lw=0.5, alpha=0.6, label="each alone")
+            ax.plot(line.x, line.y / MDPS, color=COLOURS[0], lw=1.8, label="average of all")
+            _band(ax, 0, tolerance, f"± {tolerance:g} mdps; settled: stays within from then on")
             plural = "s" if count > 1 else ""
-            ax.set(
-                title=f"{count} gyroscope{plural}, settled at {settled:.1f} s",
-                xlabel="time [s]",
-                xlim=(0, times_s[-1]),
-            )
-        _, alone = _running_mean(centred, rate_hz)
-        _limit(axes[0], (alone / MDPS)[:, times_s >= 2 * _FROM_S], tolerance)
+            ax.set(title=f"{count} gyroscope{plural}, {line.line.iloc[0]}", xlabel="time [s]")
+            ax.set_xlim(0, line.x.max())
+        _limit(axes[0], alone[:, together[0].x >= 2 * _FROM_S], tolerance)
         axes[0].set_ylabel("running average less ground truth [mdps]")
         share_legend(figure, axes, columns=3)
-        figure.suptitle(
-            f"Running average of several gyroscopes: {one.sensor} recording {one.recording}; "
-            f"{_source(recordings)}"
-        )
-    return figure
-
-
-def allan_deviation(published: Published, **stored: Any) -> Figure:
-    """Allan deviation of every gyroscope, and the fitted N, B and K (IEEE Std 952).
-
-    Args:
-        published: Names the sensors, and their stated noise density.
-        **stored: ``<sensor>_recordings``, ``<sensor>_allan`` and ``<sensor>_noise`` of each.
-    """
-    with LOOK():
-        figure = Figure(figsize=(9.5, 7.2), layout="constrained")
-        axes = figure.subplots(2, 2, sharex=True, sharey=True).ravel()
-        for ax, sheet in zip(axes, published.specifications, strict=True):
-            recordings, allan, noise = (
-                stored[f"{sheet.sensor}_{name}"] for name in ("recordings", "allan", "noise")
-            )
-            _draw_allan(ax, allan, noise)
-            if sheet.noise_density_mdps_rthz is not None:
-                stated = sheet.noise_density_mdps_rthz / np.sqrt(2)
-                ax.plot(
-                    allan.time_s,
-                    stated / np.sqrt(allan.time_s),
-                    color="black",
-                    ls=":",
-                    label="white noise of the datasheet",
-                )
-            ax.set_title(f"{sheet.name}; {_source(recordings)}")
-        for ax in axes[::2]:
-            ax.set_ylabel("Allan deviation [mdps]")
-        for ax in axes[2:]:
-            ax.set_xlabel("averaging time [s]")
-        share_legend(figure, axes, columns=3)
-        figure.suptitle("Overlapping Allan deviation; N, B and K over all gyroscopes")
-    return figure
-
-
-def _draw_allan(ax: Axes, allan: xr.Dataset, noise: pd.DataFrame) -> None:
-    times_s = allan.time_s.to_numpy()
-    counts = allan.differences.fillna(0)
-    variance = allan.allan_variance.weighted(counts).mean("recording")
-    for one in variance.stack(gyroscope=("imu", "axis")).transpose("gyroscope", "time_s"):
-        deviation = np.sqrt(one.to_numpy()) / MDPS
-        ax.plot(times_s, deviation, color=COLOURS[0], lw=0.7, alpha=0.6, label="each gyroscope")
-    columns = ["white_dps_rts", "instability_dps", "random_walk_dps_per_rts"]
-    squares = (noise[columns] ** 2).mean()
-    white, instability, walk = np.sqrt(squares)
-    fitted_s = times_s[SHORTEST_FIT_SAMPLES * times_s[0] <= times_s]
-    model = white**2 / fitted_s + FLICKER_FLOOR * instability**2 + walk**2 * fitted_s / 3
-    ax.plot(fitted_s, np.sqrt(model) / MDPS, color=CEILING, ls="--", lw=1.5, label="fit of N, B, K")
-    ax.text(
-        0.04,
-        0.06,
-        f"N = {white / MDPS:.2f} mdps·√s\nB = {instability * _HOUR_S:.2g} deg/h\n"
-        f"K = {walk / MDPS:.2g} mdps/√s",
-        transform=ax.transAxes,
+        sensor = material.sensor_name(lines.sensor.iloc[0])
+        figure.suptitle(f"Running average of several gyroscopes: {sensor}; {material.source_name}")
+    caption = (
+        "Each gyroscope is centred by its own bias before they are averaged: biases of several "
+        f"deg/s would hide all else. {_TOLERANCE} Paper, section III-A."
     )
-    ax.set(xscale="log", yscale="log")
-    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    for axis in (ax.xaxis, ax.yaxis):
-        axis.set_major_formatter("{x:g}")
-    ax.minorticks_off()
+    return Exhibit("mg_convergence", "Running average of several gyroscopes", caption, figure)
 
 
-def _first(bias: pd.DataFrame) -> pd.Series:
-    """The first axis of the first IMU, in its first recording."""
-    own = bias[(bias.imu == bias.imu.min()) & (bias.axis == AXES[0])]
-    return own.sort_values("recording").iloc[0]
+def _first(material: Material) -> pd.DataFrame | None:
+    """The lines of the sensor that is shown: SparkFun, or the first one that there is."""
+    if material.signals.empty:
+        return None
+    sensors = material.signals.sensor.unique().tolist()
+    shown = "sparkfun" if "sparkfun" in sensors else sensors[0]
+    return material.signals[material.signals.sensor == shown]
 
 
-def _samples(recordings: xr.Dataset, one: pd.Series) -> NDArray[np.float64]:
-    """All samples of its own length; masked ones are their mean."""
-    chosen = recordings.sel(imu=one.imu, recording=one.recording, axis=one.axis)
-    samples = chosen.angular_rate.to_numpy()[: int(chosen["samples"])]
-    return fill_masked(samples).astype(np.float64)
+def _described(material: Material, sensor: str) -> pd.Series:
+    return material.sensors[material.sensors.sensor == sensor].iloc[0]
 
 
-def _running_mean(
-    samples: NDArray[np.float64], rate_hz: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Times in s, shape (points,), and the mean of all samples until then, shape (..., points)."""
-    step = max(1, samples.shape[-1] // _POINTS)
-    counts = np.arange(step, samples.shape[-1] + 1, step)
-    return counts / rate_hz, np.cumsum(samples, axis=-1)[..., counts - 1] / counts
+def _panels(material: Material, sharey: bool) -> tuple[Figure, list[tuple[Axes, str]]]:
+    """A figure with a panel for every sensor."""
+    sensors = material.signals.sensor.unique().tolist()
+    high, wide = -(-len(sensors) // 2), min(2, len(sensors))
+    with LOOK():
+        figure = Figure(figsize=(9.5, 1.2 + 3 * high), layout="constrained")
+        axes = figure.subplots(high, wide, sharey=sharey, squeeze=False).ravel()
+    for ax in axes[len(sensors) :]:
+        ax.remove()
+    return figure, list(zip(axes, sensors, strict=False))
 
 
-def _limit(ax: Axes, shown: NDArray[np.float64], tolerance: float, middle: float = 0.0) -> None:
+def _whose(material: Material, line: pd.DataFrame) -> str:
+    sensor = material.sensor_name(line.sensor.iloc[0])
+    return f"{sensor} {line.line.iloc[0]}; {material.source_name}"
+
+
+def _band(ax: Axes, middle: float, tolerance: float, words: str) -> None:
+    ends = middle - tolerance, middle + tolerance
+    ax.axhspan(*ends, color=COLOURS[2], alpha=0.2, lw=0, label=words)
+
+
+def _limit(ax: Axes, shown: np.ndarray, tolerance: float, middle: float = 0.0) -> None:
     """Leave out what the running mean does at the very first, when it scatters most."""
     half = max(3 * tolerance, 1.1 * float(np.abs(shown).max()))
     ax.set_ylim(middle - half, middle + half)
-
-
-def _name(recordings: xr.Dataset, one: pd.Series) -> str:
-    return (
-        f"{one.sensor} IMU {one.imu}, axis {one.axis}, recording {one.recording}; "
-        f"{_source(recordings)}"
-    )
-
-
-def _source(recordings: xr.Dataset) -> str:
-    return source_name(recordings.attrs["source"], bool(recordings.attrs["simulated"]))

@@ -1,0 +1,189 @@
+"""What a report is made from, and what one of its tables or figures is."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from gyro_pipeline.conventions import ALL, FIRST, LEAVE_ONE_DEVICE_OUT
+from gyro_pipeline.parameters import Published, PublishedResult
+from gyro_pipeline.pipelines.reporting.results import column
+from gyro_pipeline.studies import CNN, CONSTANT, MEAN
+
+PREMISE = "white noise without drift"
+"""Of the ceiling, to be named wherever it is."""
+
+_LABELS = {
+    MEAN: "running mean",
+    CNN: "network",
+    CONSTANT: "constant",
+    "cnn_best": "network at its best epoch",
+}
+_STUDIES_OF = {
+    "three_gyroscopes": "augmentation",
+    "multiple_gyroscopes": "augmentation",
+    "generalization": "real2real",
+}
+"""The study that makes each result table of the paper."""
+
+_KEYS = ["sensor", "real_gyros", "virtual_gyros", "window_s"]
+
+
+@dataclass(frozen=True)
+class Exhibit:
+    """A table or figure of the report.
+
+    Attributes:
+        name: Of its files.
+        title: A few words.
+        caption: What is to be seen, for a reader who has not read the paper.
+        content: The table or figure.
+        shown: Columns of the table that the page shows, all by default; the files hold the rest.
+    """
+
+    name: str
+    title: str
+    caption: str
+    content: pd.DataFrame | Figure
+    shown: Sequence[str] | None = None
+
+
+@dataclass(frozen=True)
+class Material:
+    """All that the tables and figures of one source are made from.
+
+    Attributes:
+        source: Where the logs come from.
+        published: What the paper states.
+        results: Of all studies, with the column ``study``.
+        curves: Running-mean curves, likewise.
+        leaks: Results of the leak study, which have columns of their own.
+        sensors: A row per sensor, from ``describe``.
+        quality: The table of quality, all sensors.
+        signals: Lines of figures, with the column ``sensor``.
+    """
+
+    source: str
+    published: Published
+    results: pd.DataFrame
+    curves: pd.DataFrame
+    leaks: pd.DataFrame
+    sensors: pd.DataFrame
+    quality: pd.DataFrame
+    signals: pd.DataFrame
+
+    @cached_property
+    def made(self) -> pd.DataFrame:
+        """Results that are there."""
+        return self.results[self.results.status.isna()]
+
+    @property
+    def simulated(self) -> bool:
+        """Whether all recordings are simulated."""
+        kinds = [table.simulated for table in (self.made, self.sensors, self.leaks) if len(table)]
+        return bool(kinds) and all(bool(kind.all()) for kind in kinds)
+
+    @property
+    def source_name(self) -> str:
+        """The source, and whether it is simulated or measured where its name does not say so."""
+        kind = "simulated" if self.simulated else "measured"
+        return self.source if kind in self.source else f"{self.source} ({kind})"
+
+    def of(self, study: str, **columns: Any) -> pd.DataFrame:
+        """Rows of a study that have these values."""
+        rows = self.results[self.results.study == study]
+        for name, value in columns.items():
+            rows = rows[rows[name] == value]
+        return rows
+
+    def sensor_name(self, sensor: str) -> str:
+        """As the paper writes it, if it does."""
+        names = {sheet.sensor: sheet.name for sheet in self.published.specifications}
+        return names.get(sensor, sensor)
+
+    @property
+    def claims(self) -> list[PublishedResult]:
+        """Published results of the sensors of this source."""
+        known = {*self.results.sensor, *self.sensors.sensor}
+        return [row for row in self.published.results if row.sensor in known]
+
+    def result(self, claim: PublishedResult, estimator: str) -> pd.Series | None:
+        """Our result for a published one; None where there is none.
+
+        Where the study has no row with as many real gyroscopes, such as on the public file of a
+        single IMU, it is the one that comes closest from below.
+
+        Args:
+            claim: The published result.
+            estimator: Whose.
+        """
+        rows = self.of(_STUDIES_OF[claim.table], estimator=estimator)
+        for key in ("sensor", "virtual_gyros", "window_s"):
+            rows = rows[rows[key] == getattr(claim, key)]
+        rows = rows[rows.real_gyros <= claim.real_gyros].sort_values("real_gyros")
+        row = rows.iloc[-1] if len(rows) else None
+        return None if row is None or pd.notna(row.status) else row
+
+    def status(self, claim: PublishedResult) -> str:
+        """Why there is no result for a published one."""
+        rows = self.of(_STUDIES_OF[claim.table], estimator=CNN)
+        match = np.all([rows[key] == getattr(claim, key) for key in _KEYS], axis=0)
+        return str(rows.status[match].iloc[0]) if match.any() else "not part of this run"
+
+
+def label(estimator: str) -> str:
+    """What a reader calls an estimator."""
+    return _LABELS.get(estimator, estimator.replace("_", " "))
+
+
+def ends(row: Mapping[str, Any] | pd.Series | None, name: str, windows: str) -> tuple[float, ...]:
+    """A score over some windows and the ends of its interval; NaN where there is none."""
+    key = column(name, windows)
+    values = [None if row is None else row.get(key + end) for end in ("", "_lo", "_hi")]
+    return tuple(np.nan if value is None else float(value) for value in values)
+
+
+def interval(row: Any, name: str, windows: str = ALL) -> str:
+    """A score in percent with its 95 % interval."""
+    value, lo, hi = ends(row, name, windows)
+    if np.isnan(value):
+        return "–"
+    return percent(value) + ("" if np.isnan(lo) else f" [{percent(lo)}, {percent(hi)}]")
+
+
+def percent(value: float) -> str:
+    """A saving is unbounded off the ends of the running-mean curve."""
+    if np.isinf(value):
+        return "never reached" if value > 0 else "off the curve"
+    return f"{round(value)}"
+
+
+def beyond_ceiling(row: Any, windows: str = ALL) -> bool:
+    """Whether the interval of an accuracy gain lies wholly beyond the ceiling's."""
+    _, low, _ = ends(row, "accuracy_gain_pct", windows)
+    limit, _, high = ends(row, "ceiling_accuracy_gain_pct", windows)
+    return bool(low > (limit if np.isnan(high) else high))
+
+
+def gyroscopes(row: Any) -> str:
+    """The training set in words."""
+    virtual = f" + {row.virtual_gyros:.0f} virtual" if row.virtual_gyros else ""
+    return f"{row.real_gyros:.0f} real{virtual}"
+
+
+def split(row: Any) -> str:
+    """How recordings were split, in words."""
+    if pd.isna(row.get("folds")):
+        return "–"
+    if row.get("protocol") == LEAVE_ONE_DEVICE_OUT:
+        return f"leave-one-device-out, {row.folds:.0f} devices"
+    return "hold-out" if row.folds == 1 else f"k-fold, {row.folds:.0f} folds"
+
+
+def window_words(windows: str) -> str:
+    """What a figure calls some windows."""
+    return {ALL: "all windows (main result)", FIRST: "first window (the paper's way)"}[windows]

@@ -1,0 +1,310 @@
+"""What the recordings of a sensor show: its noise, drift and hours, as tables to draw from."""
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyro_pipeline.conventions import AXES, MDPS, TEST, InputError
+from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED
+from gyro_pipeline.parameters import GroundTruth
+from gyro_pipeline.physics.allan import FLICKER_FLOOR, SHORTEST_FIT_SAMPLES
+from gyro_pipeline.physics.bias import fill_masked, settling_time_s
+from gyro_pipeline.physics.ceiling import turn_on_spread
+from gyro_pipeline.protocol.recordings import one_by_one, tested_imu
+
+SIGMAS_MDPS = (1.0, 0.5)
+"""The accuracy of the bias for which the times of a start-up are given."""
+
+FIGURES = ["white_dps_rts", "instability_dps", "random_walk_dps_per_rts"]
+GYROSCOPES = (1, 4, 10)
+"""How many gyroscopes the paper averages in its figure of convergence."""
+
+_WORST_FIRST = (REJECTED, REPAIRED, KEPT)
+_SHOWN = 20  # recordings of a sensor that have a row of their own in the table of quality
+_POINTS = 1300  # more of a running mean would not be seen
+_BLOCKS = 24  # of a recording, in the figure of drift
+_LAST_PART = 4  # the last quarter of a recording centres it
+_CONFIDENCE = 0.95
+
+
+def describe(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
+    recordings: xr.Dataset,
+    bias: pd.DataFrame,
+    noise: pd.DataFrame,
+    allan: xr.Dataset,
+    quality: pd.DataFrame,
+    ground_truth: GroundTruth,
+    virtual: xr.Dataset | None = None,
+) -> dict[str, pd.DataFrame]:
+    """Describe a sensor by its recordings.
+
+    Args:
+        recordings: Angular rates, deg/s.
+        bias: Their ground truth.
+        noise: N, B and K of every gyroscope.
+        allan: Their Allan variances.
+        quality: What quality control found.
+        ground_truth: The tolerance of the settling time.
+        virtual: Virtual recordings, where there are some.
+
+    Returns:
+        ``description``, one row; ``quality``, the table of the report; and ``signals``, the lines
+        of figures: ``figure, line, x, y, lo, hi, sensor``.
+    """
+    row = {name: recordings.attrs[name] for name in ("sensor", "source", "rate_hz")}
+    row |= {"simulated": bool(recordings.attrs["simulated"]), "imus": recordings.sizes["imu"]}
+    row |= _counts(recordings, virtual) | _noise(noise) | start_up(recordings, bias, noise)
+    signals = [
+        *_signals(recordings, bias, ground_truth.tolerance_mdps * MDPS),
+        *_allan_lines(allan, noise),
+        drift(recordings).assign(figure="drift"),
+    ]
+    return {
+        "description": pd.DataFrame([row]),
+        "quality": recording_quality(quality),
+        "signals": pd.concat(signals, ignore_index=True).assign(sensor=row["sensor"]),
+    }
+
+
+def drift(recordings: xr.Dataset, blocks: int = _BLOCKS) -> pd.DataFrame:
+    """Mean rate against time after power-on, over all recordings and IMUs.
+
+    Each recording is centred by the mean of its last quarter, so that only what changes within a
+    recording is left: a warm-up that all power-ons share stands out, noise averages out.
+
+    Args:
+        recordings: Angular rates, deg/s; a recording shorter than nine in ten others is left out.
+        blocks: Number of blocks whose means are taken.
+
+    Returns:
+        For each axis (``line``) and block its middle ``x``, seconds, the mean ``y``, deg/s, and
+        its 95 % interval over recordings, ``lo`` and ``hi``; NaN for a single recording.
+    """
+    lengths = recordings["samples"].to_numpy()
+    length = int(np.quantile(lengths[lengths > 0], 0.1, method="lower"))
+    size = length // blocks
+    means = [
+        np.nanmean(samples[:, : size * blocks].reshape(-1, blocks, size), axis=-1, dtype=float)
+        for _, _, samples in one_by_one(recordings)
+        if samples.shape[-1] >= length
+    ]
+    last = slice(-(blocks // _LAST_PART), None)
+    centred = np.stack(
+        [block - np.nanmean(block[:, last], axis=1, keepdims=True) for block in means]
+    )
+    middle, count = np.nanmean(centred, axis=0), len(centred)
+    half = np.full(middle.shape, np.nan)
+    if count > 1:
+        from scipy import stats  # noqa: PLC0415 - it starts slowly
+
+        quantile = stats.t.ppf((1 + _CONFIDENCE) / 2, count - 1)
+        half = quantile * np.nanstd(centred, axis=0, ddof=1) / np.sqrt(count)
+    times_s = size * (np.arange(blocks) + 0.5) / recordings.attrs["rate_hz"]
+    return pd.concat(
+        pd.DataFrame({"line": axis, "x": times_s, "y": y, "lo": y - h, "hi": y + h})
+        for axis, y, h in zip(AXES, middle, half, strict=True)
+    )
+
+
+def start_up(recordings: xr.Dataset, bias: pd.DataFrame, noise: pd.DataFrame) -> dict[str, float]:
+    """Seconds at rest after which the bias of the tested IMU is known, pooled over its axes.
+
+    The mean of t seconds errs by N^2/t + (0.664 B)^2 + K^2 t/3. Who knows earlier calibrations
+    combines it with their mean, about which the bias scatters by the turn-on spread; the ceiling
+    is that of one who knows their mean exactly. White noise, no warm-up, exchangeable power-ons.
+
+    Args:
+        recordings: For the split and, if simulated, the drawn spread.
+        bias: Their ground truth.
+        noise: N, B and K.
+
+    Returns:
+        ``<method>_s_at_<sigma>``, of the methods mean, history and ceiling; 0 where history alone
+        suffices, inf where a recording's length does not, NaN where the noise is not known.
+    """
+    imu, rate_hz = tested_imu(recordings), recordings.attrs["rate_hz"]
+    white, flicker, walk = (
+        noise[noise.imu == imu].set_index("axis").loc[list(AXES), FIGURES].T.to_numpy()
+    )
+    own = bias[bias.imu == imu]
+    if "split" in recordings.coords:
+        held_out = recordings.recording[recordings.split == TEST].to_numpy()
+        own = own[~own.recording.isin(held_out)]
+    means = own.pivot(index="recording", columns="axis", values="bias_dps")[list(AXES)].to_numpy()
+    recording_s = float(recordings["samples"].max()) / rate_hz
+    averaging, count = white**2 / recording_s, len(means)
+    try:
+        spread = turn_on_spread(means, averaging)
+    except InputError:  # of a single recording
+        spread = np.full(len(AXES), np.nan)
+    if "true_turn_on_spread" in recordings:
+        spread = recordings.true_turn_on_spread.to_numpy()
+    times_s = np.geomspace(1 / rate_hz, recording_s, 4000)[:, None]
+    mean = white**2 / times_s + FLICKER_FLOOR * flicker**2 + walk**2 * times_s / 3
+    priors = {
+        "mean": np.full(len(AXES), np.inf),
+        "history": spread**2 + (spread**2 + averaging) / count,
+        "ceiling": spread**2,
+    }
+    row = {"spread_dps": float(np.sqrt(np.mean(spread**2))), "history_recordings": count}
+    for method, prior in priors.items():
+        with np.errstate(divide="ignore"):
+            variance = (1 / (1 / mean + 1 / prior)).mean(axis=1)
+        for sigma in SIGMAS_MDPS:
+            reached = variance <= (sigma * MDPS) ** 2
+            time_s = times_s[reached.argmax(), 0] if reached.any() else np.inf
+            time_s = 0.0 if prior.mean() <= (sigma * MDPS) ** 2 else float(time_s)
+            row[f"{method}_s_at_{sigma:g}"] = np.nan if np.isnan(variance).any() else time_s
+    return row
+
+
+def recording_quality(table: pd.DataFrame) -> pd.DataFrame:
+    """How many recordings were kept, repaired and rejected, and those that something was found in.
+
+    Args:
+        table: Of the raw-logs stage, a row per IMU and recording.
+
+    Returns:
+        A row for the sensor, and below it the recordings that are not simply kept, the worst first.
+    """
+    counts, used = Counter(table.outcome), (table.stop - table.start).dropna()
+    noted = table[(table.outcome != KEPT) | table.findings.notna()]
+    noted = noted.sort_values(
+        "outcome", key=lambda word: word.map(_WORST_FIRST.index), kind="stable"
+    )
+    rows: list[dict[str, Any]] = [
+        {
+            "Sensor": table.sensor.iloc[0],
+            "IMU": f"all {table.imu.nunique()}",
+            "Recording": f"all {len(table)}",
+            "File": None,
+            "Outcome": ", ".join(f"{counts[outcome]} {outcome}" for outcome in _WORST_FIRST[::-1]),
+            "Rows used": _range(used) if len(used) else "none",
+            "Findings": f"in {len(noted)} recordings" if len(noted) else "none",
+        }
+    ]
+    rows += [_of_recording(row) for _, row in noted.head(_SHOWN).iterrows()]
+    if len(noted) > _SHOWN:
+        rest = f"in {len(noted) - _SHOWN} further recordings"
+        rows.append({"Sensor": rows[0]["Sensor"], "Findings": rest})
+    return pd.DataFrame(rows)
+
+
+def _range(rows: pd.Series) -> str:
+    """How many rows the shortest and the longest recording have."""
+    lowest, highest = f"{rows.min():.0f}", f"{rows.max():.0f}"
+    return f"{lowest} of each" if lowest == highest else f"{lowest} to {highest}"
+
+
+def _of_recording(row: pd.Series) -> dict[str, Any]:
+    used = "none" if pd.isna(row.stop) else f"{row.start:.0f} to {row.stop - 1:.0f}"
+    return {
+        "Sensor": row.sensor,
+        "IMU": str(row.imu),
+        "Recording": str(row.recording),
+        "File": row.file,
+        "Outcome": row.outcome,
+        "Rows used": f"{used} of {row.rows}",
+        "Findings": row.findings,
+    }
+
+
+def _noise(noise: pd.DataFrame) -> dict[str, float]:
+    """Root mean square over gyroscopes, with the smallest and the largest."""
+    row: dict[str, float] = {}
+    for name in ["sample_sigma_dps", *FIGURES]:
+        values = noise[name]
+        row |= {name: float(np.sqrt((values**2).mean()))}
+        row |= {f"{name}_min": float(values.min()), f"{name}_max": float(values.max())}
+    return row
+
+
+def _counts(recordings: xr.Dataset, virtual: xr.Dataset | None) -> dict[str, float]:
+    """Recordings of gyroscopes, and samples in them, that train, test, or do either.
+
+    Training recordings (validation included) count for every gyroscope, test recordings for the
+    three of the tested IMU; in a k-fold all of them do both.
+    """
+    samples = recordings["samples"].load().transpose("imu", "recording")
+    there = samples > 0
+    tested = there & (there.imu == tested_imu(recordings))
+    train, test = there, tested
+    if "split" in recordings.coords:
+        train, test = there & (recordings.split != TEST), tested & (recordings.split == TEST)
+    gyroscopes = len(AXES) * int(train.any("recording").sum())
+    row: dict[str, float] = {
+        "gyroscopes": gyroscopes,
+        "median_samples": float(samples.where(there).median()),
+    }
+    for name, part in (("train", train), ("test", test), ("all", train | test)):
+        row[f"{name}_recordings"] = len(AXES) * int(part.sum())
+        row[f"{name}_samples"] = len(AXES) * int((samples * part).sum())
+    if virtual is not None:
+        lengths = virtual["samples"].load()
+        used = (lengths > 0) & (virtual.recording <= virtual.attrs["train_recordings"])
+        row["virtual_gyroscopes"] = len(AXES) * virtual.sizes["imu"]
+        row["virtual_median_samples"] = float(lengths.where(lengths > 0).median())
+        row["virtual_recordings"] = len(AXES) * int(used.sum())
+        row["virtual_samples"] = len(AXES) * int((lengths * used).sum())
+    return row
+
+
+def _allan_lines(allan: xr.Dataset, noise: pd.DataFrame) -> Iterator[pd.DataFrame]:
+    """The Allan deviation of each gyroscope, and the fit of N, B and K over all of them."""
+    times_s = allan.time_s.to_numpy()
+    counts = allan.differences.fillna(0)
+    variance = allan.allan_variance.weighted(counts).mean("recording")
+    for imu in allan.imu.to_numpy().tolist():
+        for axis in AXES:
+            deviation = np.sqrt(variance.sel(imu=imu, axis=axis).to_numpy())
+            yield _line("allan", f"IMU {imu}, axis {axis}", times_s, deviation)
+    white, flicker, walk = (noise[FIGURES] ** 2).mean().to_numpy()
+    fitted_s = times_s[SHORTEST_FIT_SAMPLES * times_s[0] <= times_s]
+    model = white / fitted_s + FLICKER_FLOOR * flicker + walk * fitted_s / 3
+    yield _line("allan", "fit of N, B, K", fitted_s, np.sqrt(model))
+
+
+def _signals(
+    recordings: xr.Dataset, bias: pd.DataFrame, tolerance_dps: float
+) -> Iterator[pd.DataFrame]:
+    """Lines of the paper's figures of signals, from the first recording of the tested IMU."""
+    rate_hz, first = recordings.attrs["rate_hz"], bias[bias.imu == tested_imu(recordings)]
+    row = first[first.axis == AXES[0]].sort_values("recording").iloc[0]
+    rates = recordings.angular_rate.sel(recording=row.recording).transpose("imu", "axis", "sample")
+    lengths = recordings["samples"].sel(recording=row.recording).to_numpy()
+    samples = rates.to_numpy()[lengths > 0, :, : lengths[lengths > 0].min()].astype(np.float64)
+    samples = fill_masked(samples.reshape(-1, samples.shape[-1])).astype(np.float64)
+    times_s, means = _running_mean(samples, rate_hz)
+    yield _line("signal", "raw", np.arange(samples.shape[-1]) / rate_hz, samples[0])
+    label = f"IMU {row.imu}, axis {row.axis}, recording {row.recording}"
+    yield _line("running average", label, times_s, means[0])
+    settled_s = float(settling_time_s(samples[0], rate_hz, tolerance_dps))
+    yield _line("bias", label, np.array([settled_s]), samples[:1].mean(axis=1))
+    means -= samples.mean(axis=1, keepdims=True)
+    centred = samples - samples.mean(axis=1, keepdims=True)
+    for count in (count for count in GYROSCOPES if count <= len(means)):
+        settled_s = float(settling_time_s(centred[:count].mean(axis=0), rate_hz, tolerance_dps))
+        together = means[:count].mean(axis=0)
+        yield _line(f"convergence {count}", f"settled at {settled_s:.1f} s", times_s, together)
+    for alone in means[: max(GYROSCOPES)]:
+        yield _line("convergence", "each alone", times_s, alone)
+
+
+def _line(figure: str, line: str, x: NDArray[np.float64], y: NDArray[np.float64]) -> pd.DataFrame:
+    return pd.DataFrame(
+        {"figure": figure, "line": line, "x": x, "y": y, "lo": np.nan, "hi": np.nan}
+    )
+
+
+def _running_mean(
+    samples: NDArray[np.float64], rate_hz: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Times in s, shape (points,), and the mean of all samples until then, (..., points)."""
+    step = max(1, samples.shape[-1] // _POINTS)
+    counts = np.arange(step, samples.shape[-1] + 1, step)
+    return counts / rate_hz, np.cumsum(samples, axis=-1)[..., counts - 1] / counts
