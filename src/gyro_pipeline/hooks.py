@@ -45,10 +45,6 @@ _NAMES_NODES = ("node_names", "from_nodes", "to_nodes", "from_inputs", "to_outpu
 class Session(KedroSession):
     """A session that runs what changed, alone in its project, and from wherever it was started."""
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        boundary.install(self._project_path)
-
     def run(self, *arguments: Any, **options: Any) -> dict[str, Any]:
         """Run pipelines, as :meth:`kedro.framework.session.KedroSession.run` does.
 
@@ -74,6 +70,7 @@ class Session(KedroSession):
                 "the background; type kedro run without it"
             )
         project = self._project_path
+        boundary.install(project)
         run_lock.check_folder(project)
         every_node = not any(map(options.get, _NAMES_NODES))
         interrupts = run_lock.Interrupts()
@@ -123,6 +120,7 @@ class Preflight:
         from gyro_pipeline.parameters import Parameters  # noqa: PLC0415
 
         self._project = Path(context.project_path)
+        boundary.install(self._project)
         given = context.config_loader["parameters"]
         try:
             self._parameters = Parameters(**given)
