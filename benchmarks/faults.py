@@ -44,7 +44,7 @@ WORKERS = (*REPORT[:2], f"--params={SMALL},execution.workers=2", RUN[3])
 OTHER = (*RUN[:2], f"{RUN[2]},virtual_gyros.turn_on_jitter_mdps=50", RUN[3])
 DRAW = ("--pipeline=virtual_gyros", *OTHER[1:3])
 PATIENCE_S = 900
-_RUN_AFTER_DAMAGE = 0.3
+_RUN_AFTER_DAMAGE = 0.1
 STORED = (
     *("recordings.nc", "quality.csv", "allan.nc", "bias.csv", "noise.csv", "dot_truth.nc"),
     *("virtual_recordings.nc", "augmentation_windows.parquet", "augmentation_plan.csv"),
@@ -195,6 +195,8 @@ def damaged(study: Study, rng: random.Random, name: str, damage: Callable, run: 
     study.said.append(log.read_text())
     if run:
         study.run(REPORT)
+    else:
+        path.write_bytes(before)
     return f"{damage.__name__} {name}{', then a run' * run}"
 
 
@@ -281,24 +283,25 @@ def plan(rng: random.Random, count: int) -> list[tuple[str, str, Callable]]:
     """Kind, where to begin (``new`` or ``made``), and what to do."""
     faults: list[tuple[str, str, Callable]] = []
     for name in STORED:
-        for damage in (flip, change_digit, cut, remove):
+        for damage in (flip, flip, change_digit, change_digit, cut, cut, remove):
             run = rng.random() < _RUN_AFTER_DAMAGE
+            state = "made" if run else "shared"
             faults.append(
-                ("damage", "made", lambda s, r, n=name, d=damage, u=run: damaged(s, r, n, d, u))
+                ("damage", state, lambda s, r, n=name, d=damage, u=run: damaged(s, r, n, d, u))
             )
     for name in ("errors.parquet", "scores.csv", "estimator.pkl"):
         faults.append(("damage", "made", lambda s, r, n=name: swapped(s, r, n)))
     sides = [[RUN] * 2, [WORKERS, RUN], [RUN] * 4, [RUN, OTHER], [WORKERS, DRAW], [RUN, DRAW]]
     sides.append([RUN, OTHER, RUN, DRAW])
-    for commands in sides * 3:
+    for commands in sides * 2:
         start = rng.choice(("new", "empty"))
         faults.append(("together", start, lambda s, r, c=commands: together(s, r, c)))
-    for part in ("data", "mlruns") * 12:
+    for part in ("data", "mlruns") * 8:
         faults.append(("full disk", "empty", lambda s, r, p=part: full(s, r, p)))
     while len(faults) < count:
         faults.append(("kill", "empty", killed))
     rng.shuffle(faults)
-    return faults[:count]
+    return sorted(faults[:count], key=lambda fault: fault[1] != "shared")  # the quick ones first
 
 
 def judge(study: Study, references: dict) -> Counter:
@@ -360,12 +363,18 @@ def main() -> None:
     again = begin(given.folder / "again", empty.folder)
     again.run()
     killed.whole_s = time.monotonic() - began
+    shared = begin(given.folder / "shared", made.folder)
+    shutil.copy(shared.folder / "mlflow.db", made.folder / "mlflow.db.kept")
     total: Counter = Counter()
     kinds: Counter = Counter()
     rng = random.Random(given.seed)
     for number, (kind, state, fault) in enumerate(plan(rng, given.faults)):
-        study = begin(given.folder / f"fault{number}", states[state])
-        study.expected = expected
+        if state == "shared":  # it is put back as it was
+            shutil.copy(made.folder / "mlflow.db.kept", shared.folder / "mlflow.db")
+            study = Study(shared.folder)
+        else:
+            study = begin(given.folder / f"fault{number}", states[state])
+        study.expected = set() if state == "shared" else expected
         try:
             what = fault(study, rng)
             counts = judge(study, references)
@@ -374,8 +383,8 @@ def main() -> None:
         kinds[kind] += 1
         total += counts
         bad = {name: count for name, count in counts.items() if count}
-        print(number, kind, what, study.codes, json.dumps(bad), flush=True)
-        if not bad:
+        print(time.strftime("%T"), number, kind, what, study.codes, json.dumps(bad), flush=True)
+        if not bad and state != "shared":
             shutil.rmtree(study.folder)
     print(json.dumps({"faults": kinds, "counts": total}))
 

@@ -183,42 +183,11 @@ def test_a_file_in_place_of_the_artifacts(mine):
     assert "mlruns is a file where a folder is needed; move it away" in refused(project)
 
 
-def damage(store):
-    content = bytearray(store.read_bytes())
-    content[12288:163840] = bytes(151552)
-    store.write_bytes(content)
-
-
 def foreign(store):
     store.unlink()
     with sqlite3.connect(store) as connection:
         connection.execute("create table books (title text)")
     connection.close()
-
-
-def of_another_version(store):
-    with sqlite3.connect(store) as connection:
-        connection.execute("update alembic_version set version_num = 'not yet known'")
-    connection.close()
-
-
-@pytest.mark.parametrize(
-    ("spoil", "words"),
-    [
-        (damage, ["malformed", "move it away"]),
-        (lambda store: store.write_text("not a database" * 99), ["not a database", "move it away"]),
-        (foreign, ["expected an MLflow store", "tables books", "move it away"]),
-        (of_another_version, ["mlflow db upgrade"]),
-    ],
-    ids=["damaged", "text", "foreign", "version"],
-)
-def test_run_stores(mine, spoil, words):
-    project = mine(good())
-    spoil(project.store)
-    output = refused(project)
-    assert "mlflow.db" in output
-    for word in words:
-        assert word in output
 
 
 # The same through the command line, where nothing stands between an error and the terminal.

@@ -133,22 +133,6 @@ def test_every_parameter_and_every_pattern_is_used(registered):
     assert {entry_name("base", name) for name in names} == set(configuration("base")["catalog"])
 
 
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [
-        ("dot.raw_logs.files", "simulated_logs.SimulatedLogs"),
-        ("dot.ground_truth.allan", "recordings.Recordings"),
-        ("dot.ground_truth.bias", "tables.Table"),
-        ("augmentation.dot.windowed_splits.windows", "tables.Table"),
-        ("augmentation.dot.training.plan", "tables.Table"),
-        ("augmentation.dot.training.runs", "tracked_runs.TrackedRuns"),
-        ("reporting.report", "reports.ReportPage"),
-    ],
-)
-def test_names_get_their_own_kind_of_dataset(name, kind):
-    assert entry(name)["type"] == f"gyro_pipeline.datasets.{kind}"
-
-
 def test_kedro_viz_shows_every_dataset_in_the_layer_of_its_stage(registered):
     for name in datasets_of(registered["base"]):
         assert entry(name)["metadata"]["kedro-viz"]["layer"] in name.split("."), name
@@ -205,10 +189,3 @@ def test_an_environment_adds_no_key_that_base_lacks_and_no_file_that_is_not_read
         given = yaml.safe_load(path.read_text()) if path.exists() else {}
         assert additions(given, dict(configuration("base")[kind])) == set()
     assert parameters(env).source == configuration(env)["globals"]["source"]
-
-
-def test_an_added_key_is_seen():
-    base = configuration("base")["parameters"]
-    assert additions({"training": {"epoch": 3}}, base) == {("training", "epoch")}
-    assert additions({"only": {"sensor": "dot", "gyros": 3}}, base) == {("only", "gyros")}
-    assert additions({"training": {"epochs": 3}, "seeds": [1]}, base) == set()

@@ -3,6 +3,7 @@ from types import SimpleNamespace
 
 import pytest
 from kedro.config import OmegaConfigLoader
+from pydantic import ValidationError
 
 from gyro_pipeline import pipeline_registry
 from gyro_pipeline.conventions import InputError
@@ -99,6 +100,9 @@ REFUSED = [
         "sensors.ng:",
         "train_recordings must leave at least one recording for testing",
     ),
+    ({"training": {"learning_rate": 2.0}}, "training.learning_rate:", "less than or equal to 1"),
+    ({"training": {"stop_below": 5}}, "training:", "stop_below: 5 leaves no epoch to train"),
+    ({"seeds": [-1]}, "seeds.0:", "greater than or equal to 0"),
     ({"reader": {"unit": "deg/s"}}, "reader.unit:", "unknown key; there are format, "),
 ]
 
@@ -108,6 +112,34 @@ def test_a_bad_parameter_is_refused_by_its_place(loaded, refusal, changes, place
     message = refusal(loaded(**changes))
     assert place in message
     assert said in message
+
+
+def numbers(tree, place=()):
+    """Places of all numbers in a tree."""
+    if isinstance(tree, dict | list):
+        items = tree.items() if isinstance(tree, dict) else enumerate(tree)
+        return [found for key, value in items for found in numbers(value, (*place, key))]
+    return [place] if type(tree) in (int, float) else []
+
+
+def test_every_number_is_a_finite_number_of_its_own_type(loaded):
+    given = loaded()
+    places = numbers(given)
+    assert len(places) > 200
+    for place in places:
+        tree = given
+        for key in place[:-1]:
+            tree = tree[key]
+        kept = tree[place[-1]]
+        for value in (True, "1", float("inf"), float("nan"), -1e300):
+            tree[place[-1]] = value
+            if value == -1e300 and place[0] == "published":  # gains may be negative
+                continue
+            with pytest.raises(ValidationError) as refused:
+                Parameters(**given)
+            assert str(place[1]) in str(refused.value)
+        tree[place[-1]] = kept
+    Parameters(**given)
 
 
 ASKED = {

@@ -81,10 +81,6 @@ def settings_in_words(given: Mapping[str, Any], prefix: str = "") -> str:
 class Session(KedroSession):
     """A session that runs what changed, alone in its project, and from wherever it was started."""
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        boundary.install(self._project_path)
-
     def run(self, *arguments: Any, **options: Any) -> dict[str, Any]:
         """Run pipelines, as :meth:`kedro.framework.session.KedroSession.run` does.
 
@@ -110,6 +106,7 @@ class Session(KedroSession):
                 "the background; type kedro run without it"
             )
         project = self._project_path
+        boundary.install(project)
         run_lock.check_folder(project)
         every_node = not any(map(options.get, _NAMES_NODES))
         interrupts = run_lock.Interrupts()
@@ -159,6 +156,7 @@ class Preflight:
         from gyro_pipeline.parameters import Parameters  # noqa: PLC0415
 
         self._project = Path(context.project_path)
+        boundary.install(self._project)
         given = context.config_loader["parameters"]
         try:
             self._parameters = Parameters(**given)

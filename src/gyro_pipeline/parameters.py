@@ -16,6 +16,7 @@ from pydantic import (
     ConfigDict,
     Field,
     Strict,
+    ValidationError,
     ValidationInfo,
     field_validator,
     model_validator,
@@ -434,7 +435,7 @@ class Evaluation(Parameter):
 class Grid(Parameter):
     """The networks one study trains on one sensor: all combinations of the lists."""
 
-    method: Literal[1, 2] = Field(description="1: input channels; 2: training data")
+    method: int = Field(ge=1, le=2, description="1: input channels; 2: training data")
     real_gyros: list[Gyroscopes] = Field(min_length=1)
     virtual_gyros: list[Gyroscopes] = Field([0], min_length=1)
 
@@ -682,6 +683,12 @@ class Parameters(Parameter):
         for study, asked in self.studies.items():
             if asked.experiment != study:
                 raise ValueError(f"studies.{study}.experiment: expected {study!r}")
+            try:
+                asked.training_of(self.training)
+            except ValidationError as error:
+                problem = error.errors()[0]
+                where = ".".join(map(str, problem["loc"]))
+                raise ValueError(f"studies.{study}.training.{where}: {problem['msg']}") from None
         return self
 
     @model_validator(mode="after")

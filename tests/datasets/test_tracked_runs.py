@@ -316,24 +316,12 @@ def test_each_study_is_an_experiment_with_its_artifacts_beside_the_store(store):
         assert len(list(folder.rglob("history.csv"))) == 1
 
 
-def test_runs_come_newest_first(store):
-    for seed, started_ms in enumerate([2000, 3000, 1000]):
-        tracked(store).save(fitted(seed=seed, started_ms=started_ms))
-    assert [run.params["seed"] for run in tracked(store).load()] == ["1", "0", "2"]
-
-
 def test_all_runs_are_found_where_the_store_answers_in_pages(store):
     runs = tracked(store)
     for seed in range(5):
         runs.save(fitted(seed=seed))
     runs._client.search_runs = partial(runs._client.search_runs, max_results=2)
     assert sorted(run.params["seed"] for run in runs.load()) == list("01234")
-
-
-def test_a_store_without_runs_is_empty(store, tmp_path):
-    assert tracked(store, study="real2real").load() == []
-    assert tracked(store).exists()
-    assert not tracked(tmp_path / "none.db").exists()
 
 
 def test_new_runs_carry_the_provenance_and_their_own_tags_win(store):
@@ -343,25 +331,6 @@ def test_new_runs_carry_the_provenance_and_their_own_tags_win(store):
     (run,) = tracked(store).load()
     assert run.tags["kedro_run"] == "2024-09-01T00.00.00"
     assert run.tags["torch"] == "of the run itself"
-
-
-def test_artifacts_come_back_as_they_were(store):
-    generator = np.random.default_rng(0)
-    errors = pd.DataFrame(
-        {
-            "recording": [81, 82],
-            "axis": ["x", "z"],
-            "truth_variance": generator.normal(size=2),
-            "error_dps": generator.normal(size=2).astype(np.float32),
-        }
-    )
-    scores = pd.DataFrame({"score": ["accuracy_gain_pct"], "value": generator.normal(size=1)})
-    tracked(store).save(fitted())
-    (run,) = tracked(store).load()
-    given = {"errors.parquet": errors, "scores.csv": scores}
-    tracked(store).save(EvaluatedRun(run.run_id, {}, {}, given))
-    pd.testing.assert_frame_equal(run.load("errors.parquet"), errors, check_exact=True)
-    pd.testing.assert_frame_equal(run.load("scores.csv"), scores, check_exact=True)
 
 
 KILLED = """
@@ -531,10 +500,6 @@ def cut_short(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
-def without_its_header(path):
-    path.write_bytes(b"x" * 100 + path.read_bytes()[100:])
-
-
 def no_sqlite(path):
     path.write_bytes(b"seed,rmse\n0,0.001\n" * 100)
 
@@ -552,7 +517,6 @@ def foreign(path):
     [
         (damaged_in_the_middle, "damaged|not a readable SQLite file"),
         (cut_short, "damaged|not a readable SQLite file"),
-        (without_its_header, "not a readable SQLite file"),
         (no_sqlite, "not a readable SQLite file"),
         (foreign, "expected an MLflow store, got an SQLite file with tables bookmarks"),
     ],
@@ -629,14 +593,6 @@ def test_a_store_is_there_complete_or_not_at_all(tmp_path, monkeypatch):
         with pytest.raises(KeyboardInterrupt):
             tracked(tmp_path / "mlflow.db").load()
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_store_that_is_not_there_is_made(new_store):
-    """The fixture let the dataset make it."""
-    assert set(new_store.parent.iterdir()) == {new_store}
-    assert {e.name for e in MlflowClient(f"sqlite:///{new_store}").search_experiments()} == {
-        "Default"
-    }
 
 
 def test_a_tracking_uri_of_the_environment_wins(store, new_store, tmp_path, monkeypatch):

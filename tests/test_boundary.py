@@ -1,0 +1,111 @@
+"""Errors end in one line at one place, and passwords are shown nowhere."""
+
+import errno
+import logging
+import sqlite3
+import sys
+from concurrent.futures.process import BrokenProcessPool
+
+import numpy as np
+import pytest
+from kedro.config import OmegaConfigLoader
+from kedro.io import DatasetError
+from mlflow.exceptions import MlflowException
+
+from gyro_pipeline import boundary
+from gyro_pipeline.boundary import explanation, masked
+from gyro_pipeline.conventions import InputError
+
+
+def raised(error, cause=None):
+    """An error as Kedro passes it on."""
+    try:
+        try:
+            raise error from cause
+        except Exception as inner:
+            raise DatasetError("Failed while saving data") from inner
+    except DatasetError as outer:
+        return outer
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (InputError("bias.csv: type make"), ["bias.csv: type make"]),
+        (OSError(errno.ENOSPC, "No space left on device", "a.nc"), ["write a.nc", "free some"]),
+        (OSError("flush failed (errno = 28, error message = 'No space')"), ["cannot write"]),
+        (OSError(errno.EROFS, "Read-only file system", "a.nc"), ["a.nc", "writable"]),
+        (PermissionError(errno.EACCES, "Permission denied", "x.db"), ["x.db", "readable"]),
+        (FileNotFoundError(errno.ENOENT, "No such file", "log.csv"), ["log.csv", "no such file"]),
+        (BrokenProcessPool("terminated abruptly"), ["memory", "execution.workers"]),
+        (np.exceptions.AxisError("no"), None),
+        (MemoryError(), ["memory ran out"]),
+        (sqlite3.OperationalError("database or disk is full"), ["run store", "disk is full"]),
+        (MlflowException("http://u:secret@h failed"), ["run store", "http://u:***@h failed"]),
+        (KeyError("x"), None),
+    ],
+)
+def test_what_others_throw_becomes_a_line_and_a_defect_of_ours_does_not(tmp_path, error, words):
+    said = explanation(raised(error), tmp_path)
+    if words is None:
+        assert said is None
+        return
+    assert "\n" not in said
+    for word in words:
+        assert word in said
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"a: 1\nb: 2\na: 3\n", "line 3: found duplicate key a"),
+        ("a: 1\nb: gr\xf6\xdfe\n".encode("latin-1"), "line 2: not UTF-8"),
+        (b"a: 1\nb: [1,\n", "line 3: "),
+        (b"- a\n- b\n", "line 1: expected keys and their values, got a list"),
+        (b"a: \x00\n", "broken.yml: "),
+    ],
+)
+def test_a_fault_in_the_configuration_is_named_by_file_and_line(tmp_path, content, words):
+    base = tmp_path / "conf" / "base"
+    base.mkdir(parents=True)
+    (base / "globals.yml").write_text("a: 1")
+    path = base / "parameters_broken.yml"
+    path.write_bytes(content)
+    loader = OmegaConfigLoader(str(tmp_path / "conf"), base_env="base", default_run_env="base")
+    with pytest.raises(Exception) as caught:  # noqa: PT011 - they have no common base
+        loader["parameters"]
+    said = explanation(caught.value, tmp_path)
+    assert said.startswith(f"configuration: {path}")
+    assert words in said
+
+
+def test_passwords_in_addresses_are_masked_wherever_something_is_logged(tmp_path, caplog):
+    address = "postgresql://me:s3cr@t/x@db.example:5432/runs"
+    assert (
+        masked(f"no answer: {address}, ")
+        == "no answer: postgresql://me:***@t/x@db.example:5432/runs, "
+    )
+    assert masked("http://h:80/a?b=c@d") == "http://h:80/a?b=c@d"
+    factory = logging.getLogRecordFactory()
+    try:
+        boundary.install(tmp_path)
+        try:
+            raise RuntimeError("postgresql://me:secret@db")
+        except RuntimeError:
+            logging.getLogger("anybody").exception("%s failed", "mysql://me:secret@db")
+        assert "secret" not in caplog.text + str(caplog.records[0].exc_text)
+        assert "mysql://me:***@db failed" in caplog.text
+    finally:
+        logging.setLogRecordFactory(factory)
+
+
+def test_a_defect_is_shown_whole_and_kept(tmp_path, capsys, caplog, monkeypatch):
+    monkeypatch.setattr(logging, "getLogRecordFactory", lambda: None)  # left as it is
+    boundary.install(tmp_path)
+    (tmp_path / "data").mkdir()
+    error = raised(KeyError("of ours"))
+    sys.excepthook(type(error), error, error.__traceback__)
+    log = (tmp_path / "data" / "defect.log").read_text()
+    assert "KeyError: 'of ours'" in log
+    assert log.partition("\n")[2] == capsys.readouterr().err
+    assert f"report it with {tmp_path / 'data' / 'defect.log'}" in caplog.text
