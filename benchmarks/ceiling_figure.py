@@ -37,7 +37,7 @@ def main() -> None:
     figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
     limit = 100 * (1 - np.sqrt(SHARES))
     axes.fill_between(SHARES, limit, 100, color="0.92", lw=0)
-    axes.text(0.59, 93, "beyond every estimator under white noise", ha="right", color="0.35")
+    axes.text(0.59, 93, "beyond what white noise without drift allows", ha="right", color="0.35")
     axes.plot(SHARES, limit, "k", label="bias known exactly, white noise: 1 − √r")
     dot = NoiseFigures(5.4 * MDPS, 3 * MDPS, 0.0)
     axes.plot(SHARES, gain(120, dot, KNOWN), "k--", label="the same, flicker of 3 mdps (DOT)")
@@ -46,7 +46,7 @@ def main() -> None:
         label = f"turn-on spread {spread:g} mdps (SparkFun)"
         axes.plot(SHARES, gain(87, white, spread * MDPS), "C0" + style, label=label)
     for sensor, marker in zip(sensors, "os^D", strict=False):
-        rows = [row for row in published["published"] if row["sensor"] == sensor]
+        rows = [row for row in published["published"]["results"] if row["sensor"] == sensor]
         if not rows:
             continue
         share = [row["window_s"] / sensors[sensor]["recording_s"] for row in rows]

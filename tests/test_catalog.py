@@ -11,7 +11,7 @@ from kedro.framework.startup import bootstrap_project
 from kedro.io import CatalogConfigResolver
 
 from gyro_pipeline import pipeline_registry
-from gyro_pipeline.parameters import Only, Sensor
+from gyro_pipeline.parameters import Only, Sensor, WarmUp
 from gyro_pipeline.settings import CONFIG_LOADER_ARGS
 
 ROOT = Path(__file__).parents[1]
@@ -20,8 +20,8 @@ ENVS = sorted(
     path.name for path in CONF.iterdir() if path.is_dir() and path.name not in ("base", "local")
 )
 STUDIES = {
-    *("augmentation", "estimators", "input_channels", "leakage", "networks", "real2real"),
-    *("sweep", "unseen_devices"),
+    *("augmentation", "estimators", "first_windows", "input_channels", "leakage", "networks"),
+    *("real2real", "sweep", "unseen_devices"),
 }
 PIPELINES = STUDIES | {"__default__", "ground_truth", "reporting", "virtual_gyros"}
 MEMORY = "kedro.io.MemoryDataset"
@@ -178,6 +178,8 @@ def additions(tree, base):
     """Keys of a tree that a base lacks; the keys of ``only`` and of sensors are their models'."""
     known = leaves(base) | {("only", key) for key in Only.model_fields}
     known |= {("sensors", name, key) for name in base["sensors"] for key in Sensor.model_fields}
+    warm_up = {("simulated", "warm_up", key) for key in WarmUp.model_fields}
+    known |= {("sensors", name, *key) for name in base["sensors"] for key in warm_up}
     return {place for place in leaves(tree) if place not in known}
 
 

@@ -70,8 +70,8 @@ def test_on_white_noise_they_are_as_good_as_the_oracle(
     assert (ratios.mean(axis=0) > 0.99).all(), ratios
 
 
-def test_with_flicker_random_walk_and_warm_up_the_one_that_knows_is(simulate, judged, training_set):
-    names = ["best_linear_warm_up", "best_linear"]
+def test_with_flicker_random_walk_and_warm_up_the_default_is(simulate, judged, training_set):
+    names = ["best_linear", "empirical_bayes"]
     (aware, stationary), *_ = ratios_to_the_oracle(
         simulate, judged, training_set, WARMING, names, 80, seeds=1
     )

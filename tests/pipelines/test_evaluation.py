@@ -671,17 +671,3 @@ def test_side_by_side_a_recording_that_one_imu_lacks_is_left_out_before_anything
     errors = replace(channels, raw=whole).judged()[CNN].artifacts[ERRORS]
     assert np.isfinite(errors.error_dps).all()
     assert errors.groupby("recording").start.nunique().to_dict() == {11: 5, 12: 4, 14: 5}
-
-
-def test_recordings_of_unequal_length_are_judged_in_the_part_they_have_in_common(
-    world, make_world, make_study
-):
-    raw = world.raw.copy(deep=True)
-    raw["samples"][:, 3], raw["samples"][:, 12] = 1000, 300
-    raw.angular_rate[:, 3, :, 1000:], raw.angular_rate[:, 12, :, 300:] = np.nan, np.nan
-    errors = make_world(raw, study=make_study("some", [MEAN])).judged()[MEAN].artifacts[ERRORS]
-    assert set(errors.recording) == {11, 12, 14}
-    samples = raw.angular_rate.sel(imu=1, recording=11).to_numpy()[:, :1000].astype(np.float64)
-    expected = samples[:, :SIZE].mean(axis=1) - samples.mean(axis=1)
-    found = errors.query("truth == 'paper' and recording == 11 and start == 0").error_dps
-    np.testing.assert_allclose(found, expected, atol=1e-12)

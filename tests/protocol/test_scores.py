@@ -162,7 +162,7 @@ TIMES = np.array([1.0, 2.0, 4.0])
 )
 def test_equivalent_time_by_hand(level, time_s):
     curve = curve_of(TIMES, [8.0, 4.0, 1.0]).of(PLAIN)
-    assert curve.equivalent_time(2.0, np.array([level / 4])).value == pytest.approx(time_s)
+    assert curve.equivalent_time(2.0, np.array([level])).value == pytest.approx(time_s)
 
 
 def test_a_rough_curve_is_made_to_fall_so_that_the_mean_saves_no_time_on_itself():
@@ -170,8 +170,8 @@ def test_a_rough_curve_is_made_to_fall_so_that_the_mean_saves_no_time_on_itself(
     assert (np.diff(rough.falling) < 0).all()
     pooled = np.sqrt((9 + 25 + 36) / 3)  # of the second to the fourth, in whose middle it stands
     np.testing.assert_allclose(rough.falling[[0, 2, 4, 5]], [9, pooled, 2, 1])
-    for window_s in (2.0, 3.0, 4.0):
-        assert rough.equivalent_time(window_s, np.ones(1)).value == pytest.approx(window_s)
+    for window_s, rmse in ((2.0, 3.0), (3.0, 5.0), (4.0, 6.0)):
+        assert rough.equivalent_time(window_s, np.array([rmse])).value == pytest.approx(window_s)
 
 
 # figures of merit

@@ -41,7 +41,7 @@ FEWEST_RECORDINGS = 3
 _BLOCK_S = 0.5
 _RANGE = 1e4  # of a standard deviation about its first guess
 _STEP = 1e-3  # of the numerical gradient, in logarithms
-_CHANCE = 0.2  # of fitting a warm-up, to no avail, where there is none
+_CHANCE = 0.05  # of a warm-up where there is none, at most
 _TIME_CONSTANTS = (0.02, 0.1, 0.3, 1.0, 3.0)  # of the recording: limits, and where searches start
 
 
@@ -58,9 +58,9 @@ def fit_recording_model(
         recordings: (n, samples), deg/s, from power-on; no NaN.
         rate_hz: Samples per second.
         warm_up: Whether there is one; its time constant is the same in all recordings. None: if
-            the recordings say so, by the Bayesian information criterion (Schwarz 1978, Annals of
-            Statistics 6), and are longer than its time constant: what the bias settles to after
-            they end, they do not say.
+            the recordings say so, by a test that finds one where there is none in at most 5 %, and
+            by the Bayesian information criterion (Schwarz 1978, Annals of Statistics 6), and are
+            longer than its time constant: what the bias settles to after they end, they do not say.
         noise: Known N, B and K; fitted together with the rest if None.
 
     Returns:

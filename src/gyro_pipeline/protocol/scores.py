@@ -140,29 +140,31 @@ class WeightedCurve:
         squares = np.interp(np.arange(given[0].size), middles, fit.x[fit.blocks[:-1]])
         return np.asarray(np.sqrt(squares))
 
-    def equivalent_time(self, window_s: float, ratio: np.ndarray) -> Estimate:
+    def equivalent_time(self, window_s: float, rmse: np.ndarray) -> Estimate:
         """When the running mean is as good as an estimator (t* of the paper, section IV-C).
 
-        The interval holds the times at which their RMSEs may be equal, given how much their ratio
-        at t* depends on single recordings.
+        The RMSE is moved by as much as the curve is where it is made to fall, so t* of the running
+        mean itself is T0. The interval holds the times at which both RMSEs may be equal, given how
+        much their ratio at t* depends on single recordings.
 
         Args:
             window_s: T0, seconds.
-            ratio: RMSE of the estimator over that of the running mean of T0, shape (n,).
+            rmse: Of the estimator for the same weightings, shape (n,), deg/s.
 
         Returns:
-            Seconds, T0 where the ratio is 1; -inf where the curve starts at or below that level,
-            inf where it never gets there.
+            Seconds; -inf where the curve starts at or below that level, inf where it never gets
+            there.
         """
-        level = ratio[0] * np.interp(window_s, self.times_s, self.falling)
+        measured, falling = (
+            float(np.interp(window_s, self.times_s, row)) for row in (self.rmse[0], self.falling)
+        )
+        level = rmse[0] * (falling / measured if measured else 1.0)
         time_s = self._reached(level)
         if not np.isfinite(time_s):
             return Estimate(time_s)
-        times = window_s, time_s
-        of_window, at_time = np.array([np.interp(times, self.times_s, row) for row in self.rmse]).T
-        with np.errstate(invalid="ignore"):  # of the whole recording both are 0
-            of_own = ratio * of_window / at_time
-        off = with_interval(of_own, positive=True)
+        at_time = np.array([np.interp(time_s, self.times_s, row) for row in self.rmse])
+        with np.errstate(divide="ignore", invalid="ignore"):  # at the end of a recording both are 0
+            off = with_interval(rmse / at_time, positive=True)
         if off.lo is None or off.hi is None:
             return Estimate(time_s)
         ends = (self._reached(level * end / off.value) for end in (off.hi, off.lo))
@@ -269,7 +271,7 @@ def score(
     scores["mean_rmse_dps"] = with_interval(mean_rmse, positive=True)
     ratio = np.divide(rmse, mean_rmse, out=np.full_like(rmse, np.inf), where=mean_rmse > 0)
     scores["accuracy_gain_pct"] = gain_pct(with_interval(ratio, positive=True))
-    time = curve.equivalent_time(window_s, ratio)
+    time = curve.equivalent_time(window_s, rmse)
     scores["equivalent_time_s"] = time
     ends = [end if end is None else _saving_pct(end, window_s) for end in (time.lo, time.hi)]
     scores["time_saving_pct"] = Estimate(_saving_pct(time.value, window_s), *ends)
