@@ -5,6 +5,7 @@ import hashlib
 import importlib.util
 import json
 import sysconfig
+from collections.abc import Iterable
 from functools import cache
 from importlib.metadata import packages_distributions, version
 from pathlib import Path
@@ -44,25 +45,44 @@ def code_hash(*entries: str) -> str:
     Raises:
         ModuleNotFoundError: There is no such module.
     """
-    contents: dict[str, bytes] = {}
     asked = [name for entry in entries for name in _members(entry.partition(":")[0])]
-    waiting = [*asked]
-    while waiting:
-        name = waiting.pop()
-        path = _source(name)
-        if path is None and name in asked:
-            contents[name] = _version(name).encode()
-        if path is None or name in contents:
-            continue
-        package = name if path.name == "__init__.py" else name.rpartition(".")[0]
-        contents[name], imported = _parsed(path, package)
-        waiting += [package, *imported]
+    contents = {name: _version(name).encode() for name in asked if _source(name) is None}
+    for name, path in _imported(asked).items():
+        package = _package(name, path)
+        contents[name], _ = _parsed(path, package)
         beside = [file for file in path.parent.iterdir() if file.suffix in _SOURCES]
         contents |= {f"{package}/{file.name}": file.read_bytes() for file in beside}
     digest = hashlib.sha256()
     for name in sorted(contents):
         digest.update(b"\0".join([name.encode(), contents[name], b""]))
     return digest.hexdigest()[:_DIGITS]
+
+
+def own_code(entry: str) -> list[Path]:
+    """Files and folders of packages that a class needs, of neither this package nor installed ones.
+
+    Args:
+        entry: As for :func:`code_hash`.
+    """
+    tops = {name.partition(".")[0] for name in _imported([entry.partition(":")[0]])}
+    return sorted({path for top in tops - {_THIS} for path in _roots(top)})
+
+
+def _imported(names: Iterable[str]) -> dict[str, Path]:
+    """The files of modules and of all that they import, directly or not, but installed ones."""
+    paths, waiting = dict[str, Path](), [*names]
+    while waiting:
+        name = waiting.pop()
+        path = _source(name)
+        if path is not None and name not in paths:
+            paths[name] = path
+            package = _package(name, path)
+            waiting += [package, *_parsed(path, package)[1]]
+    return paths
+
+
+def _package(name: str, path: Path) -> str:
+    return name if path.name == "__init__.py" else name.rpartition(".")[0]
 
 
 def _members(name: str) -> list[str]:

@@ -179,18 +179,21 @@ def test_the_model_of_a_class_from_outside_the_package_brings_its_code(
 ):
     monkeypatch.syspath_prepend(tmp_path / "code")
     source = sys.modules["constant"].__file__
-    kinds = ("theirs_file", "theirs_package.__init__", "theirs_folder.inner")
+    kinds = ("theirs_file", "theirs_package.__init__", "theirs_folder.inner", "theirs_importing")
+    importing = "import theirs_file\nclass Constant(theirs_file.Constant):\n    pass\n"
     for seed, module in enumerate(kinds):
         file = tmp_path / "code" / f"{module.replace('.', '/')}.py"
         file.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(source, file)
+        if seed == len(kinds) - 1:
+            file.write_text(importing)
         kind = import_module(module.removesuffix(".__init__")).Constant
         tracked(store).save(fitted(estimator=kind(float(seed)), seed=seed))
     models = [model_uri(run) for run in reversed(tracked(store).load())]
     command = [sys.executable, "-c", APPLY, f"sqlite:///{store}", *models]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     said = {line.split()[0] for line in done.stdout.splitlines()}
-    assert said == {"0.0", "1.0", "2.0"}, done.stderr
+    assert said == {"0.0", "1.0", "2.0", "3.0"}, done.stderr
 
 
 FOLDS = ("fold 0", "without IMU 3", MODEL)

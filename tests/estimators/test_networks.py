@@ -9,7 +9,6 @@ from gyro_pipeline.estimators.networks import ResidualNetwork, WindowMeanNetwork
 from gyro_pipeline.learning.perceptrons import train_perceptrons
 from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.recording_model import RecordingModel, constant_bias, innovations
-from gyro_pipeline.physics.reml import fit_recording_model
 
 SAMPLES, RECORDING_S = 1300, 87.0
 RATE = SAMPLES / RECORDING_S
@@ -83,12 +82,6 @@ def test_it_learns_a_warm_up_that_its_linear_part_was_not_told_of(simulate, judg
         assert corrected < (0.6 if target == RECORDING_MEAN else 0.95) * linear
 
 
-def test_the_recordings_say_whether_there_is_a_warm_up(simulate):
-    for model, parameters in ((COLOURED, 1), (WARMING, 2)):
-        rates = simulate(model, 40, seed=8).angular_rate.to_numpy()[0, :, 0]
-        assert fit_recording_model(rates, RATE, warm_up=None).mean.size == parameters
-
-
 def test_other_devices_train_it_and_do_not_move_its_bias(simulate, judged, training_set):
     heated = with_heater(simulate(COLOURED, 120, seed=9, imus=2), np.random.default_rng(9))
     training, tested = heated.isel(recording=slice(40)), heated.isel(recording=slice(40, None))
@@ -106,15 +99,6 @@ def test_with_few_recordings_it_is_the_linear_predictor(simulate, judged, traini
         network = ResidualNetwork(False).fit(training_set(training, window_s=window_s))
         ours, theirs = judged(network, tested, window_s), judged(linear, tested, window_s)
         np.testing.assert_array_equal(ours, theirs)
-
-
-def test_training_it_twice_gives_the_same_estimates(simulate, training_set):
-    heated = with_heater(simulate(COLOURED, 30, seed=11), np.random.default_rng(11))
-    windows = heated.angular_rate.to_numpy()[0, :, :, :149]
-    first, second = (
-        ResidualNetwork(False).fit(training_set(heated)).estimate(windows) for _ in range(2)
-    )
-    np.testing.assert_array_equal(first, second)
 
 
 def test_innovations_of_the_model_itself_are_independent_with_variance_1(simulate):

@@ -146,15 +146,11 @@ def test_what_cannot_be_batched_is_told(layer, reason):
 
 
 @pytest.mark.parametrize(
-    "changes", [{"steps": 23}, {"epochs": 6, "stop_below": 1.5e-4}, {"batch_size": 500}]
+    ("changes", "watched"),
+    [({"steps": 23}, 3), ({"epochs": 6, "stop_below": 1.5e-4}, None), ({"batch_size": 500}, 40)],
 )
-def test_every_schedule_is_that_of_the_reference(changes):
-    assert_those_alone(learners(), schedule(**changes))
-
-
-@pytest.mark.parametrize("watched", [None, 3, 40])
-def test_validation_may_be_there_or_not_and_of_any_size(watched):
-    assert_those_alone(learners(watched=watched), schedule())
+def test_every_schedule_is_that_of_the_reference_with_and_without_validation(changes, watched):
+    assert_those_alone(learners(watched=watched), schedule(**changes))
 
 
 def test_best_weights_are_those_of_each_networks_own_best_epoch():

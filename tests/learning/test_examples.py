@@ -84,20 +84,6 @@ def test_imus_side_by_side_are_in_order_of_imu_then_axis():
         np.testing.assert_array_equal(samples, np.repeat(np.array(wanted)[:, None], 7, axis=1))
 
 
-def test_the_order_of_stored_dimensions_does_not_matter():
-    rates, bias = drawn()
-    usual = device(rates, bias, imus=(1, 2))
-    turned = Device(
-        usual.recordings.transpose("sample", "axis", "recording", "imu"),
-        usual.imus,
-        usual.numbers,
-        usual.biases,
-        usual.starts,
-    )
-    for one, other in zip(turned.samples(), usual.samples(), strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
 def test_centring_per_device_and_with_one_mean_for_all_by_hand():
     bias = np.array([[[1.0, 2, 3], [3, 4, 5]], [[10, 20, 30], [50, 60, 70]]])
     rates = noise_on(bias, 40)
@@ -108,15 +94,6 @@ def test_centring_per_device_and_with_one_mean_for_all_by_hand():
     overall = (1 + 2 + 3 + 3 + 4 + 5 + 50 + 60 + 70) / 9
     shared = device_centres([first, second], "global")
     np.testing.assert_allclose(shared, np.full((2, 3), overall), rtol=1e-15)
-
-
-def test_devices_side_by_side_are_centred_gyroscope_by_gyroscope():
-    bias = told_apart(2, 3)
-    together = device(noise_on(bias, 40), bias, (1, 2), (1, 3))
-    (own,) = device_centres([together], "per_device")
-    np.testing.assert_allclose(own, [121, 122, 123, 221, 222, 223])
-    (shared,) = device_centres([together], "global")
-    np.testing.assert_allclose(shared, np.full(6, 172))
 
 
 @pytest.mark.parametrize("centring", ["per_device", "global"])
@@ -236,19 +213,6 @@ def test_windows_to_use_may_be_named_by_their_starts():
     np.testing.assert_allclose(got, windows, atol=2e-6 * np.abs(rates).max())
     targets = examples.targets * scaling.target_scale + scaling.centres[0]
     np.testing.assert_allclose(targets, [bias[0, number] for number, _ in places], atol=2e-6 * 10)
-
-
-def test_overlapping_windows_need_one_packed_copy_of_them():
-    """A copy of one recording's windows at a time, never of all of them."""
-    rates, bias = drawn(imus=1, recordings=20, samples=2_000)
-    starts = (np.arange(0, 1_500, 5),) * 20
-    dense = device(rates, bias, (1,), tuple(range(1, 21)), starts)
-    sizes = packed(3, 500, 8, 10, 10, 8, 32)
-    tracemalloc.start()
-    examples, _ = training_examples([dense], sizes, "per_device")
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak < 1.15 * examples.inputs.nbytes
 
 
 def test_shuffled_labels_are_permuted_for_each_gyroscope_on_its_own():

@@ -153,44 +153,11 @@ def test_best_weights_are_those_of_the_lowest_validation_loss():
     assert loss_of(result.last, validation) == pytest.approx(history.val_loss[40], rel=1e-5)
 
 
-def test_validation_changes_nothing_that_is_trained():
-    _, examples = drawn(24)
-    watched = trained(examples, drawn(10, seed=1)[1])
-    alone = trained(examples)
-    assert alone.best is None
-    assert alone.best_epoch is None
-    for name, value in alone.last.items():
-        assert torch.equal(value, watched.last[name]), name
-    pd.testing.assert_frame_equal(alone.history, watched.history.drop(columns="val_loss"))
-
-
-def test_the_order_of_examples_comes_from_the_generator_alone():
-    _, examples = drawn(40)
-    torch.manual_seed(1)
-    first = trained(examples)
-    torch.manual_seed(2)
-    second = trained(examples)
-    other = train(network(), examples, None, schedule(), ordered(6), lambda: None)
-    assert torch.equal(first.last["output.bias"], second.last["output.bias"])
-    assert not torch.equal(first.last["output.bias"], other.last["output.bias"])
-
-
 def test_a_loss_that_is_no_longer_finite_ends_the_training():
     _, examples = drawn(40)
     examples.inputs[7, 0, 0] = np.inf
     with pytest.raises(FloatingPointError, match="the loss is .* in epoch 1"):
         trained(examples)
-
-
-def test_predictions_do_not_depend_on_how_many_are_made_at_once():
-    of = network()
-    inputs = torch.from_numpy(drawn(1500)[1].inputs)
-    outputs = predict(of, inputs)
-    assert outputs.shape == (1500, 3)
-    assert not outputs.requires_grad
-    with torch.no_grad():
-        one_by_one = [of.forward_packed(inputs[[i]]) for i in (0, 1023, 1024, 1499)]
-    torch.testing.assert_close(outputs[[0, 1023, 1024, 1499]], torch.cat(one_by_one))
 
 
 def test_a_training_ends_once_the_rates_to_come_sum_to_less_than_asked():

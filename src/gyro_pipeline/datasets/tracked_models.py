@@ -1,8 +1,6 @@
 """The model of a run, as MLflow keeps and serves it."""
 
-import inspect
 import logging
-import sys
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,6 +16,7 @@ from mlflow.types import ParamSchema, ParamSpec, Schema, TensorSpec
 from gyro_pipeline.conventions import BIAS
 from gyro_pipeline.datasets.stored import digest_of
 from gyro_pipeline.estimators.base import Estimator
+from gyro_pipeline.fingerprints import own_code
 from gyro_pipeline.tracking import DESCRIPTION, MODEL
 
 # It tells of every model that its example is valid.
@@ -58,7 +57,7 @@ def log_model(client: MlflowClient, run: Run, estimator: Estimator, example: np.
             model,
             loader_module="gyro_pipeline.estimators.served",
             data_path=fit,
-            code_paths=_code_of(estimator.source),
+            code_paths=[str(path) for path in own_code(estimator.source.__module__)] or None,
             mlflow_model=Model(artifact_path=MODEL, run_id=run.info.run_id, model_id=model_id),
             signature=_SIGNATURE,
             input_example=np.round(example[:1].astype(np.float64), _EXAMPLE_DECIMALS),
@@ -92,14 +91,3 @@ def _new_model(client: MlflowClient, run: Run, estimator: Estimator) -> str:
     )
     client.log_outputs(run.info.run_id, [LoggedModelOutput(model.model_id, 0)])
     return str(model.model_id)
-
-
-def _code_of(kind: type) -> list[str] | None:
-    """The file or folder that a class outside of this package and of site-packages is from."""
-    top = kind.__module__.partition(".")[0]
-    module = sys.modules[top]
-    folders = [*getattr(module, "__path__", [])]  # of a package
-    path = Path(folders[0] if folders else inspect.getfile(module))
-    if top == __name__.partition(".")[0] or "site-packages" in path.parts:
-        return None
-    return [str(path)]

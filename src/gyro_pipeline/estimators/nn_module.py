@@ -88,7 +88,7 @@ class ModuleEstimator(Estimator):
             raise InputError(
                 "with centring per_device a device needs at least two training recordings, got one"
             )
-        self.job(training).design.check()
+        self._design(devices[0], training).check()
 
     def work(self, training: TrainingSet) -> float:
         """See :meth:`Estimator.work`."""
@@ -103,16 +103,18 @@ class ModuleEstimator(Estimator):
             generator = np.random.default_rng(self._seed)
             devices = [with_shuffled_labels(device, generator) for device in devices]
             cell = training.key, self._seed  # a seed has labels of its own
-        gyroscopes = devices[0].biases.shape[1]
-        options = options_of(self._path, self._settings, self._options, training.rate_hz)
         return TrainingJob(
-            design=Design(self._path, gyroscopes, training.size, options),
+            design=self._design(devices[0], training),
             devices=devices,
             validation=watched[0] if watched else None,
             settings=self._settings,
             seed=self._seed,
             cell=cell,
         )
+
+    def _design(self, device: Device, training: TrainingSet) -> Design:
+        options = options_of(self._path, self._settings, self._options, training.rate_hz)
+        return Design(self._path, device.biases.shape[1], training.size, options)
 
     def trained(self, network: TrainedNetwork) -> Self:
         """Take over what a training left."""
