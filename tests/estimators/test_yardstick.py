@@ -124,16 +124,15 @@ def test_coverage_on_memsense(leave_one_out, name, window_s):
     ("model", "name"),
     [
         (WHITE, "empirical_bayes"),
-        (WHITE, "best_linear"),
         (COLOURED, "best_linear"),
         (WARMING, "best_linear_warm_up"),
     ],
 )
-def test_coverage_on_a_thousand_simulated_recordings(simulate, judged, model, name, training_set):
-    """Of four devices: 80 recordings fix the spread of one, and so its sigma, to a tenth or so."""
+def test_coverage_on_many_simulated_recordings(simulate, judged, model, name, training_set):
+    """Of two devices: 80 recordings fix the spread of one, and so its sigma, to a tenth or so."""
     ratios = []
-    for device in range(4):
-        made = simulate(model, 330, seed=device)
+    for device in range(2):
+        made = simulate(model, 280, seed=device)
         estimator = make_estimator(name, None, 0).fit(training_set(made.isel(recording=slice(80))))
         errors, sigma = judged(estimator, made.isel(recording=slice(80, None)), 10)
         ratios.append(np.abs(errors) / sigma)
@@ -167,7 +166,7 @@ def of_five(recordings, judged, training_set, resamples):
 def test_five_training_recordings_suffice_not_to_be_worse_than_the_mean(
     sources, judged, source, training_set
 ):
-    assert (of_five(sources[source], judged, training_set, 8) <= 1.05).all()
+    assert (of_five(sources[source], judged, training_set, 4) <= 1.05).all()
 
 
 def test_five_memsense_recordings_suffice_too(memsense, judged, training_set):
