@@ -8,6 +8,8 @@ from gyro_pipeline.estimators import make_estimator
 from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.recording_model import RecordingModel, best_linear, constant_bias
 
+pytestmark = pytest.mark.slow
+
 SAMPLES, RECORDING_S = 1300, 87.0  # a tenth of SparkFun's rate: what matters is N, not sigma
 RATE = SAMPLES / RECORDING_S
 N, TAU = 3.3 * MDPS, 0.31 * MDPS
@@ -119,7 +121,6 @@ def test_coverage_on_memsense(leave_one_out, name, window_s):
     assert 0.90 <= np.mean(np.abs(errors) < 2 * sigma) <= 0.98
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "name"),
     [
@@ -161,7 +162,6 @@ def of_five(recordings, judged, training_set, resamples):
     return np.mean(rows, axis=0)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("source", ["white", "coloured"])
 def test_five_training_recordings_suffice_not_to_be_worse_than_the_mean(
     sources, judged, source, training_set
