@@ -1,13 +1,7 @@
 """``kedro run --pipeline=leakage`` on the smoke environment; no other run has any of it."""
 
-from pathlib import Path
-
 import pandas as pd
-from kedro.framework.startup import bootstrap_project
 
-from gyro_pipeline import pipeline_registry
-
-ROOT = Path(__file__).parents[1]
 FEW = {"strides_s": [10], "folds": 2, "training": {"steps": 4}, "recordings": 4}
 REPORT = "data/08_reporting/simulated_smoke"
 WRITTEN = {
@@ -67,14 +61,3 @@ def test_each_way_of_training_is_one_run_made_once_and_shares_nothing_with_anoth
     assert "3 runs planned, 0 skipped (made before), 0 shared with another study" in other.output
     for path, content in project.files(REPORT).items():
         assert "leakage" in path or b"leak" not in content, path
-
-
-def test_no_other_pipeline_has_any_of_its_nodes(monkeypatch, parameters):
-    bootstrap_project(ROOT)
-    monkeypatch.setattr(pipeline_registry, "_selected", parameters("base"))
-    registered = pipeline_registry.register_pipelines()
-    own = {node.name for node in registered["leakage"].nodes if "leakage" in node.name}
-    assert own
-    for name, pipeline in registered.items():
-        found = {node.name for node in pipeline.nodes if "leakage" in node.name}
-        assert found == (own if name == "leakage" else set()), name
