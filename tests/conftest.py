@@ -259,7 +259,8 @@ def smoke(made_once):
 
     def make(folder):
         project = configured(folder)
-        project.amend("smoke", **FEW)
+        # few fits are not worth the start of processes
+        project.amend("smoke", **FEW, execution={"executor": "serial"})
         done = project.kedro_run("--pipeline=augmentation", "--env=smoke")
         (folder / "code").write_text(str(done.code))
 

@@ -17,7 +17,6 @@ from mlflow import MlflowClient
 from gyro_pipeline.estimators import ESTIMATORS, ORIENTATION_NOTE, make_estimator
 
 SMOKE = ("--pipeline=augmentation", "--env=smoke")
-SERIAL = "--params=execution.executor=serial"  # where few fits are not worth the start of processes
 REPORT = "data/08_reporting/simulated_smoke"
 PAGE = "data/08_reporting/report"
 ROW = ["sensor", "estimator", "real_gyros", "virtual_gyros", "window_s"]
@@ -227,7 +226,7 @@ def test_the_report_names_what_is_missing_and_the_command_that_makes_it_and_noth
 
 def test_another_hyper_parameter_trains_anew_and_keeps_what_was(smoke, smoke_copy):
     only = "only.sensor=dot,only.real_gyros=3,only.virtual_gyros=0,only.window_s=10"
-    done = smoke_copy.command(*SMOKE, f"{SERIAL},training.hidden=33,{only}")
+    done = smoke_copy.command(*SMOKE, f"--params=training.hidden=33,{only}")
     assert done.code == 0, done.output
     assert "3 runs planned, 2 skipped" in done.output
     before, runs = identities(smoke.runs), smoke_copy.runs("augmentation")
@@ -246,7 +245,7 @@ def test_another_hyper_parameter_trains_anew_and_keeps_what_was(smoke, smoke_cop
 def test_a_whole_run_shares_what_another_study_has_and_gaps_are_missed_by_what_needs_them(
     smoke, smoke_copy
 ):
-    whole = smoke_copy.command("--env=smoke", SERIAL)
+    whole = smoke_copy.command("--env=smoke")
     assert whole.code == 0, whole.output
     assert identities(smoke_copy.runs("augmentation")) == identities(smoke.runs)
     for line in (
