@@ -6,13 +6,19 @@ PYTHON ?= python3
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: run test check docs help
+.PHONY: run test test-fast check docs help
 
 run: .venv/.package  ## install, then train and evaluate the augmentation study
 	.venv/bin/kedro run --pipeline=augmentation $(ARGS)
 
-test: .venv/.package  ## run the tests, a file per core
-	.venv/bin/python -m pytest --numprocesses=auto --dist=loadfile $(ARGS)
+# A file at a time on each core; files with slow tests come first, as tests/conftest.py sorts them.
+PYTEST = .venv/bin/python -m pytest --numprocesses=auto --dist=loadfile --no-loadscope-reorder
+
+test: .venv/.package  ## run all tests
+	$(PYTEST) $(ARGS)
+
+test-fast: .venv/.package  ## run the tests without the slow ones, while at work
+	$(PYTEST) -m "not slow" $(ARGS)
 
 check: .venv/.package  ## lint, formatting and types
 	.venv/bin/ruff check .

@@ -1,55 +1,43 @@
-"""Fixtures: a project of one's own to run, and recordings with known values."""
+"""Fixtures: a project of one's own to run, and recordings with known values.
+
+Kedro, MLflow and others start slowly and many tests use none of them, so they are imported late.
+"""
 
 import contextlib
 import io
 import logging
 import os
-import pickle
 import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
-import xarray as xr
 import yaml
 from filelock import FileLock
-from kedro.config import OmegaConfigLoader
-from kedro.framework.session import KedroSession
-from kedro.framework.startup import bootstrap_project
-from mlflow import MlflowClient
-from mlflow.entities import Run
 
 from gyro_pipeline.conventions import AXES, DIMENSIONS, HOLD_OUT, TEST, TRAIN, VALIDATION
-from gyro_pipeline.datasets.recordings import InspectedRecordings, Recordings
-from gyro_pipeline.datasets.tracked_runs import TrackedRuns
-from gyro_pipeline.fingerprints import data_hash
-from gyro_pipeline.logs import Logs
-from gyro_pipeline.parameters import Execution, Parameters, Quality
-from gyro_pipeline.physics.noise import simulate_noise
-from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs, label_recordings, quality_table
-from gyro_pipeline.settings import CONFIG_LOADER_ARGS
-from gyro_pipeline.store import relocate
 
 ROOT = Path(__file__).parents[1]
 ROLES = (TRAIN, VALIDATION, TEST)
 _TIMEOUT_S = 600
+FEW = {"windows_s": [10], "training": {"epochs": 2}}
+"""Less of the smoke environment, enough for stories."""
 
 
-@pytest.fixture(scope="session", autouse=True)
-def compiled_elsewhere(tmp_path_factory):
-    """What tests compile does not end up in the cache of who runs them."""
-    os.environ["GYRO_PIPELINE_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+def pytest_collection_modifyitems(items):
+    """What runs the pipelines is slow, and what is slow is run first: workers then end together."""
+    for item in items:
+        if {"new_project", "smoke"} & set(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.slow)
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
 
 
-def listen_to_interrupts() -> None:
+def listen_to_interrupts():
     """A shell lets what it runs in the background ignore Ctrl-C, and children inherit that."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
@@ -69,12 +57,16 @@ class Project:
     folder: Path
 
     @property
-    def store(self) -> Path:
+    def store(self):
         return self.folder / "mlflow.db"
 
-    def start(self, *arguments: str, log: Path) -> subprocess.Popen[bytes]:
+    @property
+    def log(self):
+        return self.folder / "terminal.log"
+
+    def start(self, *arguments):
         """``kedro run`` in a process group of its own, as a shell would start it."""
-        with log.open("wb") as output:
+        with self.log.open("wb") as output:
             return subprocess.Popen(
                 [sys.executable, "-m", "kedro", "run", *arguments],
                 cwd=self.folder,
@@ -85,71 +77,98 @@ class Project:
                 preexec_fn=listen_to_interrupts,
             )
 
-    def kedro_run(self, *arguments: str) -> Done:
-        """``kedro run`` to its end."""
-        log = self.folder / "terminal.log"
-        process = self.start(*arguments, log=log)
+    def kedro_run(self, *arguments):
+        """``kedro run`` to its end, in a process of its own."""
+        process = self.start(*arguments)
         try:
             code = process.wait(_TIMEOUT_S)
         finally:
             process.kill()
-        return Done(code, log.read_text())
+        return Done(code, self.log.read_text())
 
-    def run_here(self, pipeline: str, env: str, **params: Any) -> Done:
-        """The same inside this process, which saves the start-up."""
-        with _logged() as log:
-            code = 0
+    def command(self, *arguments):
+        """``kedro run`` inside this process, which saves the start-up."""
+        from kedro.framework.cli.project import run
+
+        return self._here(lambda: run.main(list(arguments), standalone_mode=False))
+
+    def run_here(self, pipeline, env, changed_only=False, **params):
+        """A pipeline inside this process: all nodes, or what changed, as ``kedro run`` does."""
+        from kedro.framework.session import KedroSession
+
+        from gyro_pipeline.hooks import Session
+
+        kind = Session if changed_only else KedroSession
+
+        def run():
+            with kind.create(self.folder, env=env, runtime_params=params) as session:
+                session.run(pipeline_names=[pipeline])
+
+        return self._here(run)
+
+    def _here(self, run):
+        from kedro.framework.startup import bootstrap_project
+
+        code = 0
+        with _logged() as log, contextlib.chdir(self.folder):
             try:
                 bootstrap_project(self.folder)
-                with KedroSession.create(self.folder, env=env, runtime_params=params) as session:
-                    session.run(pipeline_names=[pipeline])
+                run()
             except Exception as error:
                 code = 1
                 with contextlib.redirect_stderr(log):  # where a traceback would go
                     sys.excepthook(type(error), error, error.__traceback__)
         return Done(code, log.getvalue())
 
-    def configure(self, env: str, **files: Mapping[str, Any]) -> None:
+    def configure(self, env, **files):
         """Write ``conf/<env>``: ``parameters``, ``globals`` and ``catalog``."""
         folder = self.folder / "conf" / env
         folder.mkdir(exist_ok=True)
         for name, content in files.items():
-            (folder / f"{name}.yml").write_text(yaml.safe_dump(dict(content)))
+            (folder / f"{name}.yml").write_text(yaml.safe_dump(content))
 
-    def runs(self, experiment: str) -> list[Run]:
+    def amend(self, env, **parameters):
+        """Change some parameters of an environment."""
+        path = self.folder / "conf" / env / "parameters.yml"
+        path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | parameters))
+
+    def runs(self, experiment):
         """Runs of a study that are not deleted, in the order they were made."""
+        from mlflow import MlflowClient
+
         client = MlflowClient(f"sqlite:///{self.store}")
-        found = client.get_experiment_by_name(experiment)
-        if found is None:
-            return []
-        return list(client.search_runs([found.experiment_id], order_by=["attributes.start_time"]))
+        study = client.get_experiment_by_name(experiment)
+        order = ["attributes.start_time"]
+        return list(client.search_runs([study.experiment_id], order_by=order)) if study else []
 
     @staticmethod
-    def artifacts(run: Run) -> Path:
+    def artifacts(run):
         """Where a run keeps them."""
         return Path(run.info.artifact_uri.removeprefix("file://"))
 
-    def weights(self, run: Run) -> dict[str, bytes]:
+    def weights(self, run):
         """Of the last epoch of a network, bit by bit."""
+        from gyro_pipeline.datasets.tracked_runs import TrackedRuns
+
         stored = {one.run_id: one for one in TrackedRuns(str(self.store)).load()}
         network = vars(stored[run.info.run_id].load_fit(HOLD_OUT))
         return {
             name: value.numpy().tobytes() for name, value in network["_artifact"]["last"].items()
         }
 
-    def count(self, query: str) -> int:
+    def count(self, query):
         """What a counting query finds in the store; cheap enough to poll."""
         with sqlite3.connect(f"file:{self.store}?mode=ro", uri=True, timeout=60) as connection:
             return int(connection.execute(query).fetchone()[0])
 
-    def files(self, part: str = "data") -> dict[str, bytes]:
+    def files(self, part="data"):
         """All files below a folder, hidden ones as well, with their content."""
         paths = sorted(path for path in (self.folder / part).rglob("*") if path.is_file())
         return {str(path.relative_to(self.folder)): path.read_bytes() for path in paths}
 
 
 @contextlib.contextmanager
-def _logged() -> Iterator[io.StringIO]:
+def _logged():
     """What the project says on the terminal."""
     log = io.StringIO()
     handler, logger = logging.StreamHandler(log), logging.getLogger("gyro_pipeline")
@@ -164,102 +183,127 @@ def _logged() -> Iterator[io.StringIO]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _no_settings_of_this_machine() -> Iterator[None]:
-    """A store, an environment or a log level set in the shell must not reach the tests."""
+def _no_settings_of_this_machine(tmp_path_factory):
+    """Settings in the shell do not reach the tests, nor they the cache of who runs them."""
     with pytest.MonkeyPatch.context() as patch:
         for name in ("MLFLOW_TRACKING_URI", "KEDRO_ENV", "KEDRO_LOGGING_CONFIG"):
             patch.delenv(name, raising=False)
+        patch.setenv("GYRO_PIPELINE_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
 
 
 @pytest.fixture(autouse=True)
-def _excepthook(monkeypatch: pytest.MonkeyPatch) -> None:
+def _excepthook(monkeypatch):
     """A run sets it, also one inside this process."""
     monkeypatch.setattr(sys, "excepthook", sys.excepthook)
 
 
 @pytest.fixture(scope="session")
-def _empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """MLflow takes seconds to make one."""
-    path = tmp_path_factory.mktemp("store") / "mlflow.db"
-    MlflowClient(f"sqlite:///{path}").search_experiments()
-    return path
+def made_once(tmp_path_factory):
+    """Makes a folder once for all processes that run tests: ``made_once(name, make)``."""
+    own = tmp_path_factory.getbasetemp()
+    common = own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
+
+    def made(name, make):
+        folder = common / name
+        with FileLock(f"{folder}.lock"):
+            if not (folder / "complete").exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                make(folder)
+                (folder / "complete").touch()
+        return folder
+
+    return made
+
+
+def configured(folder):
+    """A project without data and without a run store; settings of this machine stay out."""
+    for name in ("pyproject.toml", "requirements.lock", ".telemetry"):
+        shutil.copy(ROOT / name, folder)
+    shutil.copytree(ROOT / "conf", folder / "conf", ignore=shutil.ignore_patterns("local"))
+    for name in ("conf/local", "data", "src"):
+        (folder / name).mkdir()
+    return Project(folder)
 
 
 @pytest.fixture(scope="session")
-def new_project(
-    tmp_path_factory: pytest.TempPathFactory, _empty_store: Path
-) -> Callable[..., Project]:
-    """Makes projects without data; ``with_store=False`` leaves the run store out as well."""
+def new_project(tmp_path_factory, made_once):
+    """Makes projects without data, with an empty run store, which takes MLflow seconds to make."""
+    from gyro_pipeline.datasets.run_store import make_store
 
-    def make(with_store: bool = True) -> Project:
-        folder = tmp_path_factory.mktemp("project")
-        for name in ("pyproject.toml", "requirements.lock", ".telemetry"):
-            shutil.copy(ROOT / name, folder)
-        # settings of this machine stay out
-        shutil.copytree(ROOT / "conf", folder / "conf", ignore=shutil.ignore_patterns("local"))
-        for name in ("conf/local", "data", "src"):
-            (folder / name).mkdir()
-        if with_store:
-            shutil.copy(_empty_store, folder / "mlflow.db")
-        return Project(folder)
+    empty = made_once("store", lambda folder: make_store(folder / "mlflow.db"))
+
+    def make():
+        project = configured(tmp_path_factory.mktemp("project"))
+        shutil.copy(empty / "mlflow.db", project.store)
+        return project
 
     return make
 
 
 @dataclass(frozen=True)
 class Ran:
-    """A finished run of the smoke environment, as it was then: later ones do not change this."""
+    """A finished run of the smoke environment. Nothing changes it: see ``smoke_copy``."""
 
     project: Project
     done: Done
-    runs: list[Run]
-    files: dict[str, bytes]
+    runs: list
+    changes: dict
+    """Of the parameters, which are fewer."""
 
 
 @pytest.fixture(scope="session")
-def smoke(new_project: Callable[..., Project], tmp_path_factory: pytest.TempPathFactory) -> Ran:
-    """``kedro run --pipeline=augmentation --env=smoke`` in a project without anything.
+def smoke(made_once):
+    """``kedro run --pipeline=augmentation --env=smoke`` in a project without anything."""
 
-    Each process of the tests gets a copy of one such run.
-    """
-    common = tmp_path_factory.getbasetemp()
-    made = (common.parent if "PYTEST_XDIST_WORKER" in os.environ else common) / "smoke"
-    project = new_project(with_store=False)
-    with FileLock(f"{made}.lock"):
-        if not made.exists():
-            done = project.kedro_run("--pipeline=augmentation", "--env=smoke")
-            ran = Ran(project, done, project.runs("augmentation"), project.files())
-            shutil.copytree(project.folder, made)
-            Path(f"{made}.pickle").write_bytes(pickle.dumps(ran))
-            return ran
-    shutil.copytree(made, project.folder, dirs_exist_ok=True)
+    def make(folder):
+        project = configured(folder)
+        # few fits are not worth the start of processes
+        project.amend("smoke", **FEW, execution={"executor": "serial"})
+        done = project.kedro_run("--pipeline=augmentation", "--env=smoke")
+        (folder / "code").write_text(str(done.code))
+
+    project = Project(made_once("smoke", make))
+    done = Done(int((project.folder / "code").read_text()), project.log.read_text())
+    return Ran(project, done, project.runs("augmentation"), FEW)
+
+
+@pytest.fixture
+def smoke_copy(smoke, tmp_path):
+    """Another project with the same data and runs, to go on with."""
+    from gyro_pipeline.store import relocate
+
+    project = Project(shutil.copytree(smoke.project.folder, tmp_path / "project"))
     relocate(project.store, str(project.folder / "mlruns"))
-    return replace(pickle.loads(Path(f"{made}.pickle").read_bytes()), project=project)
+    return project
 
 
 @pytest.fixture(scope="session")
-def parameters() -> Callable[..., Parameters]:
+def parameters():
     """Parameters of an environment, with some groups changed: ``parameters(splits={...})``."""
+    from kedro.config import OmegaConfigLoader
 
-    def load(env: str = "smoke", **changes: Mapping[str, Any]) -> Parameters:
-        settings: dict[str, Any] = dict(CONFIG_LOADER_ARGS)
-        loader = OmegaConfigLoader(str(ROOT / "conf"), env, changes, **settings)
+    from gyro_pipeline.parameters import Parameters
+    from gyro_pipeline.settings import CONFIG_LOADER_ARGS
+
+    def load(env="smoke", **changes):
+        loader = OmegaConfigLoader(str(ROOT / "conf"), env, changes, **CONFIG_LOADER_ARGS)
         return Parameters(**loader["parameters"])
 
     return load
 
 
 @pytest.fixture(scope="session")
-def read_logs(
-    parameters: Callable[..., Parameters],
-) -> Callable[..., tuple[xr.Dataset, pd.DataFrame]]:
+def read_logs(parameters):
     """The raw-logs stage with its datasets, as ``kedro run`` wires them."""
+    from gyro_pipeline.datasets.recordings import InspectedRecordings, Recordings
+    from gyro_pipeline.parameters import Execution
+    from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs, label_recordings, quality_table
+
     splits = parameters("base").splits
 
-    def read(
-        files: Logs, quality: Quality, folder: Path, workers: int | None = None
-    ) -> tuple[xr.Dataset, pd.DataFrame]:
+    def read(files, quality, folder, workers=None):
         """Recordings, and the table of their quality; few of them have no split."""
         execution = Execution(executor="processes" if workers else "serial", workers=workers)
         path = str(folder / "recordings.nc")
@@ -274,34 +318,28 @@ def read_logs(
 
 
 @pytest.fixture(scope="session")
-def make_recordings() -> Callable[..., xr.Dataset]:
+def make_recordings():
     """White noise of known N around known biases, in the layout of the conventions.
 
     ``split``: how many recordings train, validate and test, in this order; none for a k-fold.
     """
+    import xarray as xr
 
-    def make(
-        bias: np.ndarray,
-        samples: int,
-        rate_hz: float,
-        noise_dps_rts: float,
-        seed: int = 0,
-        split: tuple[int, int, int] | None = None,
-    ) -> xr.Dataset:
+    from gyro_pipeline.fingerprints import data_hash
+    from gyro_pipeline.physics.noise import simulate_noise
+
+    def make(bias, samples, rate_hz, noise_dps_rts, seed=0, split=None):
         generator = np.random.default_rng(seed)
         rates = simulate_noise(generator, (*bias.shape, samples), rate_hz, noise_dps_rts)
         rates += bias[..., None].astype(np.float32)
+        imus, recordings, _ = bias.shape
+        coords = {"imu": np.arange(1, 1 + imus), "recording": np.arange(1, 1 + recordings)}
+        if split:
+            coords["split"] = ("recording", np.repeat(ROLES, split))
+        lengths = np.full(bias.shape[:2], samples)
         return xr.Dataset(
-            {
-                "angular_rate": (DIMENSIONS, rates),
-                "samples": (DIMENSIONS[:2], np.full(bias.shape[:2], samples)),
-            },
-            coords={
-                "imu": np.arange(1, 1 + bias.shape[0]),
-                "recording": np.arange(1, 1 + bias.shape[1]),
-                "axis": list(AXES),
-            }
-            | ({"split": ("recording", np.repeat(ROLES, split))} if split else {}),
+            {"angular_rate": (DIMENSIONS, rates), "samples": (DIMENSIONS[:2], lengths)},
+            coords=coords | {"axis": list(AXES)},
             attrs={
                 "sensor": "sparkfun",
                 "source": "test",

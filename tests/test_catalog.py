@@ -16,9 +16,7 @@ from gyro_pipeline.settings import CONFIG_LOADER_ARGS
 
 ROOT = Path(__file__).parents[1]
 CONF = ROOT / "conf"
-ENVS = sorted(
-    path.name for path in CONF.iterdir() if path.is_dir() and path.name not in ("base", "local")
-)
+ENVS = sorted({path.name for path in CONF.iterdir() if path.is_dir()} - {"base", "local"})
 STUDIES = {
     *("augmentation", "estimators", "first_windows", "input_channels", "leakage", "networks"),
     *("real2real", "sweep", "unseen_devices"),
@@ -27,6 +25,22 @@ PIPELINES = STUDIES | {"__default__", "ground_truth", "reporting", "virtual_gyro
 MEMORY = "kedro.io.MemoryDataset"
 SHARED = {"mlflow.db"}  # by all sources
 PUBLISHED = "data/01_raw/published"  # files to read only, of two sources
+KINDS = {
+    "dot.raw_logs.files": "simulated_logs.SimulatedLogs",
+    "dot.ground_truth.allan": "recordings.Recordings",
+    "dot.ground_truth.bias": "tables.Table",
+    "augmentation.dot.windowed_splits.windows": "tables.Table",
+    "augmentation.dot.training.plan": "tables.Table",
+    "augmentation.dot.training.runs": "tracked_runs.TrackedRuns",
+    "reporting.report": "reports.ReportPage",
+}
+TYPOS = {
+    "sparkfun.ground_thruth.bias",
+    "augmentation.sparkfun.training.run",
+    "augmentation.sparkfun.windowed_splits.window",
+    "augmentation.reporting.result",
+    "reporting.table",
+}
 
 # The package says so itself, but pytest sets filters of its own.
 pytestmark = pytest.mark.filterwarnings("ignore:One or more dataset names contain")
@@ -46,8 +60,8 @@ def resolver(env):
 
 def entry_name(env, name):
     """The catalog entry or pattern that a dataset of this name gets; None if there is none."""
-    found = resolver(env)
-    return name if name in found.config else found.match_dataset_pattern(name)
+    catalog = resolver(env)
+    return name if name in catalog.config else catalog.match_dataset_pattern(name)
 
 
 def entry(name, env="base"):
@@ -58,12 +72,12 @@ def entry(name, env="base"):
 def registered(parameters):
     """Pipelines by environment."""
     bootstrap_project(ROOT)
-    found = {}
+    pipelines = {}
     with pytest.MonkeyPatch.context() as patch:
         for env in ("base", *ENVS):
             patch.setattr(pipeline_registry, "_selected", parameters(env))
-            found[env] = pipeline_registry.register_pipelines()
-    return found
+            pipelines[env] = pipeline_registry.register_pipelines()
+    return pipelines
 
 
 def datasets_of(pipelines):
@@ -73,16 +87,9 @@ def datasets_of(pipelines):
 
 def paths(env, names):
     """Where each dataset is stored."""
-    found = {}
-    for name in names:
-        config = entry(name, env)
-        path = config.get("filepath") or config.get("path")
-        if path is not None:
-            found[name] = path
-    return found
-
-
-# the catalog
+    entries = {name: entry(name, env) for name in names}
+    keys = ("filepath", "path")
+    return {n: one[key] for n, one in entries.items() for key in keys if one.get(key)}
 
 
 @pytest.mark.parametrize("env", ["base", *ENVS])
@@ -96,9 +103,7 @@ def test_every_dataset_has_an_entry_and_a_path_of_its_own_with_the_source(regist
     assert elsewhere == SHARED | ({PUBLISHED} if env == "published" else set())
     # what is read, and is there already, becomes the recordings in the end
     begun = (".raw_logs.files", ".raw_logs.earlier", ".raw_logs.inspected")
-    files = [
-        path for name, path in stored.items() if path != "mlflow.db" and not name.endswith(begun)
-    ]
+    files = [path for n, path in stored.items() if path != "mlflow.db" and not n.endswith(begun)]
     assert len(files) == len(set(files)) > 5
     # only messages between nodes stay in memory, and the reference to the recordings
     kept = [name for name in names if entry(name, env)["type"] == MEMORY]
@@ -107,35 +112,24 @@ def test_every_dataset_has_an_entry_and_a_path_of_its_own_with_the_source(regist
         assert name in names or name in configuration("base")["catalog"]
 
 
-@pytest.mark.parametrize(
-    "typo",
-    [
-        "sparkfun.ground_thruth.bias",
-        "augmentation.sparkfun.training.run",
-        "augmentation.sparkfun.windowed_splits.window",
-        "augmentation.reporting.result",
-        "reporting.table",
-    ],
-)
-def test_a_typo_has_none(typo):
-    assert entry_name("base", typo) is None
+def test_names_get_their_own_kind_of_dataset_and_typos_none(registered):
+    kinds = {name: entry(name)["type"].removeprefix("gyro_pipeline.datasets.") for name in KINDS}
+    assert kinds == KINDS
+    assert {entry_name("base", name) for name in TYPOS} == {None}
+    for name in datasets_of(registered["base"]):  # kedro viz shows it in the layer of its stage
+        assert entry(name)["metadata"]["kedro-viz"]["layer"] in name.split("."), name
 
 
 def test_every_parameter_and_every_pattern_is_used(registered):
     given = configuration("base")["parameters"]
     for pipeline in registered["base"].values():
         for name in pipeline.inputs():
-            found = given
+            value = given
             for key in name.removeprefix("params:").split(".") if "params:" in name else ():
-                assert key in found, name
-                found = found[key]
+                assert key in value, name
+                value = value[key]
     names = datasets_of(registered["base"])
     assert {entry_name("base", name) for name in names} == set(configuration("base")["catalog"])
-
-
-def test_kedro_viz_shows_every_dataset_in_the_layer_of_its_stage(registered):
-    for name in datasets_of(registered["base"]):
-        assert entry(name)["metadata"]["kedro-viz"]["layer"] in name.split("."), name
 
 
 def test_studies_that_take_long_are_pipelines_of_their_own(registered):
@@ -144,6 +138,8 @@ def test_studies_that_take_long_are_pipelines_of_their_own(registered):
         assert f"{study}.memsense.evaluation.runs" in pipelines[study].all_outputs()
         for name in ("__default__", "reporting"):
             assert not [one for one in datasets_of({name: pipelines[name]}) if f"{study}." in one]
+    for name, pipeline in pipelines.items():
+        assert (name == "leakage") == any("leakage" in node.name for node in pipeline.nodes), name
 
 
 def test_a_studys_runs_are_narrowed_to_it_and_tracked_ones_are_not():
@@ -164,9 +160,6 @@ def test_sources_never_share_a_path(registered):
         assert theirs & others == SHARED | ({PUBLISHED} if both_published else set())
 
 
-# environments
-
-
 def leaves(tree, place=()):
     """Places of all values that are no mappings."""
     if not isinstance(tree, dict):
@@ -180,14 +173,15 @@ def additions(tree, base):
     known |= {("sensors", name, key) for name in base["sensors"] for key in Sensor.model_fields}
     warm_up = {("simulated", "warm_up", key) for key in WarmUp.model_fields}
     known |= {("sensors", name, *key) for name in base["sensors"] for key in warm_up}
-    return {place for place in leaves(tree) if place not in known}
+    return leaves(tree) - known
 
 
 @pytest.mark.parametrize("env", ENVS)
 def test_an_environment_adds_no_key_that_base_lacks_and_no_file_that_is_not_read(env, parameters):
     assert {path.stem for path in (CONF / env).iterdir()} <= {"parameters", "globals", "catalog"}
     for kind in ("parameters", "globals"):
-        path = CONF / env / f"{kind}.yml"
+        path, base = CONF / env / f"{kind}.yml", dict(configuration("base")[kind])
         given = yaml.safe_load(path.read_text()) if path.exists() else {}
-        assert additions(given, dict(configuration("base")[kind])) == set()
+        assert additions(given, base) == set()
+        assert additions(given | {"stray": 1}, base) == {("stray",)}
     assert parameters(env).source == configuration(env)["globals"]["source"]

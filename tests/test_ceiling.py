@@ -28,6 +28,8 @@ from gyro_pipeline.pipelines.training.nodes import TrainingSets
 from gyro_pipeline.protocol.scores import beats_oracle, holm, squared_errors
 from gyro_pipeline.studies import CNN, RunSpec
 
+pytestmark = pytest.mark.slow
+
 NOISE, SPREAD, RECORDING_S = 3.3e-3, 0.31e-3, 87.0  # SparkFun's
 SAMPLES = 1300  # a tenth of its rate: what matters is N, not sigma
 RATE_HZ = SAMPLES / RECORDING_S

@@ -3,9 +3,7 @@
 import os
 import re
 import shutil
-import sys
 from collections import Counter
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
@@ -17,9 +15,8 @@ import xarray as xr
 from mlflow import MlflowClient
 
 from gyro_pipeline.estimators import ESTIMATORS, ORIENTATION_NOTE, make_estimator
-from gyro_pipeline.hooks import Session
 
-SERIAL = {"executor": "serial"}  # where few fits are not worth the start of processes
+SMOKE = ("--pipeline=augmentation", "--env=smoke")
 REPORT = "data/08_reporting/simulated_smoke"
 PAGE = f"{REPORT}/report"
 ROW = ["sensor", "estimator", "real_gyros", "virtual_gyros", "window_s"]
@@ -41,7 +38,6 @@ METRICS = {
     "accuracy_gain_pct_lo", "accuracy_gain_pct_hi", "time_saving_pct", "equivalent_time_s",
     "accuracy_gain_pct_first", "time_saving_pct_first",
 }  # fmt: skip
-LOSSES = {"train_loss", "val_loss"}
 # What `kedro run` writes: the five tables of the paper, every figure, and all results.
 FORMATS = {"tables": ("csv", "md", "tex"), "figures": ("png", "svg")}
 FIGURES = [
@@ -66,10 +62,14 @@ OTHERS = {
 }  # fmt: skip
 
 
-def files_of(names):
+def files_of(*kinds):
     pages = {"report.html", "report.md"}
-    return pages | {f"{kind}/{name}.{ending}" for kind in names for name in names[kind]
-                    for ending in FORMATS[kind]}  # fmt: skip
+    return pages | {f"{kind}/{name}.{ending}" for names in kinds for kind in names for name in names[kind]
+            for ending in FORMATS[kind]}  # fmt: skip
+
+
+def report(project):
+    return {path.removeprefix(f"{REPORT}/"): b for path, b in project.files(REPORT).items()}
 
 
 def row(run):
@@ -85,22 +85,8 @@ def identities(runs):
     return {run.info.run_id: (run.info.start_time, run.info.end_time) for run in runs}
 
 
-@dataclass(frozen=True)
-class Step:
-    """What there was after a command."""
-
-    code: int
-    output: str
-    runs: dict
-    report: dict
-    page: str
-
-
-def step(project, done):
-    runs = {study: project.runs(study) for study in ("augmentation", "real2real", "input_channels")}
-    report = {path.removeprefix(f"{REPORT}/"): b for path, b in project.files(REPORT).items()}
-    page = (project.folder / f"{PAGE}.md").read_text()
-    return Step(done.code, done.output, runs, report, page)
+def delete(project, run):
+    MlflowClient(f"sqlite:///{project.store}").delete_run(run.info.run_id)
 
 
 # The first run
@@ -114,27 +100,32 @@ def test_the_first_run_ends_well_and_says_where_to_look(smoke):
     assert "Traceback" not in smoke.done.output
 
 
-def test_rows_whose_estimator_uses_the_same_training_set_are_one_finished_run(smoke):
-    assert {run.info.status for run in smoke.runs} == {"FINISHED"}
-    places, windows = ("sparkfun", "dot"), ("10.0", "30.0")
+def test_rows_whose_estimator_uses_the_same_training_set_are_one_run_that_says_what_made_it(smoke):
+    sensors = ("sparkfun", "dot")
     assert Counter(map(row, smoke.runs)) == Counter([
-        *product(places, ["cnn"], ("3", "12"), ("0", "12", "24"), windows),
-        *product(places, ["residual_network"], ("3", "12"), ["0"], windows),
-        *product(places, ["mean", "training_mean", "best_linear"], ["3"], ["0"], windows),
+        *product(sensors, ["cnn"], ("3", "12"), ("0", "12", "24"), ["10.0"]),
+        *product(sensors, ["residual_network"], ("3", "12"), ["0"], ["10.0"]),
+        *product(sensors, ["mean", "training_mean", "best_linear"], ["3"], ["0"], ["10.0"]),
     ])  # fmt: skip
-
-
-def test_parameters_and_metrics_keep_their_names(smoke):
     for run in smoke.runs:
-        params, network = run.data.params, run.data.params["estimator"] == "cnn"
+        params, tags, network = run.data.params, run.data.tags, row(run)[1] == "cnn"
+        assert run.info.status == "FINISHED"
         virtual = VIRTUAL if params["virtual_gyros"] != "0" else set()
         assert set(params) == PARAMS | virtual | (HYPER_PARAMETERS if network else set())
         fixed = {"study": "augmentation", "source": "simulated_smoke", "method": "2", "folds": "1"}
         assert {name: params[name] for name in fixed} == fixed
-        names = METRICS | (LOSSES if network else {"coverage_95_pct"})
+        names = METRICS | ({"train_loss", "val_loss"} if network else {"coverage_95_pct"})
         assert names - {"equivalent_time_s"} <= set(run.data.metrics) <= names
         no_time = {"equivalent_time_s"} - set(run.data.metrics)  # it is said why
-        assert no_time == {"equivalent_time_s"} & set(run.data.tags)
+        assert no_time == {"equivalent_time_s"} & set(tags)
+        assert (tags["kedro_env"], tags["simulated"], tags["layout"]) == ("smoke", "1", "2")
+        assert re.fullmatch(
+            r"[0-9a-f]{16} [0-9a-f]{16}", f"{tags['lock_hash']} {tags['fingerprint']}"
+        )
+        assert {"kedro_run", "git_dirty", "mlflow.source.git.commit", "data_hash"} <= set(tags)
+        assert {"torch", "numpy", "python", "mlflow.user", "mlflow.source.name"} <= set(tags)
+        for part in (*row(run)[:2], f"{float(params['window_s']):g} s"):
+            assert part in tags["mlflow.runName"]
 
 
 def test_metrics_are_those_of_the_errors_kept_with_the_run(smoke):
@@ -149,27 +140,26 @@ def test_metrics_are_those_of_the_errors_kept_with_the_run(smoke):
         assert metrics["rmse_mdps"] == pytest.approx(1e3 * np.sqrt((errors.error_dps**2).mean()))
         ratio = metrics["rmse_mdps"] / metrics["mean_rmse_mdps"]
         assert metrics["accuracy_gain_pct"] == pytest.approx(100 * (1 - ratio))
-        scores = pd.read_csv(folder / "scores.csv").set_index(
-            ["weights", "truth", "windows", "score"]
-        )
+        scores = pd.read_csv(folder / "scores.csv")
+        scores = scores.set_index(["weights", "truth", "windows", "score"]).value
         first = errors[errors.start == 0]
-        rmse = scores.value["last", "paper", "first", "test_rmse_dps"]
+        rmse = scores["last", "paper", "first", "test_rmse_dps"]
         assert rmse == pytest.approx(np.sqrt((first.error_dps**2).mean()))
-        gain = scores.value["last", "paper", "first", "accuracy_gain_pct"]
+        gain = scores["last", "paper", "first", "accuracy_gain_pct"]
         assert metrics["accuracy_gain_pct_first"] == gain
 
 
 @pytest.mark.parametrize("estimator", ["cnn", "residual_network"])
 def test_the_model_of_a_run_makes_the_errors_that_it_was_judged_by(smoke, estimator, monkeypatch):
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{smoke.project.store}")
-    run = the_run(smoke.runs, "dot", estimator, "12", "0", "30.0")
+    run = the_run(smoke.runs, "dot", estimator, "12", "0", "10.0")
     model = mlflow.pyfunc.load_model(f"runs:/{run.info.run_id}/model")
     errors = pd.read_parquet(smoke.project.artifacts(run) / "errors.parquet")
     last = errors[(errors.truth == "paper") & (errors.weights == "last")]
     path = smoke.project.folder / "data/02_intermediate/simulated_smoke/dot/recordings.nc"
     with xr.open_dataset(path) as recordings:
         rates, rate_hz = recordings.angular_rate.sel(imu=1), recordings.attrs["rate_hz"]
-        size = round(30 * rate_hz)
+        size = round(10 * rate_hz)
         for (number, start), rows in last.groupby(["recording", "start"]):
             whole = rates.sel(recording=number).to_numpy().astype(float)
             asked = {"target": "recording_mean", "start_s": [start / rate_hz]}
@@ -178,26 +168,23 @@ def test_the_model_of_a_run_makes_the_errors_that_it_was_judged_by(smoke, estima
             assert bias - whole.mean(axis=-1) == pytest.approx(expected, abs=1e-8)
 
 
-def test_the_report_says_what_was_run_and_where_its_runs_are(smoke):
-    written = {path for path in smoke.files if path.startswith(REPORT)}
-    assert written == {f"{REPORT}/{name}" for name in files_of(AUGMENTATION)}
-    assert not [path for path in smoke.files if Path(path).name.startswith(".")]
-    html, text = (smoke.files[f"{PAGE}.{suffix}"].decode() for suffix in ("html", "md"))
+def test_the_report_says_what_was_run_links_its_runs_and_compares_with_the_paper(smoke):
+    project = smoke.project
+    assert set(report(project)) == files_of(AUGMENTATION)
+    assert not [path for path in project.files() if Path(path).name.startswith(".")]
+    html, text = ((project.folder / f"{PAGE}.{suffix}").read_text() for suffix in ("html", "md"))
     (experiment,) = {run.info.experiment_id for run in smoke.runs}
     for page in (html, text):
         assert "This is a smoke run, not a result." in page
         assert "7 of 8 published gains on these sensors are beyond" in page
         assert f"127.0.0.1:5000/#/experiments/{experiment}/runs" in page
     assert html.count("data:image/png") == len(AUGMENTATION["figures"])
-    every = smoke.files["data/08_reporting/report.html"].decode()
+    every = (project.folder / "data/08_reporting/report.html").read_text()
     assert 'href="simulated_smoke/report.html"' in every
-    results = smoke.files[f"{REPORT}/tables/augmentation_results.csv"].decode()
+    results = (project.folder / REPORT / "tables/augmentation_results.csv").read_text()
     assert all(run.info.run_id[:8] in results for run in smoke.runs)
-
-
-def test_tables_show_published_ours_and_the_ceiling_with_their_runs(smoke):
     three, multiple = (
-        pd.read_csv(smoke.project.folder / REPORT / "tables" / f"augmentation_{name}.csv")
+        pd.read_csv(project.folder / REPORT / "tables" / f"augmentation_{name}.csv")
         for name in ("three_gyroscopes", "multiple_gyroscopes")
     )
     assert three["Published S/A %"].tolist() == ["72/57", "84/79", "89/85"]
@@ -211,102 +198,65 @@ def test_tables_show_published_ours_and_the_ceiling_with_their_runs(smoke):
         assert three[column][0] == "{} [{}, {}]".format(*ends)
 
 
-def test_runs_say_what_made_them(smoke):
-    for run in smoke.runs:
-        tags = run.data.tags
-        assert (tags["kedro_env"], tags["simulated"], tags["layout"]) == ("smoke", "1", "2")
-        assert re.fullmatch(r"[0-9a-f]{16}", tags["lock_hash"])
-        assert re.fullmatch(r"[0-9a-f]{16}", tags["fingerprint"])
-        assert {"kedro_run", "git_dirty", "mlflow.source.git.commit", "data_hash"} <= set(tags)
-        assert {"torch", "numpy", "python", "mlflow.user", "mlflow.source.name"} <= set(tags)
-        for part in (*row(run)[:2], f"{float(run.data.params['window_s']):g} s"):
-            assert part in tags["mlflow.runName"]
+# What can happen next
 
 
-# Each of these does the next thing in the same project.
-
-
-@pytest.fixture(scope="module")
-def incomplete(smoke):
-    """A run is deleted, and the recordings of a sensor."""
-    project = smoke.project
-    run = the_run(smoke.runs, "dot", "cnn", "12", "24", "10.0")
-    MlflowClient(f"sqlite:///{project.store}").delete_run(run.info.run_id)
-    (project.folder / "data/02_intermediate/simulated_smoke/dot/recordings.nc").unlink()
-    return step(project, project.run_here("reporting", "smoke"))
-
-
-@pytest.fixture(scope="module")
-def changed(smoke, incomplete):
-    only = {"sensor": "dot", "real_gyros": 3, "virtual_gyros": 0, "window_s": 10}
-    changes = {"only": only, "training": {"hidden": 33}, "execution": SERIAL}
-    return step(smoke.project, smoke.project.run_here("augmentation", "smoke", **changes))
-
-
-@pytest.fixture(scope="module")
-def whole(smoke, changed):
-    return step(smoke.project, smoke.project.run_here("__default__", "smoke", execution=SERIAL))
-
-
-def test_reporting_trains_nothing_and_says_in_rows_what_is_missing(smoke, incomplete):
-    assert incomplete.code == 0, incomplete.output
-    assert len(incomplete.runs["augmentation"]) == len(smoke.runs) - 1
-    table = pd.read_csv(
-        smoke.project.folder / REPORT / "tables/augmentation_multiple_gyroscopes.csv"
-    )
-    assert table["Note"].tolist()[1:] == ["not run"] * 2 or table["Note"].tolist()[2] == "not run"
+def test_reporting_trains_nothing_and_says_in_rows_what_is_missing(smoke, smoke_copy):
+    before = report(smoke_copy)
+    delete(smoke_copy, the_run(smoke.runs, "dot", "cnn", "12", "24", "10.0"))
+    (smoke_copy.folder / "data/02_intermediate/simulated_smoke/dot/recordings.nc").unlink()
+    done, written = smoke_copy.command("--pipeline=reporting", "--env=smoke"), report(smoke_copy)
+    assert done.code == 0, done.output
+    assert len(smoke_copy.runs("augmentation")) == len(smoke.runs) - 1
+    table = pd.read_csv(smoke_copy.folder / REPORT / "tables/augmentation_multiple_gyroscopes.csv")
+    assert table["Note"].fillna("").tolist() == ["", "", "not run"]
     three = "tables/augmentation_three_gyroscopes.md"
-    assert incomplete.report[three] == smoke.files[f"{REPORT}/{three}"]
-    makes = incomplete.page.partition("### What was not made")[2]
-    assert "| kedro run --env=smoke | 1 of " in makes
-    assert makes.count("kedro run") == 4  # that, and studies that take long
+    assert written[three] == before[three]
+    _, _, lacking = written["report.md"].decode().partition("### What was not made")
+    assert "| kedro run --env=smoke |" in lacking
 
 
-def test_other_settings_train_anew_and_leave_the_report_of_the_study(smoke, incomplete, changed):
-    assert changed.code == 0, changed.output
-    assert "5 runs planned, 4 skipped" in changed.output
-    before = identities(incomplete.runs["augmentation"])
-    assert before.items() <= identities(changed.runs["augmentation"]).items()
-    (new,) = [run for run in changed.runs["augmentation"] if run.info.run_id not in before]
+def test_another_hyper_parameter_trains_anew_and_keeps_what_was(smoke, smoke_copy):
+    only = "only.sensor=dot,only.real_gyros=3,only.virtual_gyros=0,only.window_s=10"
+    done = smoke_copy.command(*SMOKE, f"--params=training.hidden=33,{only}")
+    assert done.code == 0, done.output
+    assert "5 runs planned, 4 skipped" in done.output
+    before, runs = identities(smoke.runs), smoke_copy.runs("augmentation")
+    assert before.items() <= identities(runs).items()
+    (new,) = [run for run in runs if run.info.run_id not in before]
     assert new.data.params["hidden"] == "33"
     assert row(new) == ("dot", "cnn", "3", "0", "10.0")
-    of_study = {path: b for path, b in changed.report.items() if not path.startswith("only")}
-    assert of_study == incomplete.report
-    (own,) = [path for path in changed.report if path.endswith("/tables/augmentation_results.csv")]
-    assert own.startswith("only.real_gyros=3,only.sensor=dot")
-    results = changed.report[own].decode()
-    shown = [run for run in changed.runs["augmentation"] if run.info.run_id[:8] in results]
+    # it has a report of its own, and leaves that of the study
+    written = report(smoke_copy)
+    assert report(smoke.project).items() <= written.items()
+    (own,) = [path for path in written if path.startswith("only") and path.endswith("results.csv")]
+    shown = [run for run in runs if run.info.run_id[:8] in written[own].decode()]
     assert [run for run in shown if run.data.params["estimator"] == "cnn"] == [new]
-    assert f"{own.partition('/')[0]}/report.html" in changed.output
+    assert f"{own.partition('/')[0]}/report.html" in done.output
 
 
-def test_a_whole_run_skips_what_is_there_and_shares_what_another_study_has(smoke, changed, whole):
+def test_a_whole_run_shares_what_another_study_has(smoke, smoke_copy):
+    whole = smoke_copy.command("--env=smoke")
     assert whole.code == 0, whole.output
-    before = identities(changed.runs["augmentation"])
-    assert before.items() <= identities(whole.runs["augmentation"]).items()
+    assert identities(smoke_copy.runs("augmentation")) == identities(smoke.runs)
     for line in (
-        "augmentation dot: 22 runs planned, 21 skipped (made before), 0 shared",
-        "augmentation: 1 finished runs with other settings or data are in the store and not used",
+        "real2real dot: 11 runs planned, 0 skipped (made before), 7 shared with another study, 4",
+        "input_channels sparkfun: 5 runs planned, 0 skipped (made before), 2 shared",
     ):
         assert line in whole.output
-    written = {path for path in whole.report if not path.startswith("only")}
-    assert written == files_of(AUGMENTATION) | files_of(OTHERS)
-    twins = {run.data.tags["fingerprint"]: run for run in whole.runs["augmentation"]}
-    others = whole.runs["real2real"] + whole.runs["input_channels"]
+    written = report(smoke_copy)
+    assert set(written) == files_of(AUGMENTATION, OTHERS)
+    twins = {run.data.tags["fingerprint"]: run for run in smoke.runs}
+    others = smoke_copy.runs("real2real") + smoke_copy.runs("input_channels")
     assert {run.info.status for run in others} == {"FINISHED"}
     for run in others:
+        assert run.data.params["method"] == "2" or run.data.params["real_gyros"] != "3"
         twin = twins.get(run.data.tags["fingerprint"])
-        one_imu = run.data.params["real_gyros"] == "3"
-        assert run.data.params["method"] == "2" or not one_imu
         if twin is not None:
             assert row(run) == row(twin)
             assert run.data.metrics == pytest.approx(twin.data.metrics, rel=1e-4)
             if run.data.params["estimator"] == "cnn":
-                assert smoke.project.weights(run) == smoke.project.weights(twin)
-    assert "kedro run --env=smoke" not in whole.page
-
-
-# A stranger's estimator, and all of our own
+                assert smoke_copy.weights(run) == smoke.project.weights(twin)
 
 
 LARGEST = """
@@ -322,98 +272,85 @@ class Largest(Estimator):
     def _estimate(self, windows):
         return self.imus, np.nan
 """
+UP_TO_DATE = r"(\d+) of (\d+) nodes are up to date and not run again \((.*)\)"
 
 
-@pytest.fixture(scope="module")
-def strangers(new_project):
+def test_an_estimator_of_ones_own_is_trained_on_what_rows_name_and_only_what_changed_runs_again(
+    new_project, monkeypatch
+):
     project = new_project()
     (project.folder / "src/of_a_stranger.py").write_text(LARGEST)
-    changes = {"studies": {"augmentation": {"estimators": ["cnn", "of_a_stranger:Largest"]}}}
-    changes |= {"training": {"epochs": 1}, "only": {"sensor": "sparkfun", "window_s": 30}}
-    changes |= {"execution": SERIAL}
-    return project, project.run_here("augmentation", "smoke", **changes), changes
+    asked = {
+        "studies": {"augmentation": {"estimators": ["cnn", "of_a_stranger:Largest"]}},
+        "training": {"epochs": 1},
+        "only": {"sensor": "sparkfun", "window_s": 30},
+        "execution": {"executor": "serial"},
+    }
 
+    def run(pipeline="augmentation", **changes):
+        return project.run_here(pipeline, "smoke", changed_only=True, **asked | changes)
 
-def test_rows_of_a_strangers_estimator_are_trained_on_what_they_name(strangers):
-    project, done, _ = strangers
+    done = run()
     assert done.code == 0, done.output
-    every = project.runs("augmentation")
-    runs = [run for run in every if run.data.params["estimator"] not in ("mean", "cnn")]
+    runs = project.runs("augmentation")
+    own = [run for run in runs if run.data.params["estimator"] not in ("mean", "cnn")]
     names = ("real_gyros", "virtual_gyros")
-    counts = {run.info.run_id: tuple(int(run.data.params[name]) for name in names) for run in runs}
+    counts = {run.info.run_id: tuple(int(run.data.params[name]) for name in names) for run in own}
     assert Counter(counts.values()) == Counter(product((3, 12), (0, 12, 24)))
-    uri = f"sqlite:///{project.store}"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("MLFLOW_TRACKING_URI", uri)
-        for run_id, (real, virtual) in counts.items():
-            model = mlflow.pyfunc.load_model(f"runs:/{run_id}/model")
-            said = model.predict(np.zeros((1, 3, 450)))["bias_dps"]
-            assert said.tolist() == [[(real + virtual) / 3] * 3]
-
-
-def test_a_second_run_does_nothing_a_change_runs_what_follows_and_a_named_node_is_run(
-    strangers, monkeypatch
-):
-    project, _, changes = strangers
-    up_to_date = r"(\d+) of (\d+) nodes are up to date and not run again \((.*)\)"
-    monkeypatch.setattr(sys.modules[type(project).__module__], "KedroSession", Session)
-    first = project.run_here("augmentation", "smoke", **changes)
-    assert not re.search(up_to_date, first.output)  # nodes that no such session has run
-    states, runs = project.files(), identities(project.runs("augmentation"))
-    again = project.run_here("virtual_gyros", "smoke", **changes)
-    left, nodes, _ = re.search(up_to_date, again.output).groups()
-    assert (again.code, left) == (0, nodes)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{project.store}")
+    for run_id, (real, virtual) in counts.items():
+        model = mlflow.pyfunc.load_model(f"runs:/{run_id}/model")
+        said = model.predict(np.zeros((1, 3, 450)))["bias_dps"]
+        assert said.tolist() == [[(real + virtual) / 3] * 3]
+    monkeypatch.delenv("MLFLOW_TRACKING_URI")
+    # nothing changed
+    states = project.files()
+    left, nodes, _ = re.search(UP_TO_DATE, run("virtual_gyros").output).groups()
+    assert left == nodes
     assert project.files() == states
-    again = project.run_here("augmentation", "smoke", **changes)  # tables that lack runs are tried
-    assert re.search(up_to_date, again.output)
-    assert "runs planned" not in again.output
-    assert "runs evaluated" not in again.output
-    assert identities(project.runs("augmentation")) == runs
+    again = run().output  # tables that lack runs are tried
+    assert re.search(UP_TO_DATE, again)
+    assert "runs planned" not in again
+    assert "runs evaluated" not in again
+    assert identities(project.runs("augmentation")) == identities(runs)
+    # a setting of a late stage changed
+    other = run(evaluation={"resamples": 160})
+    assert other.code == 0, other.output
+    stages = set(re.search(UP_TO_DATE, other.output)[3].split(", "))
+    assert {"raw_logs", "ground_truth", "virtual_gyros", "training"} <= stages
+    assert "evaluation" not in stages
+    assert "runs planned" not in other.output
+    assert f"sparkfun: {len(runs)} runs evaluated, 0 skipped" in other.output
+    # a node that is named is run
     bias = project.folder / "data/03_primary/simulated_smoke/sparkfun/bias.csv"
     before = bias.stat().st_mtime_ns
-    named = project.kedro_run(
-        "--pipeline=ground_truth", "--env=smoke", "--nodes=ground_truth.bias_sparkfun"
-    )
+    node = "--nodes=ground_truth.bias_sparkfun"
+    named = project.command("--pipeline=ground_truth", "--env=smoke", node)
     assert named.code == 0, named.output
     assert bias.stat().st_mtime_ns > before
 
 
-@pytest.fixture(scope="module")
-def estimators(new_project):
-    """Of one sensor and window, made, and asked for again."""
+def test_every_estimator_is_a_finished_run_with_a_model_and_a_row_of_the_comparison(
+    new_project, parameters
+):
     project = new_project()
-    only = {"sensor": "sparkfun", "window_s": 10}
-    done = project.run_here("estimators", "smoke", only=only)
-    made = project.runs("estimators")
-    return project, done, made, project.run_here("estimators", "smoke", only=only)
-
-
-def test_every_estimator_is_a_finished_run_with_a_model(estimators, parameters):
-    _, done, runs, again = estimators
+    only = "--params=only.sensor=sparkfun,only.window_s=10"
+    done = project.command("--pipeline=estimators", "--env=smoke", only)
     assert done.code == 0, done.output
-    every = [name for name in ESTIMATORS if name != "cnn_shuffled"]
-    assert sorted(run.data.params["estimator"] for run in runs) == sorted(every)
-    for run in runs:
-        name, tags = run.data.params["estimator"], run.data.tags
+    runs = {run.data.params["estimator"]: run for run in project.runs("estimators")}
+    assert set(runs) == {*ESTIMATORS} - {"cnn_shuffled"}
+    for name, run in runs.items():
         made = make_estimator(name, parameters().training, 0)
         assert run.info.status == "FINISHED"
         assert len(run.outputs.model_outputs) == 1
-        assert ("uses_prior" in tags) == made.uses_prior
-        assert tags["recommended"] == str(made.recommended)
+        assert ("uses_prior" in run.data.tags) == made.uses_prior
+        assert run.data.tags["recommended"] == str(made.recommended)
         no_sigma = {"median", "trimmed_mean", "ridge", "ridge_same_time", "window_mean_network"}
         assert ("coverage_95_pct" in run.data.metrics) == (name not in no_sigma | {"cnn"})
-    assert f"sparkfun: 0 runs evaluated, {len(every)} skipped" in again.output
-    assert f"{len(every)} skipped (made before)" in again.output
-
-
-def test_estimators_are_compared_in_the_report(estimators):
-    project, _, runs, _ = estimators
     (path,) = (project.folder / REPORT).glob("only*/tables/estimators_comparison.csv")
-    table = pd.read_csv(path)
-    table = table.set_index("Estimator")
-    assert {run.data.params["estimator"] for run in runs} | {"cnn_best"} == set(table.index)
-    (ridge,) = [run for run in runs if run.data.params["estimator"] == "ridge"]
-    rmse = ridge.data.metrics["rmse_mdps"]
+    table = pd.read_csv(path).set_index("Estimator")
+    assert set(table.index) == {*runs, "cnn_best"}
+    rmse = runs["ridge"].data.metrics["rmse_mdps"]
     assert table["RMSE mdps"]["ridge"] == pytest.approx(rmse, abs=1e-3)
     page = (path.parents[1] / "report.md").read_text()
     assert "SparkFun, estimators: error relative to the mean" in page
@@ -424,69 +361,45 @@ def test_estimators_are_compared_in_the_report(estimators):
 # The real file
 
 
-@pytest.fixture(scope="module")
-def memsense(new_project):
+def test_the_real_file_has_known_errors_and_stands_beside_the_simulated_one(smoke_copy):
     folder, name = os.environ.get("GYRO_PIPELINE_REAL_DATA", ""), "memsense_test_real.npy"
     if not folder or not Path(folder, name).is_file():
         pytest.skip(f"GYRO_PIPELINE_REAL_DATA names no folder with {name}")
-    project = new_project()
-    raw = project.folder / "data/01_raw/published"
+    project, raw = smoke_copy, smoke_copy.folder / "data/01_raw/published"
     raw.mkdir(parents=True)
     shutil.copy(Path(folder, name), raw)
-    settings = {"training": {"epochs": 2}, "splits": {"validation_recordings": 2}}
-    done = project.run_here("real2real", "memsense_real", **settings, execution=SERIAL)
-    return project, done, project.runs("real2real")
+    few = {"training": {"epochs": 2}, "only": {"window_s": 10}, "execution": {"executor": "serial"}}
+    known = ["mean", "training_mean", "empirical_bayes", "best_linear"]
+    few["splits"] = {"validation_recordings": 2}  # as on the simulated ones
+    few["studies"] = {"estimators": {"windows_s": [10], "estimators": known}}
 
+    def run(pipeline, env="memsense_real"):
+        done = project.run_here(pipeline, env, changed_only=True, **few)
+        assert done.code == 0, done.output
+        stored = [run for run in project.runs(pipeline) if run.data.params["source"] == "published"]
+        return {run.data.params["estimator"]: run for run in stored}
 
-def test_on_the_real_file_all_folds_are_one_run_with_a_model_of_all_recordings(memsense):
-    _, done, runs = memsense
-    assert done.code == 0, done.output
-    names = ("mean", "cnn", "residual_network")
-    kinds = Counter((r.data.params["estimator"], r.data.params["window_s"]) for r in runs)
-    assert kinds == Counter(product(names, ("10.0", "30.0")))
-    for run in runs:
-        params, tags = run.data.params, run.data.tags
-        assert run.info.status == "FINISHED"
-        assert (params["sensor"], params["source"]) == ("memsense", "published")
-        assert (params["folds"], tags["simulated"]) == ("11", "0")
+    # all folds are one run, whose model is fitted to all recordings
+    runs = run("real2real")
+    assert set(runs) == {"mean", "cnn", "residual_network"}
+    for one in runs.values():
+        params, tags = one.data.params, one.data.tags
+        assert one.info.status == "FINISHED"
+        assert (params["sensor"], params["folds"], tags["simulated"]) == ("memsense", "11", "0")
         assert tags["model_fold"] == "all recordings"
         assert "fitted once more, to all recordings" in tags["mlflow.note.content"]
-
-
-def test_the_running_means_error_on_the_real_file_is_the_known_one(memsense):
-    _, done, runs = memsense
-    mean = the_run(runs, "memsense", "mean", "3", "0", "10.0")
-    assert f"{mean.data.metrics['rmse_mdps']:.3f}" == "1.508"
-    (line,) = [one for one in done.output.splitlines() if "memsense mean 3+0 10 s" in one]
-    assert line.endswith(": RMSE 1.5083 mdps in all windows, 1.5854 in the first")
-
-
-def test_the_real_file_stands_beside_the_simulated_one_in_the_report(memsense):
-    project, _, runs = memsense
-    changes = {"training": {"epochs": 2}, "only": {"window_s": 10}}
-    done = project.run_here("real2real", "smoke", **changes, execution=SERIAL)
-    assert done.code == 0, done.output
-    table = pd.read_csv(project.folder / REPORT / "tables/real2real_generalization.csv")
-    assert table["Sensor"].tolist() == ["sparkfun", "dot", "ng", "memsense", "memsense"]
-    measured = table.iloc[-1]
-    assert measured["Source"] == "published (measured)"
-    assert measured["Split"] == "k-fold, 11 folds"
-    assert measured["Published S/A %"] == "75/75 (6 real)"
-    names = ("cnn", "residual_network")
-    both = [the_run(runs, "memsense", name, "3", "0", "10.0") for name in names]
-    assert measured["Runs"].split() == [run.info.run_id[:8] for run in both]
-
-
-def test_estimators_without_a_network_reach_on_the_real_file_what_is_known(memsense):
-    project, _, _ = memsense
-    asked = ["mean", "training_mean", "empirical_bayes", "best_linear"]
-    studies = {"estimators": {"windows_s": [10], "estimators": asked}}
-    done = project.run_here("estimators", "memsense_real", studies=studies)
-    assert done.code == 0, done.output
-    runs = {run.data.params["estimator"]: run.data for run in project.runs("estimators")}
-    assert set(runs) == set(asked)
-    rmse = {name: run.metrics["rmse_mdps"] for name, run in runs.items()}
+    assert f"{runs['mean'].data.metrics['rmse_mdps']:.4f}" == "1.5083"
+    # what estimators without a network reach
+    estimated = run("estimators")
+    assert set(estimated) == set(known)
+    rmse = {name: run.data.metrics["rmse_mdps"] for name, run in estimated.items()}
     assert f"{rmse['training_mean']:.4f}" == "1.4536"
     assert 0.53 < rmse["empirical_bayes"] / rmse["mean"] <= 0.72
     assert 0.53 < rmse["best_linear"] / rmse["mean"] <= 0.72
-    assert 88 <= runs["best_linear"].metrics["coverage_95_pct"] <= 99
+    assert 88 <= estimated["best_linear"].data.metrics["coverage_95_pct"] <= 99
+    # in the report of its source
+    (path,) = (project.folder / "data/08_reporting").glob("published/*/tables/real2real_gen*.csv")
+    measured = pd.read_csv(path).iloc[-1]
+    assert (measured["Sensor"], measured["Published S/A %"]) == ("memsense", "75/75")
+    networks = [runs[name].info.run_id[:8] for name in ("cnn", "residual_network")]
+    assert measured["Runs"].split() == networks

@@ -1,14 +1,7 @@
 """``kedro run --pipeline=leakage`` on the smoke environment; no other run has any of it."""
 
-from pathlib import Path
-
 import pandas as pd
-import pytest
-from kedro.framework.startup import bootstrap_project
 
-from gyro_pipeline import pipeline_registry
-
-ROOT = Path(__file__).parents[1]
 FEW = {"strides_s": [10], "folds": 2, "training": {"steps": 4}, "recordings": 4}
 REPORT = "data/08_reporting/simulated_smoke"
 WRITTEN = {
@@ -26,25 +19,22 @@ WAYS = {
 }
 
 
-@pytest.fixture(scope="module")
-def project(new_project):
-    return new_project()
+def test_each_way_of_training_is_one_run_made_once_and_shares_nothing_with_another_study(
+    new_project,
+):
+    project = new_project()
 
+    def run(pipeline="leakage", study=FEW, **params):
+        given = {"execution": {"executor": "serial"}}
+        return project.run_here(pipeline, "smoke", studies={"leakage": study}, **given | params)
 
-def run(project, pipeline="leakage", study=FEW, **params):
-    given = {"execution": {"executor": "serial"}, "evaluation": {"resamples": 100}}
-    return project.run_here(pipeline, "smoke", studies={"leakage": study}, **given | params)
+    refused = run(only={"sensor": "dot"})
+    assert refused.code != 0
+    assert "only={'sensor': 'dot'} matches nothing in leakage" in refused.output
 
-
-@pytest.fixture(scope="module")
-def first(project):
-    done = run(project)
-    return done, project.runs("leakage"), project.files()
-
-
-def test_each_way_of_training_is_one_finished_run_that_says_what_it_is(first):
-    done, runs, files = first
+    done = run()
     assert done.code == 0, done.output
+    runs = project.runs("leakage")
     ways = {(one.data.params["protocol"], one.data.params["estimator"]): one for one in runs}
     assert len(runs) == len(ways)
     fits = {way: one.data.tags["fits"].count(";") for way, one in ways.items()}
@@ -54,46 +44,22 @@ def test_each_way_of_training_is_one_finished_run_that_says_what_it_is(first):
         assert one.data.params["window_stride_s"] == "10.0"
         assert protocol in one.info.run_name
         assert protocol in one.data.tags["mlflow.note.content"]
-    leaks = [path for path in files if path.startswith(REPORT) and "leakage_" in path]
+    leaks = [path for path in project.files(REPORT) if "leakage_" in path]
     assert {"/".join(path.split("/")[-2:]) for path in leaks} == WRITTEN
-    (results,) = [path for path in files if path.endswith("leakage/results.csv")]
-    assert len(files[results].splitlines()) == 1 + 5
+    (results,) = [path for path in project.files() if path.endswith("leakage/results.csv")]
+    assert len((project.folder / results).read_text().splitlines()) == 1 + 5
 
-
-def test_a_second_run_trains_nothing_and_another_stride_only_its_own(project, first):
-    again = run(project)
-    assert again.code == 0, again.output
-    assert "leakage memsense: 7 runs planned, 7 skipped (made before), 0 shared" in again.output
-    assert "memsense: 0 runs evaluated, 7 skipped" in again.output
-    more = run(project, study=FEW | {"strides_s": [10, 20]})
+    more = run(study=FEW | {"strides_s": [10, 20]})
     assert more.code == 0, more.output
     assert "14 runs planned, 7 skipped (made before)" in more.output
+    assert "memsense: 7 runs evaluated, 7 skipped" in more.output
     paths = (project.folder / REPORT).rglob("tables/leakage_results.csv")
     table = pd.read_csv(max(paths, key=lambda path: path.stat().st_mtime))
     assert table["Window stride s"].tolist() == [10, 20]
 
-
-def test_a_study_on_the_same_recordings_shares_nothing_with_it(project, first):
     only = {"sensor": "memsense", "real_gyros": 3, "window_s": 10}
-    done = run(project, "real2real", only=only, training={"epochs": 2})
-    assert done.code == 0, done.output
-    assert "3 runs planned, 0 skipped (made before), 0 shared with another study" in done.output
+    other = run("real2real", only=only, training={"epochs": 2})
+    assert other.code == 0, other.output
+    assert "3 runs planned, 0 skipped (made before), 0 shared with another study" in other.output
     (page,) = [path for path in project.files(REPORT) if "only" in path and path.endswith("t.md")]
     assert "on purpose" not in project.files(REPORT)[page].decode()
-
-
-def test_an_only_without_its_sensor_is_refused(project):
-    done = run(project, only={"sensor": "dot"})
-    assert done.code != 0
-    assert "only={'sensor': 'dot'} matches nothing in leakage" in done.output
-
-
-def test_no_other_pipeline_has_any_of_its_nodes(monkeypatch, parameters):
-    bootstrap_project(ROOT)
-    monkeypatch.setattr(pipeline_registry, "_selected", parameters("base"))
-    registered = pipeline_registry.register_pipelines()
-    own = {node.name for node in registered["leakage"].nodes if "leakage" in node.name}
-    assert own
-    for name, pipeline in registered.items():
-        found = {node.name for node in pipeline.nodes if "leakage" in node.name}
-        assert found == (own if name == "leakage" else set()), name

@@ -8,30 +8,19 @@ import pytest
 from nbclient import NotebookClient
 
 ROOT = Path(__file__).parents[1]
-NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+NOTEBOOKS = [
+    ROOT / f"notebooks/{name}.ipynb" for name in ("01_explore_recordings", "02_compare_runs")
+]
 
 # The kernel is another process; what it is sent and how is not our concern.
 pytestmark = pytest.mark.filterwarnings("ignore")
 
 
-def test_there_are_two():
-    assert [path.name for path in NOTEBOOKS] == [
-        "01_explore_recordings.ipynb",
-        "02_compare_runs.ipynb",
-    ]
-
-
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_it_is_stored_without_results(path):
-    cells = nbformat.read(path, as_version=4).cells
-    code = [cell for cell in cells if cell.cell_type == "code"]
+def test_it_is_stored_without_results_and_runs(path, smoke, monkeypatch):
+    code = [cell for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
     assert code
-    assert [cell.outputs for cell in code] == [[]] * len(code)
-    assert {cell.execution_count for cell in code} == {None}
-
-
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_it_runs(path, smoke, monkeypatch):
+    assert [(cell.outputs, cell.execution_count) for cell in code] == [([], None)] * len(code)
     monkeypatch.setenv("KEDRO_ENV", "smoke")
     monkeypatch.setenv("PYTHONPATH", str(ROOT / "src"))
     folder = smoke.project.folder / "notebooks"

@@ -4,7 +4,6 @@ import os
 import re
 import signal
 import time
-from dataclasses import dataclass
 
 import psutil
 import pytest
@@ -14,49 +13,44 @@ SENSOR = "dot"
 COMMAND = ("--pipeline=augmentation", "--env=smoke", f"--params=only.sensor={SENSOR}")
 TRAINED = "select count(*) from tags where key = 'trained'"
 FINISHED = "select count(*) from runs where status = 'FINISHED'"
-RUNS, SOME, MOST = 18, 4, 10
-
-
-@dataclass(frozen=True)
-class Stopped:
-    """What there was right after a run had been stopped."""
-
-    code: int
-    output: str
-    survivors: list
-    runs: list
-
-    @property
-    def trained(self):
-        return {run.info.run_id: run for run in self.runs if "trained" in run.data.tags}
-
-    @property
-    def finished(self):
-        return [run for run in self.runs if run.info.status == "FINISHED"]
+RUNS, SOME = 9, 2
+WAYS = [(signal.SIGKILL, TRAINED, SOME), (signal.SIGINT, FINISHED, 1)]
 
 
 def stop(project, how, query, at_least):
-    """Start the run, stop it when the store shows so much progress, and look around."""
-    log = project.folder / "terminal.log"
-    process = project.start(*COMMAND, log=log)
+    """Start the run, stop it when the store shows so much progress, and look around.
+
+    Returns:
+        What it said, and the runs that were left.
+    """
+    process = project.start(*COMMAND)
     try:
         deadline = time.monotonic() + PATIENCE_S
         while process.poll() is None and project.count(query) < at_least:
             assert time.monotonic() < deadline, "nothing happened"
             time.sleep(0.01)
-        assert process.poll() is None, log.read_text()
+        assert process.poll() is None, project.log.read_text()
         workers = psutil.Process(process.pid).children(recursive=True)
         if how == signal.SIGINT:  # Ctrl-C reaches all that the terminal runs
             os.killpg(process.pid, how)
         else:
             os.kill(process.pid, how)
-        code = process.wait(PATIENCE_S)
+        assert process.wait(PATIENCE_S) != 0
     finally:
         process.kill()
     _, survivors = psutil.wait_procs(workers, timeout=30)
     for worker in survivors:  # to be found, not to be left behind
         worker.kill()
-    return Stopped(code, log.read_text(), survivors, project.runs("augmentation"))
+    assert survivors == []
+    return project.log.read_text(), project.runs("augmentation")
+
+
+def trained(runs):
+    return {run.info.run_id: run for run in runs if "trained" in run.data.tags}
+
+
+def finished(runs):
+    return [run for run in runs if run.info.status == "FINISHED"]
 
 
 def number(words, output):
@@ -64,57 +58,34 @@ def number(words, output):
     return int(re.search(rf"(\d+) {words}", output)[1])
 
 
-@pytest.fixture(scope="module")
-def stops(new_project):
-    """Killed while it trains, interrupted while it trains on, and killed while it evaluates."""
+def test_what_was_made_is_not_made_again_and_in_the_end_it_is_as_if_nothing_had_stopped_it(
+    smoke, new_project
+):
+    """Killed while it trains, and interrupted while it evaluates."""
     project = new_project()
-    ways = [(signal.SIGKILL, TRAINED, SOME), (signal.SIGINT, TRAINED, MOST)]
-    ways.append((signal.SIGKILL, FINISHED, 3))
-    return project, [stop(project, *way) for way in ways]
-
-
-@pytest.fixture(scope="module")
-def completed(stops):
-    project, _ = stops
-    done = project.kedro_run(*COMMAND)
-    return done, project.runs("augmentation")
-
-
-def test_a_stopped_run_fails_takes_its_workers_along_and_looks_finished_nowhere(stops):
-    project, (killed, interrupted, evaluating) = stops
-    for one in (killed, interrupted, evaluating):
-        assert one.code != 0, one.output
-        assert one.survivors == []
-        for run in one.finished:
-            kept = {path.name for path in project.artifacts(run).iterdir()}
-            assert {"errors.parquet", "scores.csv"} <= kept
-            assert {"rmse_mdps", "accuracy_gain_pct"} <= set(run.data.metrics)
-    assert SOME <= len(killed.trained) < MOST <= len(interrupted.trained) < RUNS
-    assert killed.finished == interrupted.finished == []
-    assert len(evaluating.trained) == RUNS
-    assert 3 <= len(evaluating.finished) < RUNS
-
-
-def test_what_was_made_is_not_made_again(stops, completed):
-    _, (killed, interrupted, evaluating) = stops
-    done, runs = completed
+    project.amend("smoke", **smoke.changes)
+    stops = [stop(project, *way) for way in WAYS]
+    done = project.command(*COMMAND)
     assert done.code == 0, done.output
-    for before, after in ((killed, interrupted), (interrupted, evaluating)):
-        assert number(r"skipped \(made before\)", after.output) == len(before.trained)
-        assert number("to fit", after.output) == RUNS - len(before.trained)
+    killed, interrupted = (runs for _, runs in stops)
+    assert SOME <= len(trained(killed)) < RUNS == len(trained(interrupted))
+    assert finished(killed) == []
+    assert 1 <= len(finished(interrupted)) < RUNS
+    for run in finished(interrupted):
+        kept = {path.name for path in project.artifacts(run).iterdir()}
+        assert {"errors.parquet", "scores.csv"} <= kept
+        assert {"rmse_mdps", "accuracy_gain_pct"} <= set(run.data.metrics)
+    assert number(r"skipped \(made before\)", stops[1][0]) == len(trained(killed))
+    assert number("to fit", stops[1][0]) == RUNS - len(trained(killed))
     assert number("to fit", done.output) == 0
-    assert number("runs evaluated", done.output) == RUNS - len(evaluating.finished)
+    assert number("runs evaluated", done.output) == RUNS - len(finished(interrupted))
+
+    runs = project.runs("augmentation")
     by_id = {run.info.run_id: run.data.tags for run in runs}
-    for one in (killed, interrupted, evaluating):
-        for run_id, run in one.trained.items():
-            for tag in ("trained", "process", "kedro_run"):
-                assert by_id[run_id][tag] == run.data.tags[tag]
-
-
-def test_in_the_end_every_run_is_there_once_as_if_nothing_had_stopped_it(stops, completed, smoke):
-    project, _ = stops
-    _, runs = completed
-    assert {run.info.status for run in runs} == {"FINISHED"}
+    for run_id, run in (trained(killed) | trained(interrupted)).items():
+        for tag in ("trained", "process", "kedro_run"):
+            assert by_id[run_id][tag] == run.data.tags[tag]
+    assert len(finished(runs)) == len(runs)
     again = {run.data.tags["fingerprint"]: run for run in runs}
     undisturbed = [run for run in smoke.runs if run.data.params["sensor"] == SENSOR]
     assert len(runs) == len(again) == len(undisturbed) == RUNS

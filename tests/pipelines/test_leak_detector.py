@@ -16,6 +16,8 @@ from gyro_pipeline.datasets.array_logs import ArrayLogs
 from gyro_pipeline.pipelines.reporting.leakage import WAYS, pool_leakage
 from gyro_pipeline.studies import CNN, CNN_SHUFFLED
 
+pytestmark = pytest.mark.slow
+
 REAL_FILE = "memsense_test_real.npy"
 
 
