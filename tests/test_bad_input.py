@@ -135,6 +135,12 @@ def test_a_file_in_place_of_a_folder(new_project, place):
         assert set(project.files()) == {place}
 
 
+def damage(store):
+    content = bytearray(store.read_bytes())
+    content[12288:163840] = bytes(151552)
+    store.write_bytes(content)
+
+
 def foreign(store):
     store.unlink()
     with sqlite3.connect(store) as connection:

@@ -63,9 +63,14 @@ OTHERS = {
 
 
 def files_of(*kinds):
-    pages = {"report.html", "report.md"}
-    return pages | {f"{kind}/{name}.{ending}" for names in kinds for kind in names for name in names[kind]
-            for ending in FORMATS[kind]}  # fmt: skip
+    written = {
+        f"{kind}/{name}.{ending}"
+        for names in kinds
+        for kind in names
+        for name in names[kind]
+        for ending in FORMATS[kind]
+    }
+    return written | {"report.html", "report.md"}
 
 
 def report(project):

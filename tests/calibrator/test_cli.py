@@ -143,6 +143,32 @@ def test_a_picture(csv, tmp_path):
     assert picture.stat().st_size > 10_000
 
 
+def test_a_bias_that_was_typed_in_stays_until_it_is_forgotten(csv):
+    typed = ("0.5", "-0.1", "0.09", "--sigma", "0.4", "--type", "memsense")
+    assert run("devices", "set", "B17", *typed).exit_code == 0
+    for seed in range(2):
+        run("log", csv(rates(20, seed), f"{seed}.csv"), "--device", "B17", "--same-heading")
+    answer, _ = said("log", csv(rates(2)), "--device", "B17", "--same-heading", "--no-store")
+    assert answer["history"][0] == "dropped"  # x was typed in wrong
+    assert "set by hand" in run("log", csv(rates(2)), "--device", "B17", "--no-store").stdout
+    run("devices", "forget", "B17", "set")
+    answer, _ = said("log", csv(rates(2)), "--device", "B17", "--same-heading", "--no-store")
+    assert answer["history"] == ["used"] * 3
+
+
+def test_attempts_are_counted_until_one_does(csv, tmp_path):
+    moving = csv(rates(20) + 20 * np.sin(np.arange(2000) / 30)[:, None], "moving.csv")
+    run("log", moving, "--device", "B17")
+    once, _ = said("log", csv(rates(20)), "--no-store")
+    again, _ = said("log", csv(rates(20)), "--device", "B17")
+    assert "attempt" in {reason["code"] for reason in again["reasons"]}
+    assert again["sigma_dps"][0] > 1.1 * once["sigma_dps"][0]  # Bonferroni's limit of two
+    lines = (tmp_path / "registry/B17/calibrations.jsonl").read_text().splitlines()
+    assert [json.loads(line)["attempt"] for line in lines] == [1, 2]
+    third, _ = said("log", csv(rates(20, 3)), "--device", "B17", "--no-store")
+    assert "attempt" not in {reason["code"] for reason in third["reasons"]}
+
+
 def test_notes_and_withdrawals_are_appended(csv, tmp_path):
     run("log", csv(rates(20)), "--device", "B17", "--type", "memsense")
     assert run("devices", "note", "B17", "fell").exit_code == 0

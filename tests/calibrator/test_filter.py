@@ -80,14 +80,6 @@ def test_the_filter_is_the_best_linear_estimate(world, seconds):
     np.testing.assert_allclose(np.sqrt(last.variance / squares), 1, atol=5e-3)
 
 
-def test_white_noise_is_averaged():
-    rng = np.random.default_rng(1)
-    means = rng.normal([[0.4], [-0.1], [3.0]], 0.01, (3, 20))
-    estimate, last = run("white", means)
-    np.testing.assert_allclose(estimate, means.mean(axis=1), rtol=1e-12)
-    np.testing.assert_allclose(np.sqrt(last.variance), 3.3e-3 / np.sqrt(10))
-
-
 def test_innovations_are_white_and_of_unit_variance():
     rng = np.random.default_rng(2)
     covariance, _, _ = exact("all", 10)

@@ -71,6 +71,8 @@ def test_a_full_disk_leaves_the_history_as_it_was(device, monkeypatch):
     monkeypatch.setattr(registry.os, "write", lambda fd, data: write(fd, data[:20]))
     with pytest.raises(RegistryError, match="nothing can be stored: No space left"):
         device.append(line(2))
+    with pytest.raises(RegistryError, match="No space left"):  # said before measuring as well
+        device.create()
     assert device.lines_path.read_bytes() == before
 
 

@@ -118,7 +118,7 @@ class Calibrator:
         self.ended = dict[str, Reason]()
         self._constant = np.zeros(3)  # blocks in a row of one value
         self.least_s = LEAST_S if np.all(self.setup.known[1] > 0) else LEAST_UNKNOWN_S
-        self._pending = np.empty((0, _COLUMNS))  # samples of a block that is not full
+        self._pending = np.empty((_COLUMNS, 0))  # samples of a block that is not full
         self._last_time: float | None = None
         self._end: float | None = None  # of the last block, on the clock of the samples
         self._proof_s = 0.0  # how long a rest must last, after one that was none
@@ -189,12 +189,12 @@ class Calibrator:
             InputError: The samples are not of three axes.
         """
         rows = self._rows(time_s, gyro_dps, accel_g, temperature_c)
-        if len(rows):
-            rows = np.concatenate([self._pending, rows])
-            gaps = np.diff(rows[:, 0])
+        if rows.size:
+            rows = np.concatenate([self._pending, rows], axis=1)
+            gaps = np.diff(rows[0])
             edges = np.flatnonzero((gaps > BLOCK_S / 2) | (gaps < -1 / self.setup.rate_hz)) + 1
-            for first, last in pairwise([0, *edges, len(rows)]):
-                self._pending = self._take_whole_blocks(rows[first:last])
+            for first, last in pairwise([0, *edges, rows.shape[1]]):
+                self._pending = self._take_whole_blocks(rows[:, first:last])
         return self.state()
 
     @property
@@ -228,7 +228,7 @@ class Calibrator:
         state, stretch, now = self.finish(), self.best, self.setup.now
         own, (noise, freedom), seen = stretch.estimate, stretch.log_noise(), stretch.temperature
         usable = state.rest == STILL and bool(np.isfinite(own.variance).all())
-        gravity = stretch.gravity / max(stretch.blocks, 1)
+        gravity = stretch.gravity[:3] / max(stretch.gravity[3], 1)
         return Calibration(
             mean_dps=tuple(own.bias.tolist()) if usable else None,
             variance_dps2=tuple(own.variance.tolist()) if usable else None,
@@ -252,42 +252,39 @@ class Calibrator:
         self, time_s: ArrayLike | None, gyro_dps: ArrayLike, accel_g: ArrayLike | None,
         temperature_c: ArrayLike | None,
     ) -> Array:  # fmt: skip
-        """Samples that hold a measurement, (n, 8)."""
+        """Samples that hold a measurement, (8, n)."""
         rates = np.atleast_2d(np.asarray(gyro_dps, np.float64))
         if rates.ndim != 2 or rates.shape[1] != 3:  # noqa: PLR2004
             raise InputError(f"gyro_dps: expected (n, 3) or (3,) deg/s, got {np.shape(gyro_dps)}")
-        rows = np.full((len(rates), _COLUMNS), np.nan)
+        rows, rate_hz = np.full((_COLUMNS, len(rates)), np.nan), self.setup.rate_hz
         if time_s is None:
-            rate_hz = self.setup.rate_hz
             first = -1 if self._last_time is None else round(self._last_time * rate_hz)
-            time_s = (first + 1 + np.arange(len(rows))) / rate_hz
-        rows[:, 0], rows[:, 1:4] = time_s, rates
+            time_s = (first + 1 + np.arange(len(rates))) / rate_hz
+        rows[0], rows[1:4] = time_s, rates.T
         if accel_g is not None:
-            rows[:, 4:7] = accel_g
+            rows[4:7] = np.atleast_2d(accel_g).T
         if temperature_c is not None:
-            rows[:, 7] = temperature_c
-        # a sum is finite where all are, and rates of 0 have one
-        finite = np.isfinite(rows[:, 0] + rows[:, 1] + rows[:, 2] + rows[:, 3])
-        zero = (rows[:, 1] == 0) & (rows[:, 2] == 0) & (rows[:, 3] == 0)
+            rows[7] = temperature_c
+        finite, zero = np.isfinite(rows[:4].sum(axis=0)), ~rows[1:4].any(axis=0)
         bad = {"not_finite": int(np.sum(~finite)), "zero": int(np.sum(zero))}
-        self.counts.update(samples=len(rows), **bad)
-        if len(rows) and np.isfinite(rows[-1, 0]):
-            self._last_time = float(rows[-1, 0])
+        self.counts.update(samples=len(rates), **bad)
+        if len(rates) and np.isfinite(rows[0, -1]):
+            self._last_time = float(rows[0, -1])
         good = finite & ~zero
-        return rows if good.all() else rows[good]
+        return rows if good.all() else rows[:, good]
 
     def _take_whole_blocks(self, rows: Array) -> Array:
         """Take the blocks of rows without a gap; returns the rows that are left."""
         size = self.setup.size
-        used = len(rows) // size * size
+        used = rows.shape[1] // size * size
         self._cross_gap(rows[0, 0])
         if used:
-            blocks = _blocks(rows[:used].reshape(-1, size, _COLUMNS))
+            blocks = _blocks(rows[:, :used].reshape(_COLUMNS, -1, size))
             self._look_for_dead_axes(blocks.variance == 0)
             while len(blocks.mean):
                 blocks = blocks.part(self._take(blocks))
-            self._end = rows[used - 1, 0] + 1 / self.setup.rate_hz
-        return rows[used:]
+            self._end = rows[0, used - 1] + 1 / self.setup.rate_hz
+        return rows[:, used:]
 
     def _look_for_dead_axes(self, constant: Mask) -> None:
         for axes in constant if constant.any() or self._constant.any() else ():
@@ -383,9 +380,9 @@ class Calibrator:
 
 
 def _blocks(samples: Array) -> Blocks:
-    """Means and variances of whole blocks, (block, sample, 8)."""
-    means, variances = samples.mean(axis=1), samples[..., 1:4].var(axis=1, ddof=1)
-    gravity_variances = np.full(len(samples), np.nan)
-    if np.isfinite(means[:, 4:7]).any():
-        gravity_variances = samples[..., 4:7].var(axis=1, ddof=1).mean(axis=1)
-    return Blocks(means[:, 1:4], variances, means[:, 4:7], gravity_variances, means[:, 7])
+    """Means and variances of whole blocks, (8, block, sample)."""
+    means, variances = samples.mean(axis=2), samples[1:4].var(axis=2, ddof=1)
+    gravity_variances = np.full(samples.shape[1], np.nan)
+    if np.isfinite(means[4:7]).any():
+        gravity_variances = samples[4:7].var(axis=2, ddof=1).mean(axis=0)
+    return Blocks(means[1:4].T, variances.T, means[4:7].T, gravity_variances, means[7])

@@ -34,17 +34,6 @@ from gyro_pipeline.conventions import MDPS, InputError
 DONE, USAGE, NOT_REACHED, NOT_AT_REST, NO_HISTORY, UNUSABLE, NOT_STORED = 0, 2, 3, 4, 5, 6, 7
 
 
-def _posix(text: str) -> float:
-    """POSIX seconds of such, or of an ISO 8601 time."""
-    for read in (float, lambda text: datetime.fromisoformat(text).timestamp()):
-        try:
-            return float(read(text))
-        except ValueError:
-            continue
-    expected = "2026-01-31T12:00:00+00:00 or POSIX seconds"
-    raise click.BadParameter(f"expected {expected}, got {text!r}")
-
-
 _option = partial(partial, click.option)  # still without the name of its argument
 _DEVICE = {  # by the arguments of Calibrator.open
     "device": _option("--device", help="name in the registry; its history is used and added to"),
@@ -55,17 +44,13 @@ _DEVICE = {  # by the arguments of Calibrator.open
         "--same-heading/--any-heading", default=None, help="whether the heading repeats"
     ),
     "latitude_deg": _option("--latitude", type=float, help="of the place, degrees"),
-    "started_at": _option(
-        "--started-at", type=_posix, metavar="TIME", help="first sample, ISO 8601 or POSIX seconds"
-    ),
+    "started_at": _option("--started-at", metavar="TIME", help="of the first sample, ISO 8601"),
     "since_power_on_s": _option("--since-power-on", type=float, help="of the first sample, s"),
     "known_still": _option("--known-still", is_flag=True, help="it was at rest: cut nothing"),
 }
 _JSON = {"as_json": _option("--json", is_flag=True, help="one JSON object")}
 _SHARED = {
-    "require_history": _option(
-        "--require-history", is_flag=True, help="exit 5 where it is not used"
-    ),
+    "require_history": _option("--require-history", is_flag=True, help="exit 5 if it is not used"),
     "store": _option("--store/--no-store", default=True, help="add to the device's history"),
     "plot": _option("--plot", type=Path, help="file to draw the running estimate to"),
     "rate_hz": _option("--rate", type=float, help="samples a second, where times do not tell"),
@@ -173,6 +158,11 @@ def _job(values: dict[str, Any]) -> SimpleNamespace:
     That the device can be written is seen before anything is measured.
     """
     known = {name: values.pop(name) for name in _DEVICE}
+    try:
+        text = known["started_at"]
+        known["started_at"] = text and datetime.fromisoformat(text).timestamp()
+    except ValueError as error:
+        raise InputError(f"--started-at: expected 2026-01-31T12:00:00Z, got {text!r}") from error
     job = SimpleNamespace(known=known, **{name: values.pop(name) for name in _SHARED})
     job.reader, job.stored_in = _read_reader_options(values), None
     if known["device"] is not None and job.store:
@@ -246,12 +236,14 @@ def _report(
         calibration = replace(
             calibrator.calibration(), hash=source, source=name, version=gyro_pipeline.__version__
         )
-        if job.stored_in.append(calibration):
-            job.stored_in.write_model(
-                Calibrator.open(rate_hz=calibrator.setup.rate_hz, **job.known)
-            )
-        else:
+        if not job.stored_in.append(calibration):
             _say(f"{name} is stored already; it is not stored again")
+            return code
+        rate_hz = calibrator.setup.rate_hz
+        try:
+            job.stored_in.write_model(Calibrator.open(rate_hz=rate_hz, **job.known))
+        except RegistryError as error:
+            _say(f"{name} is stored, but model.json is that of before: {error}")
     return code
 
 

@@ -67,9 +67,9 @@ class DeviceType:
         white = np.ones(3) if self.noise_mdps_rts is None else self.dps("noise_mdps_rts")
         warm, warm_up = self.warm_up, None
         if warm is not None:
-            pair = (np.broadcast_to(x, 3) * MDPS for x in (warm.amplitude_mdps, warm.spread_mdps))
-            mean, spread = pair
-            warm_up = mean, np.maximum(spread, 1e-3 * MDPS), warm.time_constant_s
+            mean = np.broadcast_to(np.multiply(warm.amplitude_mdps, MDPS), 3)
+            spread = np.broadcast_to(np.maximum(warm.spread_mdps, 1e-3) * MDPS, 3)
+            warm_up = mean, spread, warm.time_constant_s
         others = self.dps("flicker_mdps"), self.dps("random_walk_mdps_per_rts")
         return Noise(white, *others, warm_up)
 

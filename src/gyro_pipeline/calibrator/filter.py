@@ -156,7 +156,7 @@ class Filter(NamedTuple):
             weighted=self.weighted + scaled * of_y[:, None],
             squares=self.squares + of_y**2 / variance,
         )
-        if not self.blocks:
+        if mean is None or not self.blocks:
             return following, np.zeros(3)
         c, uncertainty = self._constants()
         spread = variance + np.sum(_times(uncertainty, of_x) * of_x, axis=1)

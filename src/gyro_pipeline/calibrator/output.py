@@ -144,8 +144,9 @@ def device_table(device: Device) -> Iterator[str]:
             sigma = "".join(f"{v**0.5 / MDPS:7.2f}" for v in line["variance_dps2"] or [])
             out = "" if stored.get(line["hash"]) in counting else "  (does not count)"
             yield f"{head}{mean}{sigma}  {'/'.join(line['outcome'])}{out}"
-    for axis, fit in device.model().items():
-        figures = (f"{k} {v:.3g}" + (f" ± {sd:.2g}" if sd else "") for k, (v, sd) in fit.items())
+    model = device.model()
+    for axis in sorted(model.keys() & set(AXES)):
+        figures = (f"{key} {v:.3g} ± {sigma:.2g}" for key, (v, sigma) in model[axis].items())
         yield f"{axis}: {', '.join(figures)} (mdps, √s, √day, °C)"
     attempts = [c for c in stored.values() if c.event != SET]
     dropped = sum(DROPPED in c.outcome for c in attempts)

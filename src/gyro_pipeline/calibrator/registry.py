@@ -36,12 +36,15 @@ SET = "set"
 
 _NAME = re.compile(r"[\w][\w.-]{0,63}")
 _LOCK_S = 10.0
+_ROOM = 4096  # bytes, more than a line takes
 _TEMPLATE = """{type}
 # mounted = true     # the heading repeats at each calibration
 # latitude = 32.1    # degrees
 # notes = ""
 """
 _KEYS = {"type", "mounted", "latitude", "frame", "notes"}
+
+_OF_TYPE = ("flicker_mdps", "random_walk_mdps_per_rts")
 
 Line = dict[str, Any]
 
@@ -144,21 +147,18 @@ class Device:
 
     def write_model(self, calibrator: Calibrator) -> None:
         """Replace ``model.json``, for people and other programs, by what is known now."""
-        setup, prior = calibrator.setup, calibrator.best.prior
-        (scale, freedom), kind = setup.known, setup.device_type
-        noise = np.sqrt(scale) * setup.noise.white / MDPS
-        model: dict[str, dict[str, Any]] = {}
-        for axis, name in enumerate(AXES):
-            fitted = prior.fitted[axis] if prior.fitted else {}
-            model[name] = {key: [v / MDPS, sigma / MDPS] for key, (v, sigma) in fitted.items()}
-            if freedom[axis] > 0:
-                sigma = noise[axis] / np.sqrt(2 * freedom[axis])
-                model[name]["noise"] = [float(noise[axis]), float(sigma)]
-            for key in ("flicker_mdps", "random_walk_mdps_per_rts"):  # the type's, not fitted
-                model[name][key.partition("_mdps")[0]] = [float(kind.dps(key)[axis] / MDPS), None]
+        setup, fitted = calibrator.setup, calibrator.best.prior.fitted or ({},) * len(AXES)
+        noise, freedom = setup.factor * setup.noise.white / MDPS, np.maximum(setup.known[1], 1e-9)
+        sigma = noise / np.sqrt(2 * freedom)
+        types = {k: getattr(setup.device_type, k) for k in _OF_TYPE}  # not fitted: no uncertainty
+        model = {
+            name: {key: [v / MDPS, s / MDPS] for key, (v, s) in fitted[axis].items()}
+            | ({"noise": [float(noise[axis]), float(sigma[axis])]} if freedom[axis] >= 1 else {})
+            for axis, name in enumerate(AXES)
+        }
         temporary = self.model_path.with_suffix(".new")
         with self._locked():
-            temporary.write_text(json.dumps(model, indent=1) + "\n", "utf-8")
+            temporary.write_text(json.dumps(model | types, indent=1) + "\n", "utf-8")
             os.replace(temporary, self.model_path)
 
     def model(self) -> dict[str, Any]:
@@ -172,7 +172,9 @@ class Device:
             RegistryError: Nothing can be written; this is said before anything is measured.
         """
         of_type = f'type = "{device_type}"' if device_type else '# type = "consumer"'
-        with self._locked(), open(self.lines_path, "ab"):
+        with self._locked():
+            size = _append(self.lines_path, b" " * _ROOM)  # is there room for a line?
+            os.truncate(self.lines_path, size)
             if not self.settings_path.exists():
                 self.settings_path.write_text(settings or _TEMPLATE.format(type=of_type), "utf-8")
 
@@ -215,8 +217,8 @@ def _read(path: Path) -> bytes:
         return b""
 
 
-def _append(path: Path, data: bytes) -> None:
-    """All of the data at the end of a file, or none, on the disk."""
+def _append(path: Path, data: bytes) -> int:
+    """All of the data at the end of a file, or none, on the disk; returns where it begins."""
     with open(path, "a+b", buffering=0) as file:
         size = file.seek(0, os.SEEK_END)
         if size and os.pread(file.fileno(), 1, size - 1) != b"\n":
@@ -228,6 +230,7 @@ def _append(path: Path, data: bytes) -> None:
         except OSError:
             file.truncate(size)
             raise
+        return size
 
 
 def _parsed(line: bytes) -> Line | None:

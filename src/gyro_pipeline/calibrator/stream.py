@@ -98,28 +98,22 @@ class Parser:
 
     def _start(self, lines: Sequence[str]) -> int:
         """Tell columns, units and rate from the first lines; returns how many are a header."""
-        from gyro_pipeline.readers.columns import (  # noqa: PLC0415
-            acceleration_of,
-            rate_columns,
-            temperature_of,
-        )
-        from gyro_pipeline.readers.file import File  # noqa: PLC0415
-        from gyro_pipeline.readers.scales import scale_of  # noqa: PLC0415
-        from gyro_pipeline.readers.table import Table  # noqa: PLC0415
+        from gyro_pipeline.readers import columns, file, scales, table  # noqa: PLC0415
 
         header = self._tell_names(lines[0])
         rows = [row for row in map(self._row, lines[header:]) if row]
         if not rows:
             text = f"expected numbers in {len(self._names)} columns, got {lines[-1][:60]!r}"
             raise InputError(f"stream: {text}; correct what sends them")
-        columns = tuple(np.array(rows).T)
-        file = File(Table("stream", tuple(self._names), columns), self.options)
-        rates = list(rate_columns(file, None))
-        scale, _ = scale_of(file, rates)
-        file.settle()
-        times, offset = _times(file), -(self.options.offset or 0.0) * scale
+        content = table.Table("stream", tuple(self._names), tuple(np.array(rows).T))
+        opened = file.File(content, self.options)
+        rates = list(columns.rate_columns(opened, None))
+        scale, _ = scales.scale_of(opened, rates)
+        opened.settle()
+        times, offset = _times(opened), -(self.options.offset or 0.0) * scale
         self._parts = [times, (rates, scale, offset)]
-        for numbers, unit in (acceleration_of(file, rates), temperature_of(file)):
+        others = columns.acceleration_of(opened, rates), beside.temperature_of(opened)
+        for numbers, unit in others:
             self._parts.append((list(numbers), unit.factor, unit.offset))
         self._tell_rate(self._columns(np.array(rows), *times))
         self.bad = 0

@@ -104,7 +104,7 @@ class Stretch:
     believed: bool = True  # that a declared heading repeats
     dropped: Mask = field(default_factory=lambda: np.zeros(3, bool))
     notes: tuple[Reason, ...] = ()  # motions that were cut, conflicts
-    gravity: Array = field(default_factory=lambda: np.zeros(3))  # summed over blocks
+    gravity: Array = field(default_factory=lambda: np.zeros(4))  # summed over blocks, and 1
     temperature: Temperature = Temperature()
     last_mean: Array = field(default_factory=lambda: np.zeros(3))  # of the last block
 
@@ -131,7 +131,7 @@ class Stretch:
     @cached_property
     def up(self) -> Array | None:
         """(3,), direction of the mean acceleration; None where it is not measured."""
-        return unit(self.gravity) if self.gravity.any() else None
+        return unit(self.gravity[:3]) if self.gravity[3] else None
 
     @cached_property
     def usable(self) -> Mask:
@@ -186,12 +186,13 @@ class Stretch:
     def _with(
         self, blocks: Blocks, after: Filter, monitor: RestMonitor, temperature: Temperature
     ) -> "Stretch":
-        measured = np.isfinite(blocks.gravity).all(axis=1)
+        measured = blocks.gravity[np.isfinite(blocks.gravity).all(axis=1)]
+        added = np.hstack([measured, np.ones((len(measured), 1))])
         return replace(
             self,
             filter=after,
             monitor=monitor,
-            gravity=np.add.accumulate(np.vstack([self.gravity, blocks.gravity[measured]]))[-1],
+            gravity=np.add.accumulate(np.vstack([self.gravity, added]))[-1],
             temperature=temperature,
             last_mean=blocks.mean[-1],
         )
