@@ -112,7 +112,7 @@ class Parser:
         opened.settle()
         times, offset = _times(opened), -(self.options.offset or 0.0) * scale
         self._parts = [times, (rates, scale, offset)]
-        others = columns.acceleration_of(opened, rates), beside.temperature_of(opened)
+        others = columns.acceleration_of(opened, rates), columns.temperature_of(opened)
         for numbers, unit in others:
             self._parts.append((list(numbers), unit.factor, unit.offset))
         self._tell_rate(self._columns(np.array(rows), *times))
