@@ -211,7 +211,7 @@ def _connected(execution: Execution) -> Iterator[Any]:
         InputError: There is none, or it is gone.
     """
     try:
-        from distributed import CancelledError, Client  # noqa: PLC0415 - an extra
+        from distributed import CancelledError, Client, KilledWorker  # noqa: PLC0415
         from distributed.comm.core import CommClosedError  # noqa: PLC0415
     except ImportError as error:
         raise InputError(f"execution.executor dask: {error}; pip install -e .[cluster]") from error
@@ -222,6 +222,8 @@ def _connected(execution: Execution) -> Iterator[Any]:
     with client:
         try:
             yield client
+        except KilledWorker as error:
+            raise InputError(f"a job was lost with every worker that had it: {error}") from error
         except (CancelledError, CommClosedError) as error:
             raise InputError(
                 "the scheduler of the cluster is gone; start it, and this run again: what has "

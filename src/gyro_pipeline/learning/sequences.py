@@ -67,13 +67,10 @@ class TCN(nn.Module):
     as the one before; the last time is mapped to the biases. There is no dropout.
 
     Args:
-        gyroscopes: Channels of a window.
-        window: Samples.
-        rate_hz: Samples per second.
+        gyroscopes, window, rate_hz, block_s: See :class:`LSTM`.
         filters: Channels of every level.
         taps: Of every convolution.
         levels: The last one's taps are ``2 ** (levels - 1)`` blocks apart.
-        block_s: See :class:`BlockMeans`.
     """
 
     def __init__(  # noqa: PLR0917 - its options
@@ -81,10 +78,10 @@ class TCN(nn.Module):
         gyroscopes: int,
         window: int,
         rate_hz: float,
+        block_s: float = 0.1,
         filters: int = 16,
         taps: int = 3,
         levels: int = 5,
-        block_s: float = 0.1,
     ) -> None:
         super().__init__()
         self.blocks = BlockMeans(window, rate_hz, block_s)
