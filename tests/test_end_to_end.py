@@ -203,7 +203,7 @@ def test_tables_show_published_ours_and_the_ceiling_with_their_runs(smoke):
 def test_runs_say_what_made_them(smoke):
     for run in smoke.runs:
         tags = run.data.tags
-        assert (tags["kedro_env"], tags["simulated"], tags["layout"]) == ("smoke", "1", "2")
+        assert (tags["kedro_env"], tags["simulated"], tags["layout"]) == ("smoke", "1", "3")
         assert re.fullmatch(r"[0-9a-f]{16}", tags["lock_hash"])
         assert re.fullmatch(r"[0-9a-f]{16}", tags["fingerprint"])
         assert {"kedro_run", "git_dirty", "mlflow.source.git.commit", "data_hash"} <= set(tags)
