@@ -274,7 +274,7 @@ def full(study: Study, rng: random.Random, part: str) -> str:
         shutil.copytree(folder, kept)
     finally:
         subprocess.run(["umount", "-l", str(folder)], check=False)
-    folder.rmdir()
+    shutil.rmtree(folder)  # what the mount hid
     kept.rename(folder)
     return f"{part} of {kb} kB"
 

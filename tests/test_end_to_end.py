@@ -123,7 +123,7 @@ def test_rows_whose_estimator_uses_the_same_training_set_are_one_run_that_says_w
         assert names - {"equivalent_time_s"} <= set(run.data.metrics) <= names
         no_time = {"equivalent_time_s"} - set(run.data.metrics)  # it is said why
         assert no_time == {"equivalent_time_s"} & set(tags)
-        assert (tags["kedro_env"], tags["simulated"], tags["layout"]) == ("smoke", "1", "2")
+        assert (tags["kedro_env"], tags["simulated"], tags["layout"]) == ("smoke", "1", "3")
         assert re.fullmatch(
             r"[0-9a-f]{16} [0-9a-f]{16}", f"{tags['lock_hash']} {tags['fingerprint']}"
         )

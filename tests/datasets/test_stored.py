@@ -96,10 +96,11 @@ def test_a_file_of_other_settings_or_sources_is_named(tmp_path):
     for changed, words in (
         ({"virtual_gyros": {"imus": 8, "seed": 2}}, "virtual_gyros.seed 1, .* 2; type draw"),
         ({"ground_truth": {"tolerance_mdps": 6.0}}, "bias.csv: .*tolerance_mdps 5.0, .* 6.0"),
-        ({"ground_truth": {}}, "tolerance_mdps 5.0, while this run has None"),
+        ({"virtual_gyros": {"imus": 8, "seed": 1, "x": 3}}, "virtual_gyros.x None, this run has 3"),
     ):
         with pytest.raises(InputError, match=words):
             drawn.check_made_with(settings | changed)
+    drawn.check_made_with(settings)
     bias.save(TABLE + 1)
     with pytest.raises(InputError, match="drawn.nc: made from another .*bias.csv than there is"):
         drawn.check_made_with(settings)

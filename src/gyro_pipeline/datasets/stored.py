@@ -171,10 +171,12 @@ def _difference(path: Path, settings: Mapping[str, Any]) -> str | None:
     record = record_of(path)
     if record is None:  # whoever loads it is told
         return None
-    for name, value in _leaves(record["settings"]):
-        now = _at(settings, name)
-        if now != value:
-            return f"{path}: made with {'.'.join(name)} {value}, while this run has {now}"
+    for key, value in record["settings"].items():
+        if settings.get(key) != value:
+            before, now = dict(_leaves(value, key)), dict(_leaves(settings.get(key), key))
+            names = sorted(before.keys() | now.keys())
+            name = next(name for name in names if before.get(name) != now.get(name))
+            return f"{path}: made with {name} {before.get(name)}, this run has {now.get(name)}"
     for relative, digest in record["sources"].items():
         source = Path(os.path.normpath(path.parent / relative))
         there = record_of(source)
@@ -186,18 +188,13 @@ def _difference(path: Path, settings: Mapping[str, Any]) -> str | None:
     return None
 
 
-def _leaves(tree: Any, name: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+def _leaves(tree: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """The values in a tree of settings by their names."""
     if not isinstance(tree, Mapping) or not tree:
         yield name, tree
         return
     for key, value in tree.items():
-        yield from _leaves(value, (*name, str(key)))
-
-
-def _at(tree: Any, name: tuple[str, ...]) -> Any:
-    for key in name:
-        tree = tree.get(key) if isinstance(tree, Mapping) else None
-    return tree
+        yield from _leaves(value, f"{name}.{key}")
 
 
 def _record_path(path: Path) -> Path:
