@@ -187,8 +187,10 @@ class Preflight:
             remove_leftovers(folder)
         settings = _settings(self._parameters)
         _hand_over(settings, pipeline, catalog)
+        sensor = self._parameters.only.sensor  # of others a report shows what is there
         for name in sorted(pipeline.inputs()):
-            if isinstance(dataset := catalog.get(name), StoredFile):
+            dataset = catalog.get(name)
+            if isinstance(dataset, StoredFile) and sensor in (None, *name.split(".")):
                 dataset.check_made_with(settings)
 
     @hook_impl
