@@ -368,6 +368,8 @@ def _explained(error: "ValidationError") -> str:
 def _paths(dataset: Any) -> list[Path]:
     """Where a dataset is stored; nowhere if it is kept in memory."""
     described = dataset._describe()
+    if "dataset_type" in described:  # a folder of files of any name
+        return [Path(described["path"], "*")]
     return [Path(described[key]) for key in ("filepath", "path") if key in described]
 
 
