@@ -35,7 +35,10 @@ help:  ## list the commands
 
 #> kedro run                                         train and evaluate the main studies, report
 #> kedro run --pipeline=augmentation                 one study; or: real2real, input_channels,
-#>                                                   estimators, unseen_devices, leakage
+#>                                                   estimators, unseen_devices, first_windows,
+#>                                                   networks, leakage
+#> kedro run --pipeline=sweep --params=sweep.learning_rate=1e-4/1e-3
+#>                                                   a network with each of some settings
 #> kedro run --pipeline=ground_truth                 biases and noise figures, no training
 #> kedro run --pipeline=virtual_gyros                the virtual gyroscopes as well
 #> kedro run --pipeline=reporting                    tables, figures and report of what was run

@@ -162,8 +162,9 @@ class Project:
             return int(connection.execute(query).fetchone()[0])
 
     def files(self, part="data"):
-        """All files below a folder, hidden ones as well, with their content."""
+        """All files below a folder, hidden ones as well, with their content; but for the lock."""
         paths = sorted(path for path in (self.folder / part).rglob("*") if path.is_file())
+        paths = [path for path in paths if path.name != "run.lock"]
         return {str(path.relative_to(self.folder)): path.read_bytes() for path in paths}
 
 

@@ -142,7 +142,7 @@ def test_the_mean_has_the_rmse_of_the_closed_form_and_the_oracle_that_of_the_cei
     for (window_s, bench), truth in product(benches.items(), TRUTHS):
         expected = running_mean_rmse(NOISE, window_s, RECORDING_S, truth)
         assert rmse_of(bench.mean_errors, truth, ALL) == pytest.approx(expected, rel=0.04)
-        ceiling = bench.ceilings(truth, ALL)["ceiling_rmse_dps"].value
+        ceiling = bench.ceilings.of(truth, ALL)["ceiling_rmse_dps"].value
         assert rmse_of(bench.oracle_errors, truth, ALL) == pytest.approx(ceiling, rel=0.06)
 
 
@@ -154,5 +154,5 @@ def test_the_check_sees_a_tenth_of_a_gain(benches):
 
 
 def test_a_network_with_its_own_centre_comes_near_the_ceiling(benches, plain):
-    ceiling = benches[10.0].ceilings(PAPER, ALL)["ceiling_rmse_dps"].value
+    ceiling = benches[10.0].ceilings.of(PAPER, ALL)["ceiling_rmse_dps"].value
     assert 0.95 < rmse_of(plain[BEST], PAPER, ALL) / ceiling < 1.25

@@ -183,14 +183,14 @@ def test_a_sensor_without_files_is_not_simulated_from_nothing(make):
     assert "imus, recordings, train_recordings, samples, recording_s, simulated" in done.output
 
 
-def readme_examples():
-    """Of options of the reader, in the README's table."""
-    table = (Path(__file__).parents[1] / "README.md").read_text().split("| `reader` |")[1]
+def documented_options():
+    """Of the reader, in the table of the documentation."""
+    table = (Path(__file__).parents[1] / "docs/your_data.md").read_text().split("| `reader` |")[1]
     rows = table.split("\n\n")[0].splitlines()[2:]
     return [found for row in rows for found in re.findall(r"`([a-z_]+: .*?)`", row)]
 
 
-@pytest.mark.parametrize("example", readme_examples())
-def test_options_of_the_readme_are_options_of_the_reader(example):
+@pytest.mark.parametrize("example", documented_options())
+def test_documented_options_are_options_of_the_reader(example):
     given = yaml.safe_load(f"{{{example}}}")
     assert ReaderOptions(**given).model_fields_set == set(given)

@@ -13,7 +13,7 @@ SENSOR = "dot"
 COMMAND = ("--pipeline=augmentation", "--env=smoke", f"--params=only.sensor={SENSOR}")
 TRAINED = "select count(*) from tags where key = 'trained'"
 FINISHED = "select count(*) from runs where status = 'FINISHED'"
-RUNS, SOME = 9, 2
+RUNS, SOME = 11, 2
 WAYS = [(signal.SIGKILL, TRAINED, SOME), (signal.SIGINT, FINISHED, 1)]
 
 

@@ -68,9 +68,10 @@ def test_augmentation_is_the_papers_grid_with_a_running_mean_for_each_window(bas
     # virtual gyroscopes teach it nothing: their rows are runs without them
     grid = product(["dot", "sparkfun"], [3, 12], [0], [10.0, 30.0])
     assert places(runs, RESIDUAL_NETWORK) == sorted(grid)
-    grid = product(["dot", "sparkfun"], [3], [0], [10.0, 30.0])
-    assert places(runs, MEAN) == sorted(grid)
-    assert len(runs) == 24 + 8 + 4
+    grid = sorted(product(["dot", "sparkfun"], [3], [0], [10.0, 30.0]))
+    for name in (MEAN, "training_mean", "best_linear"):
+        assert places(runs, name) == grid
+    assert len(runs) == 24 + 8 + 3 * 4
     assert {(run.method, run.source, run.protocol) for run in runs} == {
         (2, "simulated", "by_recording")
     }
@@ -105,7 +106,8 @@ def test_full_is_five_seeds_of_networks_and_one_of_all_else(base, parameters):
     seeds = {run.estimator: set() for run in full}
     for run in full:
         seeds[run.estimator].add(run.seed)
-    assert seeds == {MEAN: {0}, RESIDUAL_NETWORK: {0}, CNN: {0, 1, 2, 3, 4}}
+    assert seeds.pop(CNN) == {0, 1, 2, 3, 4}
+    assert set(map(tuple, seeds.values())) == {(0,)}
     assert set(one) == {run for run in full if run.seed == 0}
 
 
@@ -181,7 +183,10 @@ def test_only_narrows_and_a_running_mean_stays_wherever_another_estimator_does(
     assert set(rows) <= set(whole)
     asked = [row for row in rows if row.estimator == CNN]
     assert len(asked) == networks
-    assert len(rows) == 2 * networks + means  # a residual network beside each
+    # a residual network, a constant and the best linear estimator are beside each
+    others = [row for row in rows if row.estimator not in (CNN, MEAN)]
+    assert len(others) == 3 * networks
+    assert len(rows) == 4 * networks + means
     for name, value in only.items():
         assert {getattr(row, name) for row in asked} <= {value}
 

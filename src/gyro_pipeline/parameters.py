@@ -425,13 +425,6 @@ class Execution(Parameter):
         return self
 
 
-class Evaluation(Parameter):
-    """Intervals over test recordings."""
-
-    resamples: int = Field(ge=100, description="of the clustered bootstrap")
-    bootstrap_seed: Seed
-
-
 class Grid(Parameter):
     """The networks one study trains on one sensor: all combinations of the lists."""
 
@@ -668,7 +661,6 @@ class Parameters(Parameter):
     splits: Splits
     training: Training
     execution: Execution
-    evaluation: Evaluation
     windows_s: list[Seconds] = Field(min_length=1)
     seeds: list[Seed] = Field(min_length=1)
     studies: dict[str, Study]

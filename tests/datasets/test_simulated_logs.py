@@ -62,7 +62,9 @@ def test_what_it_takes_to_simulate_a_sensor_is_named(tmp_path, changes, words):
 
 def test_files_have_the_published_layout_and_give_what_was_read(tmp_path):
     logs = simulated(tmp_path).load()
-    assert set(os.listdir(tmp_path)) == {"dot_train.npy", "dot_test.npy", "dot_truth.nc"}
+    assert set(os.listdir(tmp_path)) == {
+        *("dot_train.npy", "dot_test.npy", "dot_truth.nc", "dot_truth.nc.made.json")
+    }
     train, test = np.load(tmp_path / "dot_train.npy"), np.load(tmp_path / "dot_test.npy")
     assert (train.shape, test.shape) == ((30, 6, 400), (10, 6, 400))
     assert train.dtype == test.dtype == np.float32

@@ -1,7 +1,6 @@
 import numpy as np
 import pandas as pd
 import pytest
-from kedro.io import DatasetError
 
 from gyro_pipeline.datasets.tables import Table
 
@@ -41,8 +40,3 @@ def test_preview_shows_the_first_rows(table):
         "columns": ["a", "b"],
         "data": [[0, 0.5], [1, 0.5]],
     }
-
-
-def test_a_table_that_is_not_there_is_said_to_be_made_first(table):
-    with pytest.raises(DatasetError, match="is not there; first run what makes it"):
-        table.load()

@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from joblib.externals.loky import get_reusable_executor
 
 from gyro_pipeline.conventions import MDPS, OWN, InputError
 from gyro_pipeline.estimators import ESTIMATORS, estimator_class, fitting, make_estimator
@@ -49,6 +50,7 @@ def recordings(simulate):
 def stranger(tmp_path, monkeypatch):
     (tmp_path / "a_strangers_file.py").write_text(STRANGER)
     monkeypatch.syspath_prepend(tmp_path)
+    get_reusable_executor().shutdown()  # workers of other tests do not see this folder
     return "a_strangers_file:Half"
 
 

@@ -12,7 +12,6 @@ import pytest
 import xarray as xr
 
 from gyro_pipeline.parameters import (
-    Evaluation,
     Execution,
     Grid,
     Only,
@@ -45,7 +44,6 @@ class World:
     training: Training
     splits: Splits
     virtual_gyros: VirtualGyros
-    evaluation: Evaluation
     windows_s: Sequence[float] = (10.0,)
     seeds: Sequence[int] = (0,)
     only: Only = field(default_factory=Only)
@@ -186,9 +184,8 @@ def make_world(
     p = parameters(
         virtual_gyros={"recordings": 6, "train_recordings": 5},
         training={"epochs": 3, "stride": 5, "pool": 2, "channels": 2, "hidden": 4},
-        evaluation={"resamples": 100},
     )
-    settings = ("training", "splits", "virtual_gyros", "evaluation")
+    settings = ("training", "splits", "virtual_gyros")
 
     def make(recordings: xr.Dataset, **changes: Any) -> World:
         allan = measure_allan_variance(recordings)

@@ -34,7 +34,6 @@ def leak_study(make_world, make_study, parameters, as_stored):
             recordings,
             study=study.model_copy(update=ways | count),
             training=base.model_copy(update={"epochs": 60, "learning_rate": 2e-3} | settings),
-            evaluation=parameters("base").evaluation,
         )
         runs = as_stored(world.train())
         judged = {run.run_id: run for run in world.evaluate(runs)}
@@ -43,7 +42,7 @@ def leak_study(make_world, make_study, parameters, as_stored):
             for run in runs
         ]
         stored = {"sparkfun_plan": world.plan, "sparkfun_runs": evaluated}
-        given = world.evaluation, study, world.training, {"sparkfun": {"rate_hz": 25}}
+        given = study, world.training, {"sparkfun": {"rate_hz": 25}}
         return pool_leakage(*given, **stored)["results"].set_index(["leak", "estimator"])
 
     return run

@@ -133,7 +133,7 @@ def plan_of(runs, left_out=None):
 @pytest.fixture(scope="module")
 def pool(base):
     def make(runs, study=None, seeds=(0,), plan=None, sensor="sparkfun"):
-        given = study or study_of(), "simulated", [30.0], list(seeds), Only(), base.evaluation
+        given = study or study_of(), "simulated", [30.0], list(seeds), Only()
         stored = {f"{sensor}_plan": plan_of(runs) if plan is None else plan}
         return pool_results(*given, **stored, **{f"{sensor}_runs": runs})
 
@@ -423,8 +423,6 @@ def test_what_was_not_made_is_named_with_the_fewest_commands(grid, write, pool, 
     lines = page.partition("### What was not made")[2].strip().splitlines()[2:]
     assert lines == [
         "| kedro run --env=smoke | 4 of 17 results of augmentation, the study input_channels |",
-        "| kedro run --pipeline=estimators --env=smoke | the study estimators |",
-        "| kedro run --pipeline=unseen_devices --env=smoke | the study unseen_devices |",
     ]
     assert "- **Narrowed to**: sensor=sparkfun" in page
     untrained = pool([], plan=plan_of([mean, make_run("network", errors(1.0))]))

@@ -25,6 +25,7 @@ from tqdm import tqdm
 from urllib3.exceptions import HTTPError
 
 from gyro_pipeline.conventions import InputError
+from gyro_pipeline.datasets.atomic import check_writable
 
 _LOG = logging.getLogger(__name__)
 
@@ -53,6 +54,7 @@ def ensure(url: str, path: Path, blob: str) -> None:
         InputError: It cannot be fetched or written, or what came or is there is another file.
     """
     if not path.exists():
+        check_writable(path)
         try:
             _fetch(url, path, blob)
         except (requests.RequestException, HTTPError) as error:  # the first is an OSError as well

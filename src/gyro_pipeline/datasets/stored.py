@@ -18,7 +18,7 @@ from gyro_pipeline.datasets.atomic import replacing
 
 Record = dict[str, Any]
 
-_REPAIR = "run the pipeline that makes it again"
+_REPAIR = "type kedro run, with the --env that it belongs to, which makes it again"
 
 _digests: dict[tuple[int, ...], str] = {}
 """Of files by their identity, which a rename keeps: each is read once by a process."""

@@ -161,7 +161,7 @@ def make_estimator(name: str, training: "Training", seed: int) -> "Estimator":
     _, fixed = ESTIMATORS.get(name.partition(" ")[0], (name, {}))
     try:
         if not kind.seeded:
-            return kind(**fixed, **options)
+            return kind(**{**fixed, **options})
         changes = {key: options.pop(key) for key in [*options] if key in training.schedule}
         settings = training.model_validate(training.model_dump() | changes)
         given = {} if issubclass(named_class(name), kind) else {"network": entry(name)}

@@ -227,11 +227,10 @@ def _missing(
     makes: dict[str, list[str]] = {}
     for name, given in studies.items():
         study = Study.model_validate(given)
-        known = [one for one in study.sensors_among(sensors) if only.sensor in (None, one)]
+        asked = [sensor for sensor in study.sensors_among(sensors) if only.sensor in (None, sensor)]
         rows = material.of(name)
-        lacking = int((rows.status == NOT_RUN).sum())
-        there = len(rows) > 0 or (name == LEAKAGE and len(material.leaks) > 0)
-        if not known or (there and not lacking):
+        lacking, there = int((rows.status == NOT_RUN).sum()), len(rows) > 0
+        if not asked or (there and not lacking) or not (there or study.default):
             continue
         command = f"kedro run{'' if study.default else f' --pipeline={name}'}{env}"
         words = f"{lacking} of {len(rows)} results of {name}" if there else f"the study {name}"
