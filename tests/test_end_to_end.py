@@ -386,7 +386,7 @@ def test_the_real_file_has_known_errors_and_stands_beside_the_simulated_one(smok
 
     # all folds are one run, whose model is fitted to all recordings
     runs = run("real2real")
-    assert set(runs) == {"mean", "cnn", "residual_network"}
+    assert set(runs) == {"mean", "cnn", "residual_network", "training_mean", "best_linear"}
     for one in runs.values():
         params, tags = one.data.params, one.data.tags
         assert one.info.status == "FINISHED"
