@@ -96,7 +96,7 @@ class Project:
         """A pipeline inside this process: all nodes, or what changed, as ``kedro run`` does."""
         from kedro.framework.session import KedroSession
 
-        from gyro_pipeline.hooks import Session
+        from gyro_pipeline.session import Session
 
         kind = Session if changed_only else KedroSession
 

@@ -66,11 +66,11 @@ ALLOWED = {
     "boundary": {"conventions"},
     "run_lock": {"conventions"},
     "runner": {"conventions", "datasets", "estimators", "fingerprints"},
-    "hooks": {
-        *("boundary", "conventions", "datasets", "parameters", "pipeline_registry", "run_lock"),
-        *("runner", "studies"),
+    "session": {
+        *("boundary", "conventions", "parameters", "pipeline_registry", "run_lock", "runner"),
     },
-    "settings": {"hooks"},
+    "hooks": {"boundary", "conventions", "datasets", "parameters", "session", "studies"},
+    "settings": {"hooks", "session"},
     "store": {"conventions"},
     "__init__": set(),
     "__main__": set(),

@@ -7,7 +7,8 @@ from kedro.runner import ParallelRunner, SequentialRunner
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.tracked_runs import TrackedRuns
-from gyro_pipeline.hooks import Provenance, Session, settings_in_words
+from gyro_pipeline.hooks import Provenance
+from gyro_pipeline.session import Session, settings_in_words
 
 
 @pytest.mark.parametrize(

@@ -1,14 +1,12 @@
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from kedro.config import OmegaConfigLoader
 from pydantic import ValidationError
 
-from gyro_pipeline import pipeline_registry
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.hooks import Preflight
 from gyro_pipeline.parameters import Parameters
+from gyro_pipeline.session import checked
 from gyro_pipeline.settings import CONFIG_LOADER_ARGS
 from gyro_pipeline.studies import check_possible
 
@@ -27,26 +25,15 @@ def loaded():
     return load
 
 
-@pytest.fixture
-def refusal(tmp_path, monkeypatch):
+def refusal(parameters):
     """What a user is told about parameters, before any pipeline is made."""
-
-    def load(parameters):
-        monkeypatch.setattr(pipeline_registry, "_selected", None)
-        context = SimpleNamespace(project_path=tmp_path, config_loader={"parameters": parameters})
-        with pytest.raises(InputError) as refused:
-            Preflight().after_context_created(context)
-        assert pipeline_registry._selected is None
-        return str(refused.value)
-
-    return load
+    with pytest.raises(InputError) as refused:
+        checked(parameters)
+    return str(refused.value)
 
 
-def test_the_configuration_of_this_project_is_accepted(loaded, monkeypatch, tmp_path):
-    monkeypatch.setattr(pipeline_registry, "_selected", None)
-    context = SimpleNamespace(project_path=tmp_path, config_loader={"parameters": loaded()})
-    Preflight().after_context_created(context)
-    assert pipeline_registry._selected == Parameters(**loaded())
+def test_the_configuration_of_this_project_is_accepted(loaded):
+    assert checked(loaded()) == Parameters(**loaded())
 
 
 def of_study(name, **changes):
@@ -108,7 +95,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("changes", "place", "said"), REFUSED)
-def test_a_bad_parameter_is_refused_by_its_place(loaded, refusal, changes, place, said):
+def test_a_bad_parameter_is_refused_by_its_place(loaded, changes, place, said):
     message = refusal(loaded(**changes))
     assert place in message
     assert said in message
@@ -216,13 +203,13 @@ def test_a_sensor_with_files_may_say_its_rate_or_nothing(loaded, entry, rate_hz)
     check_possible(parameters, ["ground_truth"])
 
 
-def test_all_problems_are_told_at_once(loaded, refusal):
+def test_all_problems_are_told_at_once(loaded):
     message = refusal(loaded(training={"epochs": 0, "stride": 0}, nonsense=1))
     for place in ("training.epochs:", "training.stride:", "nonsense:"):
         assert place in message
 
 
-def test_a_missing_key_is_refused(loaded, refusal):
+def test_a_missing_key_is_refused(loaded):
     parameters = loaded()
     del parameters["splits"]["split_seed"]
     assert "splits.split_seed: Field required" in refusal(parameters)

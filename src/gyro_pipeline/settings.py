@@ -1,14 +1,16 @@
 """Kedro settings (https://docs.kedro.org)."""
 
-from gyro_pipeline.hooks import OWN_SETTINGS, OwnReport, Preflight, Provenance, Session
+from gyro_pipeline.hooks import Preflight, Provenance
+from gyro_pipeline.session import OWN_SETTINGS, Context, Session
 
 SESSION_CLASS = Session
-HOOKS = (Preflight(), OwnReport(), Provenance())
+CONTEXT_CLASS = Context
+HOOKS = (Preflight(), Provenance())
 
 CONFIG_LOADER_ARGS = {
     "base_env": "base",
     "default_run_env": "local",
     # Environments hold differences only, at any depth.
     "merge_strategy": {"parameters": "soft", "globals": "soft"},
-    "custom_resolvers": {OWN_SETTINGS: str},  # a hook replaces it in a run with --params
+    "custom_resolvers": {OWN_SETTINGS: str},  # a context replaces it in a run with --params
 }
