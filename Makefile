@@ -46,7 +46,7 @@ help:  ## list the commands
 #> kedro run --pipeline=ground_truth --env=logs --params=logs=FOLDER
 #>                                                   biases of log files of your own
 #> kedro registry list                               the pipelines
-#> kedro viz                                         the pipelines drawn, in the browser
+#> kedro viz                                         the pipelines drawn: http://127.0.0.1:4141/?types=task
 #> mlflow ui                                         the runs, in the browser
 #> gyro-calibrate log FILE                           the bias of one still log
 

@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+_STAGES = "http://127.0.0.1:4141/?types=task"
+"""The seven stages as boxes, without the datasets between them, which there are for each sensor."""
+
 _WITHOUT_EFFECT = ("execution", "only")
 """Settings that change how much is made, and how, but no number."""
 
@@ -92,7 +95,7 @@ class Preflight:
         if run_result:  # where nothing was run, nothing is new
             for link in _run_links(catalog.get(name) for name in sorted(pipeline.datasets())):
                 logger.info("compare runs:       %s", link)
-        logger.info("see the lineage:    kedro viz")
+        logger.info("see the lineage:    kedro viz, then %s", _STAGES)
 
 
 class Provenance:
