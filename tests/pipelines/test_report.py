@@ -149,6 +149,20 @@ def test_datasheets_and_signals_are_shown_from_the_recordings(report, recordings
     assert [ax.get_title() for ax in figures["drift"].axes] == ["Movella DOT", "SparkFun", "NG"]
 
 
+def test_the_warm_up_that_a_published_gain_would_need_is_in_the_answer(
+    described, report, parameters
+):
+    p = parameters("base")
+    own = described["sparkfun/description"]()
+    own[[f"white_dps_rts_{axis}" for axis in "xyz"]] = 0.0033
+    own[[f"spread_dps_{axis}" for axis in "xyz"]] = 0.31e-3
+    given = p.published, p.ground_truth, p.studies, {name: {} for name in p.sensors}
+    page = write_report("test", Only(), *given, {"sparkfun/description": lambda: own})[2]
+    # by hand: 0.52 of an amplitude of 30 s moves the mean of 10 s; 88 % needs it off by 3.4 mdps
+    assert "a warm-up (SparkFun 2.8 to 9.1 mdps at power-on, for time constants of 5" in page
+    assert "a warm-up (SparkFun " in report[2] and "; NG " in report[2]
+
+
 # the page
 
 

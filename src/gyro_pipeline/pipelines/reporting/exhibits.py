@@ -9,8 +9,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from gyro_pipeline.conventions import ALL, FIRST, LEAVE_ONE_DEVICE_OUT
+from gyro_pipeline.conventions import ALL, AXES, FIRST, LEAVE_ONE_DEVICE_OUT, MDPS
 from gyro_pipeline.parameters import Published, PublishedResult
+from gyro_pipeline.physics.warm_up import amplitude_needed
 from gyro_pipeline.pipelines.reporting.results import column
 from gyro_pipeline.studies import CNN, CONSTANT, MEAN
 
@@ -29,6 +30,9 @@ _STUDIES_OF = {
     "generalization": "real2real",
 }
 """The study that makes each result table of the paper."""
+
+WARM_UPS_S = (5.0, 10.0, 20.0, 30.0, 60.0)
+"""Time constants for which the amplitude of a warm-up is computed."""
 
 _KEYS = ["sensor", "real_gyros", "virtual_gyros", "window_s"]
 
@@ -104,6 +108,32 @@ class Material:
         """As the paper writes it, if it does."""
         names = {sheet.sensor: sheet.name for sheet in self.published.specifications}
         return names.get(sensor, sensor)
+
+    def paper_recording_s(self, sensor: str) -> float:
+        """How long the paper's recordings of a sensor are."""
+        lengths = {sheet.sensor: sheet.recording_s for sheet in self.published.specifications}
+        return lengths[sensor]
+
+    def warm_up_needed_mdps(self, claim: PublishedResult) -> list[float]:
+        """Amplitudes of a warm-up that would make a published gain the ceiling in first windows.
+
+        Args:
+            claim: The published result; T is the paper's, N and the spread are those of the
+                recordings.
+
+        Returns:
+            One for each of :data:`WARM_UPS_S`; none where the sensor is not described.
+        """
+        rows = self.sensors[self.sensors.sensor == claim.sensor]
+        if rows.empty:
+            return []
+        noise, spread = (
+            rows.iloc[-1][[f"{name}_{axis}" for axis in AXES]].to_numpy(float)
+            for name in ("white_dps_rts", "spread_dps")
+        )
+        times = claim.window_s, self.paper_recording_s(claim.sensor), WARM_UPS_S
+        needed = amplitude_needed(claim.accuracy_gain_pct / 100, noise, spread, *times) / MDPS
+        return [] if np.isnan(needed).any() else needed.tolist()
 
     @property
     def claims(self) -> list[PublishedResult]:

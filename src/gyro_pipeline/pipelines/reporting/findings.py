@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from gyro_pipeline.conventions import ALL, MDPS
+from gyro_pipeline.conventions import ALL
 from gyro_pipeline.estimators import DEFAULT
 from gyro_pipeline.parameters import PublishedResult
 from gyro_pipeline.physics.ceiling import best_gain
@@ -21,9 +21,6 @@ _CEILING_GAIN = column("ceiling_accuracy_gain_pct", ALL)
 
 _SIGNIFICANT = 0.001
 """Of the oracle check after Holm's correction; tests/test_ceiling.py holds the same."""
-
-_TIME_CONSTANTS_S = (5.0, 60.0)
-"""Of the warm-ups whose amplitude is computed."""
 
 _CELL = ["sensor", "window_s"]
 _TRAINED_ON = ["method", "real_gyros", "virtual_gyros"]
@@ -101,12 +98,11 @@ def _estimators(rows: pd.DataFrame) -> str:
 
 def beyond_white_noise(material: Material) -> list[PublishedResult]:
     """Published results that exceed A = 1 - sqrt(T0/T), with the paper's T."""
-    lengths = {sheet.sensor: sheet.recording_s for sheet in material.published.specifications}
     return [
         claim
         for claim in material.claims
         if claim.accuracy_gain_pct
-        > 100 * best_gain(np.sqrt(claim.window_s / lengths[claim.sensor]))
+        > 100 * best_gain(np.sqrt(claim.window_s / material.paper_recording_s(claim.sensor)))
     ]
 
 
@@ -128,11 +124,9 @@ def _explanations(material: Material) -> str:
         return ""
     needed: dict[str, list[float]] = {}
     for claim in beyond:
-        row = material.result(claim, CNN)
-        if row is not None:
-            amplitudes = [warm_up_needed(row, claim, time_s) for time_s in _TIME_CONSTANTS_S]
-            needed.setdefault(material.sensor_name(claim.sensor), []).extend(amplitudes)
-    sizes = "; ".join(f"{name} {min(a):.2g} to {max(a):.2g}" for name, a in needed.items())
+        name = material.sensor_name(claim.sensor)
+        needed.setdefault(name, []).extend(material.warm_up_needed_mdps(claim))
+    sizes = "; ".join(f"{name} {min(a):.2g} to {max(a):.2g}" for name, a in needed.items() if a)
     amount = f" ({sizes} mdps at power-on, for time constants of 5 to 60 s)" if sizes else ""
     return (
         f"Three things would put them within reach: a warm-up{amount}, which a constant could take "
@@ -140,28 +134,6 @@ def _explanations(material: Material) -> str:
         "test. The mean rate against time after power-on, on measured data, tells the first from "
         "the others."
     )
-
-
-def warm_up_needed(row: pd.Series, claim: PublishedResult, time_constant_s: float) -> float:
-    """Amplitude of a warm-up that makes a published gain the ceiling, in mdps.
-
-    A warm-up a exp(-t / c) moves the mean of the first t seconds by a c/t (1 - exp(-t / c)). The
-    running mean of the window then errs by the difference of that at T0 and at T as well; whoever
-    knows the device takes it off. So (1 - A)^2 (mean^2 + error^2) = ceiling^2.
-
-    Args:
-        row: Our result, for the ceiling of the sensor without warm-up (first windows).
-        claim: The published one.
-        time_constant_s: c.
-    """
-
-    def moved(time_s: float) -> float:
-        return time_constant_s / time_s * (1 - np.exp(-time_s / time_constant_s))
-
-    ceiling = row.ceiling_rmse_dps / MDPS
-    mean = ceiling / (1 - row.ceiling_accuracy_gain_pct / 100)
-    error2 = (ceiling / (1 - claim.accuracy_gain_pct / 100)) ** 2 - mean**2
-    return float(np.sqrt(max(error2, 0)) / (moved(claim.window_s) - moved(row.recording_s)))
 
 
 def _ranked(window_s: float, networks: pd.DataFrame) -> str:

@@ -124,8 +124,9 @@ def start_up(recordings: xr.Dataset, bias: pd.DataFrame, noise: pd.DataFrame) ->
         noise: N, B and K.
 
     Returns:
-        ``<method>_s_at_<sigma>``, of the methods mean, history and ceiling; 0 where history alone
-        suffices, inf where a recording's length does not, NaN where the noise is not known.
+        ``spread_dps`` and ``white_dps_rts`` of each axis, and ``<method>_s_at_<sigma>``, of the
+        methods mean, history and ceiling; 0 where history alone suffices, inf where a recording's
+        length does not, NaN where the noise is not known.
     """
     imu, rate_hz = tested_imu(recordings), recordings.attrs["rate_hz"]
     white, flicker, walk = (
@@ -152,6 +153,8 @@ def start_up(recordings: xr.Dataset, bias: pd.DataFrame, noise: pd.DataFrame) ->
         "ceiling": spread**2,
     }
     row = {"spread_dps": float(np.sqrt(np.mean(spread**2))), "history_recordings": count}
+    row |= {f"spread_dps_{axis}": value for axis, value in zip(AXES, spread, strict=True)}
+    row |= {f"white_dps_rts_{axis}": value for axis, value in zip(AXES, white, strict=True)}
     for method, prior in priors.items():
         with np.errstate(divide="ignore"):
             variance = (1 / (1 / mean + 1 / prior)).mean(axis=1)
