@@ -199,6 +199,22 @@ def beyond_ceiling(row: Any, windows: str = ALL) -> bool:
     return bool(low > (limit if np.isnan(high) else high))
 
 
+def remark(row: Any) -> str | None:
+    """What a reader must know beside an accuracy gain; None where there is nothing."""
+    notes = []
+    for windows in (ALL, FIRST):
+        gain, _, _ = ends(row, "accuracy_gain_pct", windows)
+        limit, _, _ = ends(row, "ceiling_accuracy_gain_pct", windows)
+        if beyond_ceiling(row, windows):
+            notes.append(f"beyond its ceiling in {windows} windows")
+        elif gain > limit:
+            notes.append(
+                f"above the expected ceiling in {windows} windows by chance: the interval holds it"
+            )
+    notes += [row["prior_conflict"]] * bool(pd.notna(row.get("prior_conflict")))
+    return "; ".join(notes) or None
+
+
 def gyroscopes(row: Any) -> str:
     """The training set in words."""
     virtual = f" + {row.virtual_gyros:.0f} virtual" if row.virtual_gyros else ""

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from gyro_pipeline.conventions import ALL
+from gyro_pipeline.conventions import ALL, FIRST
 from gyro_pipeline.estimators import DEFAULT
 from gyro_pipeline.parameters import PublishedResult
 from gyro_pipeline.physics.ceiling import best_gain
-from gyro_pipeline.pipelines.reporting.exhibits import Material, label
+from gyro_pipeline.pipelines.reporting.exhibits import Material, beyond_ceiling, label
 from gyro_pipeline.pipelines.reporting.results import column
 from gyro_pipeline.protocol.scores import holm
 from gyro_pipeline.studies import CNN, CONSTANT, MEAN
@@ -17,6 +17,9 @@ from gyro_pipeline.studies import CNN, CONSTANT, MEAN
 _GAIN = column("accuracy_gain_pct", ALL)
 _RMSE = column("test_rmse_dps", ALL)
 _CEILING = column("ceiling_rmse_dps", ALL)
+_ORACLE, _ORACLE_GAIN = (
+    column(name, ALL) for name in ("oracle_rmse_dps", "oracle_accuracy_gain_pct")
+)
 _CEILING_GAIN = column("ceiling_accuracy_gain_pct", ALL)
 
 _SIGNIFICANT = 0.001
@@ -48,6 +51,7 @@ def findings(material: Material) -> list[str]:
         _more_data(networks, "virtual_gyros", "virtual gyroscopes to the same real ones"),
         _more_data(networks[networks.method == 2], "real_gyros", "real gyroscopes"),  # noqa: PLR2004
         _below_ceiling(rows),
+        _prior_conflicts(rows),
         _oracle_check(rows),
     ]
     return [sentence for sentence in told if sentence]
@@ -71,7 +75,14 @@ def _networks(rows: pd.DataFrame) -> str:
         )
     if (here.estimator == DEFAULT).any():
         parts.append(f"the {label(DEFAULT)} predictor {_gain(here, DEFAULT)} %")
-    parts.append(f"and the ceiling is {_range(here[_CEILING_GAIN].dropna())} %")
+    limit = f"{_range(here[_CEILING_GAIN].dropna())} %"
+    if _ORACLE_GAIN in here and here[_ORACLE_GAIN].notna().any():
+        parts.append(
+            f"and the oracle, which knows what was drawn, {_range(here[_ORACLE_GAIN].dropna())} %, "
+            f"where {limit} is expected of the best (the ceiling)"
+        )
+    else:
+        parts.append(f"and the ceiling is {limit}")
     return f"{', '.join(parts)}."
 
 
@@ -138,10 +149,13 @@ def _explanations(material: Material) -> str:
 
 def _ranked(window_s: float, networks: pd.DataFrame) -> str:
     better, worse = (networks[f"{_GAIN}_lo"] > 0).sum(), (networks[f"{_GAIN}_hi"] < 0).sum()
+    realised = _ORACLE in networks and networks[_ORACLE].notna().all()
+    best = networks[_ORACLE if realised else _CEILING]
     told = (
         f"At {window_s:g} s, {better} of {len(networks)} networks are better than the running mean "
         f"with their whole interval and {worse} are worse with it; A is {_range(networks[_GAIN])} "
-        f"%. Their RMSE is {_range(networks[_RMSE] / networks[_CEILING], '.2f')} times the ceiling."
+        f"%. Their RMSE is {_range(networks[_RMSE] / best, '.2f')} times "
+        f"{'that of the oracle on the same windows' if realised else 'the expected ceiling'}."
     )
     key = f"less_{CONSTANT}_dps"
     if key in networks and networks[key].notna().any():
@@ -184,21 +198,31 @@ def _more_data(networks: pd.DataFrame, count: str, what: str) -> str:
 
 
 def _below_ceiling(rows: pd.DataFrame) -> str:
-    if f"{_GAIN}_lo" not in rows:
-        return ""
-    limits = rows[f"{_CEILING_GAIN}_hi"].astype(float).fillna(rows[_CEILING_GAIN].astype(float))
-    beyond = rows[rows[f"{_GAIN}_lo"] > limits]
-    if beyond.empty:
+    flagged = [
+        beyond_ceiling(row, ALL) or beyond_ceiling(row, FIRST) or pd.notna(row.below_ceiling)
+        for _, row in rows.iterrows()
+    ]
+    if not any(flagged):
         return ""
     names = ", ".join(
         f"{label(row.estimator)} on {row.sensor} at {row.window_s:g} s"
-        for _, row in beyond.iterrows()
+        for _, row in rows[flagged].iterrows()
     )
     return (
         f"Beyond their ceiling with the whole interval: {names}. The ceiling is the linear "
         "optimum, axis by axis, for exchangeable power-ons; correlated axes, biases that follow "
         "one another or other noise leave more to gain."
     )
+
+
+def _prior_conflicts(rows: pd.DataFrame) -> str:
+    """What contradicts the prior, and what the mean would have given."""
+    conflicts = rows[rows.prior_conflict.notna()]
+    told = [
+        f"{label(row.estimator)} on {row.sensor} at {row.window_s:g} s: {row.prior_conflict}"
+        for _, row in conflicts.iterrows()
+    ]
+    return f"The prior does not hold. {'. '.join(told)}." if told else ""
 
 
 def _oracle_check(rows: pd.DataFrame) -> str:
@@ -211,7 +235,9 @@ def _oracle_check(rows: pd.DataFrame) -> str:
     verdict = "No estimator beats" if not beaten else f"DEFECT OF THE EVALUATION: {beaten} beat"
     return (
         f"{verdict} the oracle, which knows what was drawn, on the same windows significantly: the "
-        f"smallest p value of {len(checked)} is {corrected.min():.2g} after Holm's correction."
+        f"smallest p value of {len(checked)} is {corrected.min():.2g} after Holm's correction. "
+        "(With 48 comparisons and 20 recordings, a leak that halves the errors is seen in 94 % of "
+        "cases if all recordings leak, in 0 % if half of them do.)"
     )
 
 

@@ -14,7 +14,7 @@ from gyro_pipeline.parameters import GroundTruth, Only, Published, Study
 from gyro_pipeline.pipelines.reporting import figures, signals, tables
 from gyro_pipeline.pipelines.reporting.exhibits import PREMISE, Exhibit, Material, label
 from gyro_pipeline.pipelines.reporting.findings import answer, findings
-from gyro_pipeline.pipelines.reporting.results import CNN_BEST, NOT_RUN, ROW
+from gyro_pipeline.pipelines.reporting.results import CNN_BEST, NOT_RUN, ROW, WARNINGS
 from gyro_pipeline.studies import CNN, CONSTANT, LEAKAGE, MEAN
 
 Tables = Mapping[str, Callable[[], pd.DataFrame]]
@@ -23,7 +23,7 @@ _OF_THE_PAPER = ("augmentation", "real2real", "input_channels")
 
 _BASE = ("base", "local")
 _COLUMNS = [*ROW, "study", "status", "run_ids", "fingerprints", "env", "simulated"]
-_COLUMNS += ["recommended", "beats_oracle_p"]
+_COLUMNS += ["recommended", "beats_oracle_p", *WARNINGS]
 """Of results, also where none was made."""
 
 
