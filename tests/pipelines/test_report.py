@@ -61,17 +61,21 @@ def report(described, parameters):
 
 
 def test_drift_shows_a_warm_up_that_all_power_ons_share_and_none_where_there_is_none(recordings):
-    warm, still = (drift(recordings[name]).set_index("x") for name in ("dot", "ng"))
+    (warm, warm_bounds), (still, bounds) = (drift(recordings[name]) for name in ("dot", "ng"))
     for axis in "xyz":
         own = warm[warm.line == axis]
-        times_s = own.index.to_numpy()
-        expected = AMPLITUDE * np.exp(-times_s / WARM_UP_S)
-        expected -= expected[-6:].mean()
-        inside = (own.lo < expected) & (expected < own.hi)
-        assert inside.mean() > 0.8
-        assert own.y.iloc[0] == pytest.approx(expected[0], abs=2e-3)
+        expected = AMPLITUDE * np.exp(-own.x / WARM_UP_S)
+        expected -= expected[-round(len(own) / 4) :].mean()
+        assert ((own.lo < expected) & (expected < own.hi)).mean() > 0.8
+        assert own.y.iloc[0] == pytest.approx(expected.iloc[0], abs=4e-3)
+        (fitted,) = [rows for name, rows in warm.groupby("line") if name.startswith(f"{axis},")]
+        assert fitted.line.iloc[0].endswith("warm-up of 5 s")
+        np.testing.assert_allclose(fitted.y, expected, atol=2e-3)
+    assert AMPLITUDE < warm_bounds["warm_up_bound_dps_5"] < AMPLITUDE + 3e-3
+    assert bounds["warm_up_bound_dps_5"] < 3e-3
+    still = still[still.line.isin(list("xyz"))]
     assert ((still.lo < 0) & (0 < still.hi)).mean() > 0.85
-    alone = drift(recordings["ng"].isel(imu=[0], recording=[0]))
+    alone, _ = drift(recordings["ng"].isel(imu=[0], recording=[0]))
     assert alone.lo.isna().all() and alone.y.notna().all()
 
 
