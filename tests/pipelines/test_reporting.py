@@ -423,6 +423,21 @@ def test_the_page_answers_first_and_names_the_premise(report):
     assert "any estimator" not in page
 
 
+def test_what_is_added_is_compared_in_pairs_with_all_seeds_together(make_run, mean, pool):
+    study = study_of(virtual=(0, 24))
+    tables = {(v, s): errors(0.002 - v * 2e-5, 10 + v + s) for v in (0, 24) for s in (0, 1)}
+    runs = [
+        make_run(f"{v}-{s}", table, study, virtual_gyros=v, seed=s)
+        for (v, s), table in tables.items()
+    ]
+    row = pool([*runs, mean], study, seeds=(0, 1))["results"].set_index("virtual_gyros").loc[24]
+    few, more = (rmse([tables[v, 0], tables[v, 1]]) for v in (0, 24))
+    change = 100 * (few - more) / rmse([mean.load(ERRORS)])
+    assert row.added_virtual_gyros_pct == pytest.approx(change)
+    assert row.added_virtual_gyros_pct_lo < change < row.added_virtual_gyros_pct_hi
+    assert "added_real_gyros_pct" not in row
+
+
 def test_what_follows_is_counted(report):
     page = report[2]
     ranked = sentence(page, "At 10 s, ")

@@ -26,6 +26,7 @@ FIGURES = ["white_dps_rts", "instability_dps", "random_walk_dps_per_rts"]
 GYROSCOPES = (1, 4, 10)
 """How many gyroscopes the paper averages in its figure of convergence."""
 
+_DRIFT_POINTS = 24  # of a recording; noise would hide the drift if there were many more
 WARM_UPS_S = (5.0, 20.0, 60.0)
 """Time constants of the warm-ups that are fitted to recordings."""
 
@@ -100,7 +101,8 @@ def drift(recordings: xr.Dataset) -> tuple[pd.DataFrame, dict[str, float]]:
         if samples.shape[-1] >= length
     ])  # fmt: skip
     blocks_hz = means.shape[-1] * rate_hz / length
-    seen = settling(means, blocks_hz)
+    coarse = block_means(means, block_edges(means.shape[-1], means.shape[-1] // _DRIFT_POINTS))
+    seen = settling(coarse, coarse.shape[-1] * rate_hz / length)
     fits = {time_s: fit_common_warm_up(means, blocks_hz, time_s) for time_s in WARM_UPS_S}
     bounds = {f"warm_up_bound_dps_{t:g}": float(fit.bound.max()) for t, fit in fits.items()}
     time_s = max(fits, key=lambda t: np.nansum((fits[t].amplitude / fits[t].half) ** 2))

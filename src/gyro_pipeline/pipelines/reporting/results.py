@@ -20,6 +20,7 @@ from gyro_pipeline.protocol.scores import (
     WeightedCurve,
     clusters,
     curve_errors,
+    gain_difference,
     gain_pct,
     leave_one_out,
     paired_difference,
@@ -60,6 +61,9 @@ WARNINGS = ["below_ceiling", "prior_conflict"]
 
 REFERENCES = (MEAN, DEFAULT, CONSTANT)
 """What every estimator is compared with, in pairs over recordings."""
+
+ADDED = ("virtual_gyros", "real_gyros")
+"""Counts of gyroscopes in training whose effect on A is compared in pairs."""
 
 _CURVES = ["study", "sensor", "windows", "time_s", "rmse_dps"]
 _ENDS = {"": "value", "_lo": "lo", "_hi": "hi"}
@@ -207,7 +211,7 @@ class Cell:
             if not runs or self.mean is None:
                 results.append(name | {"status": problem or NOT_RUN, "run_ids": None})
                 continue
-            results.append(name | self._result(specs[0], runs))
+            results.append(name | self._result(specs[0], runs) | self._added(specs[0], runs))
             best = [best_epoch(run) for run in runs if specs[0].estimator == CNN]
             if best and all(len(run.load(ERRORS)) for run in best):
                 results.append(
@@ -273,6 +277,26 @@ class Cell:
             for table in (errors, self._references[MEAN])
         )
         return gain_pct(with_interval(np.sqrt(own / mean), positive=True))
+
+    def _added(self, spec: RunSpec, runs: Sequence[StoredRun]) -> dict[str, Any]:
+        """By how much A exceeds that with the fewest gyroscopes, all else equal.
+
+        Paired over recordings, all seeds together: ``added_<count>_pct``, over all windows.
+        """
+        row: dict[str, Any] = {}
+        for count in ADDED if spec.estimator == CNN else ():
+            none: dict[str, Any] = {count: 0}
+            alike = [
+                (getattr(specs[0], count), of_fewer)
+                for specs, of_fewer, _ in self._rows
+                if of_fewer and replace(specs[0], **none) == replace(spec, **none)
+            ]
+            fewest, of_fewest = min(alike, key=lambda pair: pair[0])
+            if getattr(spec, count) > fewest:
+                own, base = (squared_errors(errors_of(r), PAPER, ALL) for r in (runs, of_fewest))
+                change = gain_difference(own, base, self._squares[ALL], self._weights)
+                row |= {f"added_{count}_pct{end}": getattr(change, k) for end, k in _ENDS.items()}
+        return row
 
     def _differences(self, runs: Sequence[StoredRun]) -> dict[str, Any]:
         """Errors less those of the references on all the same windows, paired over recordings.

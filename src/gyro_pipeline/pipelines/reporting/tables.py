@@ -23,6 +23,7 @@ from gyro_pipeline.pipelines.reporting.exhibits import (
 )
 from gyro_pipeline.pipelines.reporting.recordings import SIGMAS_MDPS
 from gyro_pipeline.pipelines.reporting.results import (
+    ADDED,
     CEILINGS,
     OTHERS,
     REALISED,
@@ -158,7 +159,8 @@ def results_table(material: Material, study: str) -> Exhibit:
     for base in more:
         short = base.replace("accuracy_gain_pct", "A").replace("_", " ")
         table[f"{short} {ALL} %"] = _scaled(rows, column(base, ALL), 0)
-    for name in [name for name in (*OTHERS, *WARNINGS) if name in rows]:
+    added = [f"added_{count}_pct{end}" for count in ADDED for end in ("", "_lo", "_hi")]
+    for name in [name for name in (*added, *OTHERS, *WARNINGS) if name in rows]:
         table[name.replace("_", " ")] = rows[name]
     table["split"] = [split(row) for _, row in rows.iterrows()]
     table["status"], table["runs"] = rows.status, rows.run_ids.map(_short, na_action="ignore")
