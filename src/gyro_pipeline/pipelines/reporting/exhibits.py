@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from gyro_pipeline.conventions import ALL, AXES, FIRST, LEAVE_ONE_DEVICE_OUT, MDPS
 from gyro_pipeline.parameters import Published, PublishedResult
+from gyro_pipeline.physics.ceiling import best_gain
 from gyro_pipeline.physics.warm_up import amplitude_needed
 from gyro_pipeline.pipelines.reporting.results import column
 from gyro_pipeline.studies import CNN, CONSTANT, MEAN
@@ -114,6 +115,11 @@ class Material:
         lengths = {sheet.sensor: sheet.recording_s for sheet in self.published.specifications}
         return lengths[sensor]
 
+    def beyond_white_noise(self, claim: PublishedResult) -> bool:
+        """Whether a published gain exceeds A = 1 - sqrt(T0/T), with the paper's T."""
+        r = claim.window_s / self.paper_recording_s(claim.sensor)
+        return bool(claim.accuracy_gain_pct > 100 * best_gain(np.sqrt(r)))
+
     def warm_up_needed_mdps(self, claim: PublishedResult) -> list[float]:
         """Amplitudes of a warm-up that would make a published gain the ceiling in first windows.
 
@@ -190,6 +196,12 @@ def percent(value: float) -> str:
     if np.isinf(value):
         return "never reached" if value > 0 else "off the curve"
     return f"{round(value)}"
+
+
+def from_to(values: Sequence[float]) -> str:
+    """The smallest and the largest of some amounts, with two digits."""
+    low, high = (f"{v:.0f}" if v >= 9.95 else f"{v:.1f}" for v in (min(values), max(values)))  # noqa: PLR2004
+    return low if low == high else f"{low} to {high}"
 
 
 def beyond_ceiling(row: Any, windows: str = ALL) -> bool:

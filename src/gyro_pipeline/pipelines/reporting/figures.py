@@ -85,9 +85,9 @@ def _draw_claim(
 ) -> None:
     gain = "accuracy_gain_pct"
     rows = [
-        (CNN, COLOURS[0], "o", -0.2),
-        (CONSTANT, COLOURS[1], "s", 0.0),
-        (DEFAULT, COLOURS[2], "^", 0.2),
+        (CNN, COLOURS[0], "o", -0.3),
+        (CONSTANT, COLOURS[1], "s", -0.1),
+        (DEFAULT, COLOURS[2], "^", 0.1),
     ]
     for name, colour, marker, shift in rows:
         value, lo, hi = ends(material.result(claim, name), gain, windows)
@@ -109,7 +109,7 @@ def _draw_claim(
         ax.plot([limit] * 2, [place - 0.42, place + 0.42], color=CEILING, lw=1.8, label="ceiling")
     realised, _, _ = ends(material.result(claim, CNN), f"oracle_{gain}", windows)
     if not np.isnan(realised):
-        ax.plot(realised, place, "x", color=CEILING, ms=6, mew=1.6, label="oracle")
+        ax.plot(realised, place + 0.3, "x", color=CEILING, ms=6, mew=1.6, label="oracle")
     ax.plot(claim.accuracy_gain_pct, place, "D", mfc="none", mec="black", ms=7, label="published")
 
 

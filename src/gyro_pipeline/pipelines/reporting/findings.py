@@ -2,14 +2,11 @@
 
 from collections.abc import Sequence
 
-import numpy as np
 import pandas as pd
 
 from gyro_pipeline.conventions import ALL, FIRST
 from gyro_pipeline.estimators import DEFAULT
-from gyro_pipeline.parameters import PublishedResult
-from gyro_pipeline.physics.ceiling import best_gain
-from gyro_pipeline.pipelines.reporting.exhibits import Material, beyond_ceiling, label
+from gyro_pipeline.pipelines.reporting.exhibits import Material, beyond_ceiling, from_to, label
 from gyro_pipeline.pipelines.reporting.results import column
 from gyro_pipeline.protocol.scores import holm
 from gyro_pipeline.studies import CNN, CONSTANT, MEAN
@@ -104,20 +101,10 @@ def _estimators(rows: pd.DataFrame) -> str:
     )
 
 
-def beyond_white_noise(material: Material) -> list[PublishedResult]:
-    """Published results that exceed A = 1 - sqrt(T0/T), with the paper's T."""
-    return [
-        claim
-        for claim in material.claims
-        if claim.accuracy_gain_pct
-        > 100 * best_gain(np.sqrt(claim.window_s / material.paper_recording_s(claim.sensor)))
-    ]
-
-
 def _published(material: Material) -> str:
     if not material.claims:
         return ""
-    beyond = beyond_white_noise(material)
+    beyond = [claim for claim in material.claims if material.beyond_white_noise(claim)]
     return (
         f"{len(beyond)} of {len(material.claims)} published gains on these sensors "
         f"{'is' if len(beyond) == 1 else 'are'} beyond "
@@ -127,14 +114,14 @@ def _published(material: Material) -> str:
 
 def _explanations(material: Material) -> str:
     """What would put the published gains within reach, the innocent explanation first."""
-    beyond = beyond_white_noise(material)
+    beyond = [claim for claim in material.claims if material.beyond_white_noise(claim)]
     if not beyond:
         return ""
     needed: dict[str, list[float]] = {}
     for claim in beyond:
         name = material.sensor_name(claim.sensor)
         needed.setdefault(name, []).extend(material.warm_up_needed_mdps(claim))
-    sizes = "; ".join(f"{name} {min(a):.2g} to {max(a):.2g}" for name, a in needed.items() if a)
+    sizes = "; ".join(f"{name} {from_to(a)}" for name, a in needed.items() if a)
     amount = f" ({sizes} mdps at power-on, for time constants of 5 to 60 s)" if sizes else ""
     return (
         f"Three things would put them within reach: a warm-up{amount}, which a constant could take "

@@ -174,7 +174,9 @@ def _sentence(name: str) -> str:
     first = " ".join((estimator_class(name).__doc__ or "No description.").split("\n\n")[0].split())
     _, options = ESTIMATORS.get(name, (name, {}))
     words = [
-        f"{key}={value}".removesuffix("=True").replace("_", " ") for key, value in options.items()
+        f"{key}={value}".removesuffix("=True").replace("_", " ")
+        for key, value in options.items()
+        if value is not None
     ]
     return first + (f" With {', '.join(words)}." if words else "")
 

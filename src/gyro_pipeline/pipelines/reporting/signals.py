@@ -40,8 +40,9 @@ def drift(material: Material) -> Exhibit | None:
                 ax.fill_between(
                     line.x, line.lo / MDPS, line.hi / MDPS, color=colour, alpha=0.18, lw=0
                 )
+            for axis, colour in zip(AXES, COLOURS, strict=False):
                 fit = own[own.line.str.startswith(f"{axis},")]
-                ax.plot(line.x, fit.y / MDPS, color=colour, ls="--", lw=1, label="fitted warm-up")
+                ax.plot(fit.x, fit.y / MDPS, color=colour, ls="--", lw=1, label="fitted warm-up")
             ax.axhline(0, color="black", lw=0.8)
             ax.set(title=material.sensor_name(sensor), xlabel="time after power-on [s]")
             ax.set_ylabel("mean rate less its end [mdps]")

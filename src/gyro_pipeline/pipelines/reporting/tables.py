@@ -1,7 +1,6 @@
 """The tables of the report: one function each, with its caption beside it."""
 
 import logging
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from gyro_pipeline.pipelines.reporting.exhibits import (
     Exhibit,
     Material,
     ends,
+    from_to,
     gyroscopes,
     interval,
     label,
@@ -110,7 +110,7 @@ def _result_row(material: Material, claim: PublishedResult) -> dict[str, Any]:
         "Ceiling A %": interval(row, "ceiling_accuracy_gain_pct"),
         _ORACLE_A: interval(row, "oracle_accuracy_gain_pct"),
         "Paper's way ceiling A %": interval(row, "ceiling_accuracy_gain_pct", FIRST),
-        _WARM_UP: _needed(material.warm_up_needed_mdps(claim)),
+        _WARM_UP: _warm_up(material, claim),
         "Seeds": known.get("seeds"),
         "Spread of S over seeds": _spread(known, "time_saving_pct"),
         "Spread of A over seeds": _spread(known, "accuracy_gain_pct"),
@@ -121,11 +121,11 @@ def _result_row(material: Material, claim: PublishedResult) -> dict[str, Any]:
     }
 
 
-def _needed(amplitudes_mdps: Sequence[float]) -> str:
-    if not amplitudes_mdps:
-        return "–"
-    low, high = min(amplitudes_mdps), max(amplitudes_mdps)
-    return f"{low:.2g} to {high:.2g}" if high else "none"
+def _warm_up(material: Material, claim: PublishedResult) -> str:
+    if not material.beyond_white_noise(claim):
+        return "none"
+    amplitudes_mdps = material.warm_up_needed_mdps(claim)
+    return from_to(amplitudes_mdps) if amplitudes_mdps else "–"
 
 
 def _spread(row: Any, base: str) -> str:
