@@ -288,6 +288,19 @@ def test_results_stand_beside_the_published_ones_and_the_ceiling(grid, report):
     assert len(report[0]["augmentation_results"]) == 1 + 4 + 3 + 1  # equal runs once
 
 
+def test_networks_trained_on_first_windows_stand_beside_the_others(grid, write):
+    first = grid["augmentation/results"].assign(study="first_windows", accuracy_gain_pct=44.0)
+    table = write(grid | {"first_windows/results": first})[0]["first_windows"]
+    assert len(table) == 2 * 4  # 9 real gyroscopes: no
+    pair = table.iloc[2:4]
+    assert pair["Trained on"].tolist() == ["all windows", "first windows"]
+    assert pair["Published A %"].tolist() == ["79", "79"]
+    assert pair["Network A %, first windows"].str.startswith("44").tolist() == [False, True]
+    assert set(pair["Constant A %, first windows"]) == {"20"}
+    assert set(pair["Ceiling A %, all windows"]) == {"66"}
+    assert "first_windows" not in write(grid)[0]
+
+
 def test_a_source_with_fewer_gyroscopes_stands_beside_the_published_row(grid, write):
     results = grid["real2real/results"]
     few = results[results.real_gyros == 3].assign(source="published", simulated=False)

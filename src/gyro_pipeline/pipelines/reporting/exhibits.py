@@ -147,7 +147,9 @@ class Material:
         known = {*self.results.sensor, *self.sensors.sensor}
         return [row for row in self.published.results if row.sensor in known]
 
-    def result(self, claim: PublishedResult, estimator: str) -> pd.Series | None:
+    def result(
+        self, claim: PublishedResult, estimator: str, study: str | None = None
+    ) -> pd.Series | None:
         """Our result for a published one; None where there is none.
 
         Where the study has no row with as many real gyroscopes, such as on the public file of a
@@ -156,8 +158,9 @@ class Material:
         Args:
             claim: The published result.
             estimator: Whose.
+            study: Another study than the one that makes the paper's table.
         """
-        rows = self.of(_STUDIES_OF[claim.table], estimator=estimator)
+        rows = self.of(study or _STUDIES_OF[claim.table], estimator=estimator)
         for key in ("sensor", "virtual_gyros", "window_s"):
             rows = rows[rows[key] == getattr(claim, key)]
         rows = rows[rows.real_gyros <= claim.real_gyros].sort_values("real_gyros")

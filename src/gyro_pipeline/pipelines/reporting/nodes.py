@@ -15,11 +15,11 @@ from gyro_pipeline.pipelines.reporting import figures, signals, tables
 from gyro_pipeline.pipelines.reporting.exhibits import PREMISE, Exhibit, Material, label
 from gyro_pipeline.pipelines.reporting.findings import answer, findings
 from gyro_pipeline.pipelines.reporting.results import CNN_BEST, NOT_RUN, ROW, WARNINGS
-from gyro_pipeline.studies import CNN, CONSTANT, LEAKAGE, MEAN
+from gyro_pipeline.studies import CNN, CONSTANT, FIRST_WINDOWS, LEAKAGE, MEAN
 
 Tables = Mapping[str, Callable[[], pd.DataFrame]]
-_OF_THE_PAPER = ("augmentation", "real2real", "input_channels")
-"""Studies that the paper has tables or figures of; others have a figure and a table per sensor."""
+_OF_THE_PAPER = ("augmentation", "real2real", "input_channels", FIRST_WINDOWS)
+"""Studies that stand beside the paper's; others have a figure and a table per sensor."""
 
 _BASE = ("base", "local")
 _COLUMNS = [*ROW, "study", "status", "run_ids", "fingerprints", "env", "simulated"]
@@ -114,6 +114,7 @@ def _tables(material: Material) -> list[Exhibit]:
         tables.three_gyroscopes(material),
         tables.multiple_gyroscopes(material),
         tables.generalization(material),
+        tables.trained_on_first_windows(material),
         *compared,
         tables.sensor_specifications(material),
         tables.recording_quality(material),

@@ -30,7 +30,7 @@ from gyro_pipeline.pipelines.reporting.results import (
     WARNINGS,
     column,
 )
-from gyro_pipeline.studies import CNN, CONSTANT, MEAN, RESIDUAL_NETWORK
+from gyro_pipeline.studies import CNN, CONSTANT, FIRST_WINDOWS, MEAN, RESIDUAL_NETWORK
 
 logger = logging.getLogger(__name__)
 
@@ -75,6 +75,45 @@ def _result_table(material: Material, name: str, title: str) -> Exhibit | None:
     shown += ["Ceiling A %", *[_ORACLE_A] * material.simulated, "Paper's way A %", _WARM_UP]
     shown += ["Note"] if made["Note"].notna().any() else []
     return Exhibit(name, title, _SUMMARY, made, shown)
+
+
+def trained_on_first_windows(material: Material) -> Exhibit | None:
+    """Networks trained on all and on first windows, beside a constant: where a bias warms up."""
+    if material.of(FIRST_WINDOWS).empty:
+        return None
+    rows = []
+    for claim in (claim for claim in material.claims if claim.table != "generalization"):
+        for study, trained in (("augmentation", ALL), (FIRST_WINDOWS, FIRST)):
+            row = material.result(claim, CNN, study)
+            if row is not None and row.real_gyros == claim.real_gyros:
+                rows.append(_first_and_all(material, claim, row, trained))
+    if not rows:
+        return None
+    caption = (
+        "The paper's network, trained on all windows and on first windows, over the first window "
+        "of each recording, the paper's way, and over all windows; A in percent, with 95 % "
+        "intervals. What a bias that settles after power-on gives to the network in first windows, "
+        "it gives to a constant as well. The ceiling is that of the noise and warm-up drawn."
+    )
+    title = "Trained on all and on first windows, beside a constant"
+    return Exhibit("first_windows", title, caption, pd.DataFrame(rows))
+
+
+def _first_and_all(
+    material: Material, claim: PublishedResult, row: pd.Series, trained: str
+) -> dict[str, Any]:
+    gains = {
+        f"{name} A %, {windows} windows": interval(row, f"{kind}accuracy_gain_pct", windows)
+        for windows in (FIRST, ALL)
+        for name, kind in (("Network", ""), ("Constant", "constant_"), ("Ceiling", "ceiling_"))
+    }
+    return {
+        "Sensor": material.sensor_name(claim.sensor),
+        "Gyroscopes": gyroscopes(row),
+        "Trained on": f"{trained} windows",
+        "Published A %": f"{claim.accuracy_gain_pct:.0f}",
+        **gains,
+    }
 
 
 _ORACLE = "oracle, on the same windows"
