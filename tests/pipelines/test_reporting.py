@@ -342,7 +342,7 @@ def test_on_simulated_data_the_oracle_stands_beside_and_chance_is_called_chance(
     tables, figures, page = write(stored_as("augmentation", made))
     table = tables["augmentation_three_gyroscopes"].iloc[0]
     assert table["Oracle A %"] == "62"
-    assert "above the expected ceiling in all windows by chance" in table["Note"]
+    assert "by chance above its ceiling in all windows" in table["Note"]
     assert table["Note"].endswith(conflict)
     assert f"network on sparkfun at 10 s: {conflict}" in page
     assert "62 %, where" in page and "times that of the oracle on the same windows" in page

@@ -126,9 +126,23 @@ def _explanations(material: Material) -> str:
     return (
         f"Three things would put them within reach: a warm-up{amount}, which a constant could take "
         "off as well; another truth than the mean of the recording; or a leak between training and "
-        "test. The mean rate against time after power-on, on measured data, tells the first from "
-        "the others."
+        f"test. {_what_decides(material, list(needed))}"
     )
+
+
+def _what_decides(material: Material, names: Sequence[str]) -> str:
+    """What tells a warm-up from the others: on measured data, the largest that there can be."""
+    allowed = {
+        material.sensor_name(sensor): material.warm_up_allowed_mdps(sensor)
+        for sensor in material.sensors.sensor
+    }
+    sizes = "; ".join(f"{name} {from_to(a)}" for name, a in allowed.items() if a and name in names)
+    if material.simulated or not sizes:
+        return (
+            "The mean rate against time after power-on, on measured data, tells the first from the "
+            "others."
+        )
+    return f"These recordings allow a warm-up of at most {sizes} mdps (95 % intervals)."
 
 
 def _ranked(window_s: float, networks: pd.DataFrame) -> str:

@@ -60,13 +60,14 @@ def drift(material: Material) -> Exhibit | None:
 
 def _bounds(material: Material) -> str:
     """The largest amplitude of a warm-up that recordings allow, by sensor and time constant."""
+    allowed = {sensor: material.warm_up_allowed_mdps(sensor) for sensor in material.sensors.sensor}
     times_s = "/".join(f"{time_s:g}" for time_s in WARM_UPS_S)
-    sizes = [
-        f"{material.sensor_name(row.sensor)} "
-        + "/".join(f"{row[f'warm_up_bound_dps_{t:g}'] / MDPS:.2g}" for t in WARM_UPS_S)
-        for _, row in material.sensors.iterrows()
-    ]
-    return f"{', '.join(sizes)} mdps for time constants of {times_s} s, on the worst axis"
+    sizes = ", ".join(
+        f"{material.sensor_name(sensor)} " + "/".join(f"{bound:.2g}" for bound in bounds)
+        for sensor, bounds in allowed.items()
+        if bounds
+    )
+    return f"{sizes} mdps for time constants of {times_s} s, on the worst axis"
 
 
 def allan_deviation(material: Material) -> Exhibit | None:
