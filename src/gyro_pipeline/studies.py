@@ -24,9 +24,6 @@ LEAKAGE = "leakage"
 """The leak study, which has a report of its own."""
 
 
-FIRST_WINDOWS = "first_windows"
-"""The study whose networks are trained on first windows."""
-
 LEFT_OUT = "left_out"
 """Column of a plan: why a run cannot be made; empty where it can."""
 

@@ -73,9 +73,10 @@ def forest(material: Material) -> Exhibit | None:
     caption = (
         "A row for each published result. A, the accuracy gain, is how much smaller the error is "
         "than that of the mean of the same window: 0 is the running mean, 100 no error. Bars are "
-        "95 % intervals over recordings. Beyond the ceiling is what white noise without drift "
-        "does not allow. The ceiling is expected; the oracle, which knows what was drawn, is "
-        "judged on the same windows as the others."
+        "95 % intervals over recordings. The ceiling is what is expected of the best under white "
+        "noise without drift or, where that was drawn or fitted, under the noise and warm-up of "
+        "the recordings. The oracle, which knows what was drawn, is judged on the same windows as "
+        "the others."
     )
     return Exhibit("forest", "The paper's ten rows and ours", caption, figure)
 

@@ -15,10 +15,10 @@ from gyro_pipeline.pipelines.reporting import figures, signals, tables
 from gyro_pipeline.pipelines.reporting.exhibits import PREMISE, Exhibit, Material, label
 from gyro_pipeline.pipelines.reporting.findings import answer, findings
 from gyro_pipeline.pipelines.reporting.results import CNN_BEST, NOT_RUN, ROW, WARNINGS
-from gyro_pipeline.studies import CNN, CONSTANT, FIRST_WINDOWS, LEAKAGE, MEAN
+from gyro_pipeline.studies import CNN, CONSTANT, LEAKAGE, MEAN
 
 Tables = Mapping[str, Callable[[], pd.DataFrame]]
-_OF_THE_PAPER = ("augmentation", "real2real", "input_channels", FIRST_WINDOWS)
+_OF_THE_PAPER = ("augmentation", "real2real", "input_channels", tables.FIRST_WINDOWS)
 """Studies that stand beside the paper's; others have a figure and a table per sensor."""
 
 _BASE = ("base", "local")

@@ -30,9 +30,12 @@ from gyro_pipeline.pipelines.reporting.results import (
     WARNINGS,
     column,
 )
-from gyro_pipeline.studies import CNN, CONSTANT, FIRST_WINDOWS, MEAN, RESIDUAL_NETWORK
+from gyro_pipeline.studies import CNN, CONSTANT, MEAN, RESIDUAL_NETWORK
 
 logger = logging.getLogger(__name__)
+
+FIRST_WINDOWS = "first_windows"
+"""The study whose networks are trained on first windows."""
 
 _HOUR_S = 3600
 _AT_DATASHEET = "At the datasheet's rate h"
