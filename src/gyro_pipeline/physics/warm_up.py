@@ -22,7 +22,8 @@ from gyro_pipeline.physics.recording_model import block_edges, block_means, prof
 Array = NDArray[np.float64]
 
 _BLOCK_S = 1.0
-_LAST = 0.25  # of a recording, by whose mean it is centred
+LAST = 0.25
+"""Part of a recording, at its end, by whose mean it is centred."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ def settling(recordings: NDArray[np.floating], rate_hz: float) -> Settling:
     """
     edges = block_edges(recordings.shape[-1], round(_BLOCK_S * rate_hz))
     means = block_means(recordings, edges)
-    last = means.shape[-1] - max(1, round(_LAST * means.shape[-1]))
+    last = means.shape[-1] - max(1, round(LAST * means.shape[-1]))
     centred = means - means[..., last:].mean(axis=-1, keepdims=True)
     time_s = (edges[:-1] + edges[1:]) / 2 / rate_hz
     return Settling(time_s, centred.mean(axis=0), _half(centred))

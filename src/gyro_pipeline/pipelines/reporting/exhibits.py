@@ -9,8 +9,11 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from gyro_pipeline.conventions import ALL, FIRST, LEAVE_ONE_DEVICE_OUT
+from gyro_pipeline.conventions import ALL, AXES, FIRST, LEAVE_ONE_DEVICE_OUT, MDPS
 from gyro_pipeline.parameters import Published, PublishedResult
+from gyro_pipeline.physics.ceiling import best_gain
+from gyro_pipeline.physics.warm_up import amplitude_needed
+from gyro_pipeline.pipelines.reporting.recordings import WARM_UPS_S
 from gyro_pipeline.pipelines.reporting.results import column
 from gyro_pipeline.studies import CNN, CONSTANT, MEAN
 
@@ -29,6 +32,9 @@ _STUDIES_OF = {
     "generalization": "real2real",
 }
 """The study that makes each result table of the paper."""
+
+TIME_CONSTANTS_S = (5.0, 10.0, 20.0, 30.0, 60.0)
+"""Time constants for which the amplitude of a warm-up is computed."""
 
 _KEYS = ["sensor", "real_gyros", "virtual_gyros", "window_s"]
 
@@ -105,13 +111,55 @@ class Material:
         names = {sheet.sensor: sheet.name for sheet in self.published.specifications}
         return names.get(sensor, sensor)
 
+    def paper_recording_s(self, sensor: str) -> float:
+        """How long the paper's recordings of a sensor are."""
+        lengths = {sheet.sensor: sheet.recording_s for sheet in self.published.specifications}
+        return lengths[sensor]
+
+    def beyond_white_noise(self, claim: PublishedResult) -> bool:
+        """Whether a published gain exceeds A = 1 - sqrt(T0/T), with the paper's T."""
+        r = claim.window_s / self.paper_recording_s(claim.sensor)
+        return bool(claim.accuracy_gain_pct > 100 * best_gain(np.sqrt(r)))
+
+    def warm_up_needed_mdps(self, claim: PublishedResult) -> list[float]:
+        """Amplitudes of a warm-up that would make a published gain the ceiling in first windows.
+
+        Args:
+            claim: The published result; T is the paper's, N and the spread are those of the
+                recordings.
+
+        Returns:
+            One for each of :data:`TIME_CONSTANTS_S`; none where the sensor is not described.
+        """
+        rows = self.sensors[self.sensors.sensor == claim.sensor]
+        if rows.empty:
+            return []
+        noise, spread = (
+            rows.iloc[-1].reindex([f"{name}_{axis}" for axis in AXES]).to_numpy(float)
+            for name in ("white_dps_rts", "spread_dps")
+        )
+        times = claim.window_s, self.paper_recording_s(claim.sensor), TIME_CONSTANTS_S
+        needed = amplitude_needed(claim.accuracy_gain_pct / 100, noise, spread, *times) / MDPS
+        return [] if np.isnan(needed).any() else needed.tolist()
+
+    def warm_up_allowed_mdps(self, sensor: str) -> list[float]:
+        """The largest amplitude that the recordings of a sensor allow, for each of ``WARM_UPS_S``.
+
+        On the worst axis, from 95 % intervals; none where they do not tell.
+        """
+        row = self.sensors[self.sensors.sensor == sensor].iloc[-1]
+        bounds = row.reindex([f"warm_up_bound_dps_{time_s:g}" for time_s in WARM_UPS_S]) / MDPS
+        return [] if bounds.isna().any() else bounds.astype(float).tolist()
+
     @property
     def claims(self) -> list[PublishedResult]:
         """Published results of the sensors of this source."""
         known = {*self.results.sensor, *self.sensors.sensor}
         return [row for row in self.published.results if row.sensor in known]
 
-    def result(self, claim: PublishedResult, estimator: str) -> pd.Series | None:
+    def result(
+        self, claim: PublishedResult, estimator: str, study: str | None = None
+    ) -> pd.Series | None:
         """Our result for a published one; None where there is none.
 
         Where the study has no row with as many real gyroscopes, such as on the public file of a
@@ -120,8 +168,9 @@ class Material:
         Args:
             claim: The published result.
             estimator: Whose.
+            study: Another study than the one that makes the paper's table.
         """
-        rows = self.of(_STUDIES_OF[claim.table], estimator=estimator)
+        rows = self.of(study or _STUDIES_OF[claim.table], estimator=estimator)
         for key in ("sensor", "virtual_gyros", "window_s"):
             rows = rows[rows[key] == getattr(claim, key)]
         rows = rows[rows.real_gyros <= claim.real_gyros].sort_values("real_gyros")
@@ -162,11 +211,31 @@ def percent(value: float) -> str:
     return f"{round(value)}"
 
 
+def from_to(values: Sequence[float]) -> str:
+    """The smallest and the largest of some amounts, with two digits."""
+    low, high = (f"{v:.0f}" if v >= 9.95 else f"{v:.1f}" for v in (min(values), max(values)))  # noqa: PLR2004
+    return low if low == high else f"{low} to {high}"
+
+
 def beyond_ceiling(row: Any, windows: str = ALL) -> bool:
     """Whether the interval of an accuracy gain lies wholly beyond the ceiling's."""
     _, low, _ = ends(row, "accuracy_gain_pct", windows)
     limit, _, high = ends(row, "ceiling_accuracy_gain_pct", windows)
     return bool(low > (limit if np.isnan(high) else high))
+
+
+def remark(row: Any) -> str | None:
+    """What a reader must know beside an accuracy gain; None where there is nothing."""
+    notes = []
+    for windows in (ALL, FIRST):
+        gain, _, _ = ends(row, "accuracy_gain_pct", windows)
+        limit, _, _ = ends(row, "ceiling_accuracy_gain_pct", windows)
+        if beyond_ceiling(row, windows):
+            notes.append(f"beyond its ceiling in {windows} windows")
+        elif gain > limit:
+            notes.append(f"by chance above its ceiling in {windows} windows")
+    notes += [row["prior_conflict"]] * bool(pd.notna(row.get("prior_conflict")))
+    return "; ".join(notes) or None
 
 
 def gyroscopes(row: Any) -> str:

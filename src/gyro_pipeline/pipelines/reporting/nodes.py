@@ -14,16 +14,16 @@ from gyro_pipeline.parameters import GroundTruth, Only, Published, Study
 from gyro_pipeline.pipelines.reporting import figures, signals, tables
 from gyro_pipeline.pipelines.reporting.exhibits import PREMISE, Exhibit, Material, label
 from gyro_pipeline.pipelines.reporting.findings import answer, findings
-from gyro_pipeline.pipelines.reporting.results import CNN_BEST, NOT_RUN, ROW
+from gyro_pipeline.pipelines.reporting.results import CNN_BEST, NOT_RUN, ROW, WARNINGS
 from gyro_pipeline.studies import CNN, CONSTANT, LEAKAGE, MEAN
 
 Tables = Mapping[str, Callable[[], pd.DataFrame]]
-_OF_THE_PAPER = ("augmentation", "real2real", "input_channels")
-"""Studies that the paper has tables or figures of; others have a figure and a table per sensor."""
+_OF_THE_PAPER = ("augmentation", "real2real", "input_channels", tables.FIRST_WINDOWS)
+"""Studies that stand beside the paper's; others have a figure and a table per sensor."""
 
 _BASE = ("base", "local")
 _COLUMNS = [*ROW, "study", "status", "run_ids", "fingerprints", "env", "simulated"]
-_COLUMNS += ["recommended", "beats_oracle_p"]
+_COLUMNS += ["recommended", "beats_oracle_p", *WARNINGS]
 """Of results, also where none was made."""
 
 
@@ -114,6 +114,7 @@ def _tables(material: Material) -> list[Exhibit]:
         tables.three_gyroscopes(material),
         tables.multiple_gyroscopes(material),
         tables.generalization(material),
+        tables.trained_on_first_windows(material),
         *compared,
         tables.sensor_specifications(material),
         tables.recording_quality(material),
@@ -174,7 +175,9 @@ def _sentence(name: str) -> str:
     first = " ".join((estimator_class(name).__doc__ or "No description.").split("\n\n")[0].split())
     _, options = ESTIMATORS.get(name, (name, {}))
     words = [
-        f"{key}={value}".removesuffix("=True").replace("_", " ") for key, value in options.items()
+        f"{key}={value}".removesuffix("=True").replace("_", " ")
+        for key, value in options.items()
+        if value is not None
     ]
     return first + (f" With {', '.join(words)}." if words else "")
 

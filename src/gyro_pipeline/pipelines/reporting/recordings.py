@@ -15,6 +15,8 @@ from gyro_pipeline.parameters import GroundTruth
 from gyro_pipeline.physics.allan import FLICKER_FLOOR, SHORTEST_FIT_SAMPLES
 from gyro_pipeline.physics.bias import fill_masked, settling_time_s
 from gyro_pipeline.physics.ceiling import turn_on_spread
+from gyro_pipeline.physics.recording_model import block_edges, block_means
+from gyro_pipeline.physics.warm_up import LAST, fit_common_warm_up, settling
 from gyro_pipeline.protocol.recordings import one_by_one, tested_imu
 
 SIGMAS_MDPS = (1.0, 0.5)
@@ -24,12 +26,13 @@ FIGURES = ["white_dps_rts", "instability_dps", "random_walk_dps_per_rts"]
 GYROSCOPES = (1, 4, 10)
 """How many gyroscopes the paper averages in its figure of convergence."""
 
+_DRIFT_POINTS = 24  # of a recording; noise would hide the drift if there were many more
+WARM_UPS_S = (5.0, 20.0, 60.0)
+"""Time constants of the warm-ups that are fitted to recordings."""
+
 _WORST_FIRST = (REJECTED, REPAIRED, KEPT)
 _SHOWN = 20  # recordings of a sensor that have a row of their own in the table of quality
 _POINTS = 1300  # more of a running mean would not be seen
-_BLOCKS = 24  # of a recording, in the figure of drift
-_LAST_PART = 4  # the last quarter of a recording centres it
-_CONFIDENCE = 0.95
 
 
 def describe(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
@@ -59,56 +62,59 @@ def describe(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     row = {name: recordings.attrs[name] for name in ("sensor", "source", "rate_hz")}
     row |= {"simulated": bool(recordings.attrs["simulated"]), "imus": recordings.sizes["imu"]}
     row |= _counts(recordings, virtual) | _noise(noise) | start_up(recordings, bias, noise)
+    drifts, bounds = drift(recordings)
     signals = [
         *_signals(recordings, bias, ground_truth.tolerance_mdps * MDPS),
         *_allan_lines(allan, noise),
-        drift(recordings).assign(figure="drift"),
+        drifts.assign(figure="drift"),
     ]
     return {
-        "description": pd.DataFrame([row]),
+        "description": pd.DataFrame([row | bounds]),
         "quality": recording_quality(quality),
         "signals": pd.concat(signals, ignore_index=True).assign(sensor=row["sensor"]),
     }
 
 
-def drift(recordings: xr.Dataset, blocks: int = _BLOCKS) -> pd.DataFrame:
-    """Mean rate against time after power-on, over all recordings and IMUs.
+def drift(recordings: xr.Dataset) -> tuple[pd.DataFrame, dict[str, float]]:
+    """Mean rate against time after power-on, over all recordings and IMUs, and its warm-up.
 
     Each recording is centred by the mean of its last quarter, so that only what changes within a
     recording is left: a warm-up that all power-ons share stands out, noise averages out.
 
     Args:
         recordings: Angular rates, deg/s; a recording shorter than nine in ten others is left out.
-        blocks: Number of blocks whose means are taken.
 
     Returns:
-        For each axis (``line``) and block its middle ``x``, seconds, the mean ``y``, deg/s, and
-        its 95 % interval over recordings, ``lo`` and ``hi``; NaN for a single recording.
+        Lines: for each axis its middles of blocks ``x``, seconds, the mean ``y``, deg/s, and its
+        95 % interval over recordings, ``lo`` and ``hi``, NaN for a single recording; and for each
+        axis the warm-up fitted with the time constant that stands out most. Then, as
+        ``warm_up_bound_dps_<time constant>``, the largest amplitude of any axis that the 95 %
+        interval allows.
     """
     lengths = recordings["samples"].to_numpy()
     length = int(np.quantile(lengths[lengths > 0], 0.1, method="lower"))
-    size = length // blocks
-    means = [
-        np.nanmean(samples[:, : size * blocks].reshape(-1, blocks, size), axis=-1, dtype=float)
+    rate_hz = recordings.attrs["rate_hz"]
+    edges = block_edges(length, round(rate_hz))
+    means = np.stack([
+        block_means(fill_masked(samples[:, :length].astype(float)), edges)
         for _, _, samples in one_by_one(recordings)
         if samples.shape[-1] >= length
-    ]
-    last = slice(-(blocks // _LAST_PART), None)
-    centred = np.stack(
-        [block - np.nanmean(block[:, last], axis=1, keepdims=True) for block in means]
-    )
-    middle, count = np.nanmean(centred, axis=0), len(centred)
-    half = np.full(middle.shape, np.nan)
-    if count > 1:
-        from scipy import stats  # noqa: PLC0415 - it starts slowly
-
-        quantile = stats.t.ppf((1 + _CONFIDENCE) / 2, count - 1)
-        half = quantile * np.nanstd(centred, axis=0, ddof=1) / np.sqrt(count)
-    times_s = size * (np.arange(blocks) + 0.5) / recordings.attrs["rate_hz"]
-    return pd.concat(
-        pd.DataFrame({"line": axis, "x": times_s, "y": y, "lo": y - h, "hi": y + h})
-        for axis, y, h in zip(AXES, middle, half, strict=True)
-    )
+    ])  # fmt: skip
+    blocks_hz = means.shape[-1] * rate_hz / length
+    coarse = block_means(means, block_edges(means.shape[-1], means.shape[-1] // _DRIFT_POINTS))
+    seen = settling(coarse, coarse.shape[-1] * rate_hz / length)
+    fits = {time_s: fit_common_warm_up(means, blocks_hz, time_s) for time_s in WARM_UPS_S}
+    bounds = {f"warm_up_bound_dps_{t:g}": float(fit.bound.max()) for t, fit in fits.items()}
+    time_s = max(fits, key=lambda t: np.nansum((fits[t].amplitude / fits[t].half) ** 2))
+    decay = np.exp(-seen.time_s / time_s)
+    decay -= decay[seen.time_s >= seen.time_s[-1] * (1 - LAST)].mean()
+    lines = []
+    for i, axis in enumerate(AXES):
+        ends = {"lo": seen.rate[i] - seen.half[i], "hi": seen.rate[i] + seen.half[i]}
+        lines.append({"line": axis, "x": seen.time_s, "y": seen.rate[i], **ends})
+        fitted = fits[time_s].amplitude[i] * decay
+        lines.append({"line": f"{axis}, warm-up of {time_s:g} s", "x": seen.time_s, "y": fitted})
+    return pd.concat(map(pd.DataFrame, lines), ignore_index=True), bounds
 
 
 def start_up(recordings: xr.Dataset, bias: pd.DataFrame, noise: pd.DataFrame) -> dict[str, float]:
@@ -124,8 +130,9 @@ def start_up(recordings: xr.Dataset, bias: pd.DataFrame, noise: pd.DataFrame) ->
         noise: N, B and K.
 
     Returns:
-        ``<method>_s_at_<sigma>``, of the methods mean, history and ceiling; 0 where history alone
-        suffices, inf where a recording's length does not, NaN where the noise is not known.
+        ``spread_dps`` and ``white_dps_rts`` of each axis, and ``<method>_s_at_<sigma>``, of the
+        methods mean, history and ceiling; 0 where history alone suffices, inf where a recording's
+        length does not, NaN where the noise is not known.
     """
     imu, rate_hz = tested_imu(recordings), recordings.attrs["rate_hz"]
     white, flicker, walk = (
@@ -152,6 +159,8 @@ def start_up(recordings: xr.Dataset, bias: pd.DataFrame, noise: pd.DataFrame) ->
         "ceiling": spread**2,
     }
     row = {"spread_dps": float(np.sqrt(np.mean(spread**2))), "history_recordings": count}
+    row |= {f"spread_dps_{axis}": value for axis, value in zip(AXES, spread, strict=True)}
+    row |= {f"white_dps_rts_{axis}": value for axis, value in zip(AXES, white, strict=True)}
     for method, prior in priors.items():
         with np.errstate(divide="ignore"):
             variance = (1 / (1 / mean + 1 / prior)).mean(axis=1)

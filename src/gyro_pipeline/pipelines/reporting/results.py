@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gyro_pipeline.conventions import ALL, BEST, FIRST, LAST, PAPER
+from gyro_pipeline.conventions import ALL, AXES, BEST, FIRST, LAST, PAPER
 from gyro_pipeline.estimators import DEFAULT
 from gyro_pipeline.parameters import Only, Study
 from gyro_pipeline.protocol.scores import (
@@ -20,11 +20,14 @@ from gyro_pipeline.protocol.scores import (
     WeightedCurve,
     clusters,
     curve_errors,
+    gain_difference,
+    gain_pct,
     leave_one_out,
     paired_difference,
     rmse_difference,
     score,
     squared_errors,
+    with_interval,
 )
 from gyro_pipeline.studies import CNN, CONSTANT, LEFT_OUT, MEAN, RunSpec, planned, run_spec
 from gyro_pipeline.studies import study_rows as rows_of_study
@@ -42,9 +45,25 @@ CNN_BEST = "cnn_best"
 """The paper's network at its best validation epoch, where that was stored."""
 
 CEILINGS = ["ceiling_rmse_dps", "ceiling_time_saving_pct", "ceiling_accuracy_gain_pct"]
+CEILINGS += [f"ceiling_{name}_accuracy_gain_pct" for name in ("joint", "history")]
+REALISED = [
+    f"{name}_{score}"
+    for name in ("oracle", "constant")
+    for score in ("rmse_dps", "accuracy_gain_pct")
+]
+"""What the oracle, where it is known, and the constant reach on the same windows."""
+
 OTHERS = ["coverage_1sigma_pct", "coverage_2sigma_pct", "beats_oracle_p"]
+OTHERS += [f"prior_p_{axis}" for axis in AXES]
+OTHERS += [f"turn_on_correlation_{axes}" for axes in ("xy", "xz", "yz")]
+WARNINGS = ["below_ceiling", "prior_conflict"]
+"""Tags of a run, in words."""
+
 REFERENCES = (MEAN, DEFAULT, CONSTANT)
 """What every estimator is compared with, in pairs over recordings."""
+
+ADDED = ("virtual_gyros", "real_gyros")
+"""Counts of gyroscopes in training whose effect on A is compared in pairs."""
 
 _CURVES = ["study", "sensor", "windows", "time_s", "rmse_dps"]
 _ENDS = {"": "value", "_lo": "lo", "_hi": "hi"}
@@ -192,7 +211,7 @@ class Cell:
             if not runs or self.mean is None:
                 results.append(name | {"status": problem or NOT_RUN, "run_ids": None})
                 continue
-            results.append(name | self._result(specs[0], runs))
+            results.append(name | self._result(specs[0], runs) | self._added(specs[0], runs))
             best = [best_epoch(run) for run in runs if specs[0].estimator == CNN]
             if best and all(len(run.load(ERRORS)) for run in best):
                 results.append(
@@ -210,6 +229,10 @@ class Cell:
             row |= self._differences(runs)
         return row | {
             **{name: scores.get((name, ALL, "value")) for name in OTHERS},
+            **{
+                name: next(filter(None, (r.tags.get(name) for r in runs)), None)
+                for name in WARNINGS
+            },
             "simulated": tags["simulated"] == "1",
             "recommended": tags.get("recommended") == "True",
             "uses_prior": "uses_prior" in tags,
@@ -242,7 +265,38 @@ class Cell:
 
     def _scores(self, errors: pd.DataFrame, windows: str, window_s: float) -> dict[str, Estimate]:
         own, reference = squared_errors(errors, PAPER, windows), self._squares[windows]
-        return score(own, reference, self._curves[windows], window_s, self._weights)
+        scores = score(own, reference, self._curves[windows], window_s, self._weights)
+        return scores | {
+            f"accuracy_gain_pct_{axis}": self._gain(errors, windows, axis) for axis in AXES
+        }
+
+    def _gain(self, errors: pd.DataFrame, windows: str, axis: str) -> Estimate:
+        """A of one axis."""
+        own, mean = (
+            squared_errors(table[table.axis == axis], PAPER, windows).mean(self._weights)
+            for table in (errors, self._references[MEAN])
+        )
+        return gain_pct(with_interval(np.sqrt(own / mean), positive=True))
+
+    def _added(self, spec: RunSpec, runs: Sequence[StoredRun]) -> dict[str, Any]:
+        """By how much A exceeds that with the fewest gyroscopes, all else equal.
+
+        Paired over recordings, all seeds together: ``added_<count>_pct``, over all windows.
+        """
+        row: dict[str, Any] = {}
+        for count in ADDED if spec.estimator == CNN else ():
+            none: dict[str, Any] = {count: 0}
+            alike = [
+                (getattr(specs[0], count), of_fewer)
+                for specs, of_fewer, _ in self._rows
+                if of_fewer and replace(specs[0], **none) == replace(spec, **none)
+            ]
+            fewest, of_fewest = min(alike, key=lambda pair: pair[0])
+            if getattr(spec, count) > fewest:
+                own, base = (squared_errors(errors_of(r), PAPER, ALL) for r in (runs, of_fewest))
+                change = gain_difference(own, base, self._squares[ALL], self._weights)
+                row |= {f"added_{count}_pct{end}": getattr(change, k) for end, k in _ENDS.items()}
+        return row
 
     def _differences(self, runs: Sequence[StoredRun]) -> dict[str, Any]:
         """Errors less those of the references on all the same windows, paired over recordings.
@@ -299,7 +353,7 @@ def mean_row(mean: StoredRun) -> dict[str, Any]:
     row: dict[str, Any] = {"recording_s": float(mean.load(CURVE).time_s.max())}
     scores = scores_of(mean)
     for windows in (ALL, FIRST):
-        for name in ["test_rmse_dps", *CEILINGS]:
+        for name in ["test_rmse_dps", *CEILINGS, *REALISED]:
             for end, key in _ENDS.items():
                 row[column(name, windows) + end] = scores.get((name, windows, key))
     return row

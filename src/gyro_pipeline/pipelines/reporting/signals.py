@@ -11,7 +11,7 @@ from matplotlib.ticker import LogLocator
 from gyro_pipeline.conventions import AXES, MDPS
 from gyro_pipeline.parameters import GroundTruth
 from gyro_pipeline.pipelines.reporting.exhibits import Exhibit, Material
-from gyro_pipeline.pipelines.reporting.recordings import GYROSCOPES
+from gyro_pipeline.pipelines.reporting.recordings import GYROSCOPES, WARM_UPS_S
 from gyro_pipeline.pipelines.reporting.style import (
     CEILING,
     COLOURS,
@@ -40,10 +40,9 @@ def drift(material: Material) -> Exhibit | None:
                 ax.fill_between(
                     line.x, line.lo / MDPS, line.hi / MDPS, color=colour, alpha=0.18, lw=0
                 )
-            for _, line in own[~own.line.isin(AXES)].groupby("line"):  # a fitted warm-up
-                ax.plot(
-                    line.x, line.y / MDPS, color="black", ls="--", lw=1, label=line.line.iloc[0]
-                )
+            for axis, colour in zip(AXES, COLOURS, strict=False):
+                fit = own[own.line.str.startswith(f"{axis},")]
+                ax.plot(fit.x, fit.y / MDPS, color=colour, ls="--", lw=1, label="fitted warm-up")
             ax.axhline(0, color="black", lw=0.8)
             ax.set(title=material.sensor_name(sensor), xlabel="time after power-on [s]")
             ax.set_ylabel("mean rate less its end [mdps]")
@@ -53,9 +52,22 @@ def drift(material: Material) -> Exhibit | None:
         "The mean over all recordings, each centred by its last quarter, with its 95 % interval. A "
         "line at 0 is a bias that does not move; one that starts off it is a warm-up, which an "
         "estimator that knows the device, a constant included, can take off. White noise without "
-        "drift, the premise of the ceiling, means a line at 0."
+        "drift, the premise of the ceiling, means a line at 0. Dashed is the warm-up fitted to all "
+        f"recordings. The 95 % intervals allow an amplitude of at most {_bounds(material)}."
     )
     return Exhibit("drift", "Does the rate drift after power-on?", caption, figure)
+
+
+def _bounds(material: Material) -> str:
+    """The largest amplitude of a warm-up that recordings allow, by sensor and time constant."""
+    allowed = {sensor: material.warm_up_allowed_mdps(sensor) for sensor in material.sensors.sensor}
+    times_s = "/".join(f"{time_s:g}" for time_s in WARM_UPS_S)
+    sizes = ", ".join(
+        f"{material.sensor_name(sensor)} " + "/".join(f"{bound:.2g}" for bound in bounds)
+        for sensor, bounds in allowed.items()
+        if bounds
+    )
+    return f"{sizes} mdps for time constants of {times_s} s, on the worst axis"
 
 
 def allan_deviation(material: Material) -> Exhibit | None:

@@ -23,12 +23,14 @@ _FAMILIES = {
     "black": ("mean", "median", "trimmed_mean"),
     COLOURS[0]: (
         *("best_linear", "best_linear_allan", "best_linear_warm_up", "best_linear_history"),
+        "best_linear_fallback",
     ),
     COLOURS[1]: ("training_mean", "last_calibration"),
     COLOURS[2]: ("empirical_bayes", "empirical_bayes_pooled"),
     COLOURS[3]: ("ridge", "ridge_same_time"),
     COLOURS[4]: ("residual_network",),
-    COLOURS[5]: ("cnn", "cnn_best", "window_mean_network"),
+    COLOURS[5]: ("cnn", "cnn_best", "window_mean_network", "single_gyroscope"),
+    "#882255": ("tcn", "lstm"),
 }
 """Estimators that share a colour; they differ in their markers. Others are grey."""
 
