@@ -254,6 +254,16 @@ class Ran:
     """Of the parameters, which are fewer."""
 
 
+@pytest.fixture(autouse=True, scope="module")
+def own_workers():
+    """Workers that outlive a file of tests do not find the modules of the next one."""
+    yield
+    if "joblib" in sys.modules:
+        from joblib.externals.loky import get_reusable_executor
+
+        get_reusable_executor().shutdown()
+
+
 @pytest.fixture(scope="session")
 def smoke(made_once):
     """``kedro run --pipeline=augmentation --env=smoke`` in a project without anything."""

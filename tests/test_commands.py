@@ -10,7 +10,7 @@ from gyro_pipeline.pipeline_registry import register_pipelines
 
 PROJECT = Path(__file__).parents[1]
 # names that a text leaves to its reader
-PLACEHOLDERS = {"NAME", "mine"}
+PLACEHOLDERS = {"NAME", "mine", "my_study"}
 
 
 def make_help():

@@ -214,7 +214,7 @@ def test_reporting_trains_nothing_and_says_in_rows_what_is_missing(smoke, smoke_
     assert done.code == 0, done.output
     assert len(smoke_copy.runs("augmentation")) == len(smoke.runs) - 1
     table = pd.read_csv(smoke_copy.folder / REPORT / "tables/augmentation_multiple_gyroscopes.csv")
-    assert table["Note"].fillna("").tolist() == ["", "", "not run"]
+    assert table["Note"].str.contains("not run").tolist() == [False, False, True]
     three = "tables/augmentation_three_gyroscopes.md"
     assert written[three] == before[three]
     _, _, lacking = written["report.md"].decode().partition("### What was not made")
@@ -405,6 +405,6 @@ def test_the_real_file_has_known_errors_and_stands_beside_the_simulated_one(smok
     # in the report of its source
     (path,) = (project.folder / "data/08_reporting").glob("published/*/tables/real2real_gen*.csv")
     measured = pd.read_csv(path).iloc[-1]
-    assert (measured["Sensor"], measured["Published S/A %"]) == ("memsense", "75/75")
+    assert (measured["Sensor"], measured["Published S/A %"]) == ("memsense", "75/75 (6 real)")
     networks = [runs[name].info.run_id[:8] for name in ("cnn", "residual_network")]
     assert measured["Runs"].split() == networks
