@@ -25,7 +25,7 @@ class Table(StoredFile):
         Returns:
             Columns and rows as Kedro-Viz takes them.
         """
-        return preview_table(self._filepath, nrows)
+        return TablePreview(read_table(self._filepath).head(nrows).to_dict(orient="split"))
 
     def _read(self, path: Path) -> pd.DataFrame:
         return read_table(path)
@@ -38,11 +38,6 @@ def write_table(data: pd.DataFrame, path: Path) -> None:
     """Write a table without its index."""
     write = data.to_parquet if path.suffix == ".parquet" else data.to_csv
     write(path, index=False)
-
-
-def preview_table(path: Path, rows: int) -> TablePreview:
-    """The first rows of a table, as Kedro-Viz takes them."""
-    return TablePreview(read_table(path).head(rows).to_dict(orient="split"))
 
 
 def read_table(path: Path) -> pd.DataFrame:
