@@ -28,7 +28,7 @@ from gyro_pipeline.physics.ceiling import (
     turn_on_spread,
 )
 from gyro_pipeline.physics.reml import guarded_spread
-from gyro_pipeline.protocol.scores import (
+from gyro_pipeline.scoring.scores import (
     Curve,
     Estimate,
     SquaredErrors,

@@ -38,7 +38,7 @@ from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.noise import simulate_noise, warm_up
 from gyro_pipeline.physics.recording_model import RecordingModel, best_linear
 from gyro_pipeline.pipeline_registry import base_parameters
-from gyro_pipeline.protocol.windows import cut_windows
+from gyro_pipeline.windows import cut_windows
 
 SAMPLES, RECORDING_S = 13_000, 87.0
 RATE_HZ = SAMPLES / RECORDING_S

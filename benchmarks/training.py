@@ -62,8 +62,8 @@ from gyro_pipeline.learning.trainer import Engine, TorchEngine, predict, train
 from gyro_pipeline.parameters import Execution, Only, Parameters, Study, Training
 from gyro_pipeline.pipelines.training.nodes import TrainingSets
 from gyro_pipeline.pipelines.windowed_splits.nodes import split_windows
-from gyro_pipeline.protocol.splits import split_recordings
 from gyro_pipeline.settings import CONFIG_LOADER_ARGS
+from gyro_pipeline.splits import split_recordings
 from gyro_pipeline.studies import CNN, RunSpec, run_specs, study_rows
 
 BATCH, RATE = 64, 1e-4

@@ -43,7 +43,7 @@ from gyro_pipeline.conventions import (
 from gyro_pipeline.estimators import ESTIMATORS, make_estimator
 from gyro_pipeline.estimators.training import TrainingSet
 from gyro_pipeline.pipeline_registry import base_parameters
-from gyro_pipeline.protocol.scores import prior_conflict
+from gyro_pipeline.scoring.scores import prior_conflict
 
 VERSION = 1
 RATE_HZ, SAMPLES, SIZE = 20, 1740, 200

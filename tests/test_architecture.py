@@ -36,7 +36,10 @@ ALLOWED = {
         "readers",
         "units",
     },
-    "protocol": {"conventions", "fingerprints", "logs", "parameters", "physics", "quality"},
+    "recordings": {"conventions", "fingerprints", "logs", "physics"},
+    "splits": {"conventions", "parameters"},
+    "windows": {"conventions", "physics"},
+    "scoring": {"conventions", "physics", "windows"},
     "learning": {"conventions", "executors", "parameters", "physics"},
     "datasets": {
         *("conventions", "estimators", "fingerprints", "logs", "parameters", "physics"),
@@ -53,7 +56,8 @@ ALLOWED = {
                 "logs",
                 "markup",
             ),
-            *("parameters", "physics", "protocol", "quality", "studies", "tracking"),
+            *("parameters", "physics", "quality", "recordings", "scoring", "splits", "studies"),
+            *("tracking", "windows"),
         }
         for stage in STAGES
     },
@@ -155,7 +159,7 @@ def test_imports_point_one_way_between_seven_stages_and_all_else():
     ("name", "source"),
     [
         ("physics.bias", "from gyro_pipeline.parameters import Sensor"),
-        ("protocol.scores", "from gyro_pipeline import estimators"),
+        ("scoring.scores", "from gyro_pipeline import estimators"),
         ("learning.trainer", "from ..tracking import StoredRun"),
         ("datasets.recordings", "def load():\n    from gyro_pipeline import learning"),
         ("datasets.recordings", "import gyro_pipeline.pipelines.training.nodes"),
@@ -188,7 +192,7 @@ def test_what_a_part_needs_beside_numpy(part, needed):
 
 
 def test_neither_the_science_nor_nodes_know_kedro_and_mlflow():
-    science = ("calibrator", "physics", "protocol", "quality", "estimators", "learning")
+    science = ("calibrator", "physics", "scoring", "quality", "estimators", "learning")
     for part in (*science, "pipelines"):
         assert names_of(part)
         for name, names in names_of(part).items():

@@ -25,7 +25,7 @@ from gyro_pipeline.physics.ceiling import running_mean_rmse
 from gyro_pipeline.pipelines.evaluation.bench import Bench
 from gyro_pipeline.pipelines.evaluation.device import describe_devices
 from gyro_pipeline.pipelines.training.nodes import TrainingSets
-from gyro_pipeline.protocol.scores import beats_oracle, holm, squared_errors
+from gyro_pipeline.scoring.scores import beats_oracle, holm, squared_errors
 from gyro_pipeline.studies import CNN, RunSpec
 
 pytestmark = pytest.mark.slow

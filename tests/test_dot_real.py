@@ -12,8 +12,8 @@ from gyro_pipeline.datasets.file_logs import FileLogs
 from gyro_pipeline.datasets.recordings import open_recordings
 from gyro_pipeline.parameters import ReaderOptions
 from gyro_pipeline.physics.bias import recording_mean
-from gyro_pipeline.protocol.recordings import cut, one_by_one
 from gyro_pipeline.readers import read_log
+from gyro_pipeline.recordings import cut, one_by_one
 
 IMUS, RATE_HZ = (1, 2, 3, 4, 5), 120.0
 START, STOP = 1, 13_000

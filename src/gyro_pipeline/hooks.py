@@ -21,7 +21,6 @@ from kedro.framework.hooks import hook_impl
 from gyro_pipeline.conventions import InputError
 
 if TYPE_CHECKING:
-    from kedro.framework.context import KedroContext
     from kedro.io import CatalogProtocol
     from kedro.pipeline import Pipeline
 
@@ -105,7 +104,7 @@ class Provenance:
         self._changed = frozenset[str]()
 
     @hook_impl
-    def after_context_created(self, context: "KedroContext") -> None:
+    def after_context_created(self, context: "Context") -> None:
         """Compare the settings of runs with those of ``conf/base``."""
         import yaml  # noqa: PLC0415
 
@@ -114,7 +113,7 @@ class Provenance:
         base: dict[str, Any] = {}
         for path in files:
             base |= yaml.safe_load(path.read_text())
-        self._changed = _changed(base, context.config_loader["parameters"])
+        self._changed = _changed(base, context.given)
 
     @hook_impl
     def before_pipeline_run(

@@ -113,11 +113,11 @@ class ChangedNodesRunner(SequentialRunner):
 def _fingerprints(pipeline: Pipeline, catalog: CatalogProtocol) -> dict[str, str]:
     """The fingerprint of each node by its name."""
     makers = {name: node.name for node in pipeline.nodes for name in node.outputs}
+    states = {name: _state(name, catalog) for name in pipeline.inputs()}
     made: dict[str, str] = {}
     for node in pipeline.nodes:
         inputs = {
-            name: made[makers[name]] if name in makers else _state(name, catalog)
-            for name in node.inputs
+            name: made[makers[name]] if name in makers else states[name] for name in node.inputs
         }
         texts = json.dumps(inputs, sort_keys=True, default=str)
         code = code_hash("gyro_pipeline", *_own_classes(inputs.values()))

@@ -87,7 +87,8 @@ class Context(KedroContext):
     ``kedro run`` and ``kedro viz``.
 
     Attributes:
-        parameters: All of them.
+        given: Parameters as the configuration has them.
+        parameters: All of them, checked.
     """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
@@ -95,7 +96,8 @@ class Context(KedroContext):
         from omegaconf import OmegaConf  # noqa: PLC0415
 
         boundary.install(Path(self.project_path))
-        self.parameters = checked(self.config_loader["parameters"])
+        self.given = self.config_loader["parameters"]
+        self.parameters = checked(self.given)
         pipeline_registry.select(self.parameters)
         name = settings_in_words(self.config_loader.runtime_params or {})
         OmegaConf.register_new_resolver(OWN_SETTINGS, lambda: name and f"/{name}", replace=True)

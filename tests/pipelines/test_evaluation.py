@@ -33,7 +33,7 @@ from gyro_pipeline.pipelines.evaluation.bench import SCORES, Bench
 from gyro_pipeline.pipelines.evaluation.device import describe_devices, training_labels
 from gyro_pipeline.pipelines.evaluation.nodes import below_the_ceiling, evaluate
 from gyro_pipeline.pipelines.ground_truth.nodes import measure_allan_variance
-from gyro_pipeline.protocol.scores import squared_errors
+from gyro_pipeline.scoring.scores import squared_errors
 from gyro_pipeline.studies import CNN, MEAN
 from gyro_pipeline.tracking import CURVE, ERRORS, EVALUATED_WITH
 from gyro_pipeline.tracking import SCORES as TABLE

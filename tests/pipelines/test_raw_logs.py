@@ -11,9 +11,8 @@ from gyro_pipeline.conventions import DIMENSIONS, InputError
 from gyro_pipeline.datasets.recordings import InspectedRecordings
 from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding, Log, LogEntry, Logs
 from gyro_pipeline.parameters import Execution
-from gyro_pipeline.pipelines.raw_logs import nodes
+from gyro_pipeline.pipelines.raw_logs import inspection, nodes
 from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs, require_enough
-from gyro_pipeline.protocol import inspection
 from gyro_pipeline.quality import Inspected
 
 RATE_HZ, SAMPLES = 100.0, 2000

@@ -14,10 +14,10 @@ from gyro_pipeline.conventions import (
 from gyro_pipeline.parameters import Only
 from gyro_pipeline.pipelines.ground_truth.nodes import measure_allan_variance
 from gyro_pipeline.pipelines.virtual_gyros.nodes import synthesise
+from gyro_pipeline.pipelines.windowed_splits.copies import near_copies
 from gyro_pipeline.pipelines.windowed_splits.nodes import cut_to_common_length, split_windows
 from gyro_pipeline.pipelines.windowed_splits.protocols import check_table
-from gyro_pipeline.protocol.copies import near_copies
-from gyro_pipeline.protocol.splits import split_recordings
+from gyro_pipeline.splits import split_recordings
 
 RATE_HZ = 20.0
 

@@ -6,22 +6,22 @@ import unicodedata
 from collections.abc import MutableMapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
 
-import matplotlib as mpl
 import pandas as pd
 from jinja2 import Environment, PackageLoader
 from kedro.io import AbstractDataset, DatasetError
 from markdown_it import MarkdownIt
 from markdown_it.renderer import RendererHTML
 from markdown_it.token import Token
-from matplotlib import pyplot as plt
-from matplotlib.figure import Figure
 
 from gyro_pipeline.datasets.atomic import replacing
 from gyro_pipeline.datasets.tables import read_table, write_table
 from gyro_pipeline.markup import pipe_table, plain
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _PNG_DPI = 160
 _LONGEST = 35
@@ -100,7 +100,7 @@ class ReportTable(AbstractDataset[pd.DataFrame, pd.DataFrame]):
         return {"filepath": str(self._path)}
 
 
-class ReportFigure(AbstractDataset[Figure, Path]):
+class ReportFigure(AbstractDataset["Figure", Path]):
     """Writes a figure as PNG and SVG; the same figure gives the same bytes.
 
     Args:
@@ -116,18 +116,19 @@ class ReportFigure(AbstractDataset[Figure, Path]):
         """Name the PNG file, to be shown elsewhere."""
         return self._path
 
-    def save(self, data: Figure) -> None:
-        """Write both files and close the figure.
+    def save(self, data: "Figure") -> None:
+        """Write both files.
 
         Args:
             data: The figure.
         """
+        import matplotlib as mpl  # noqa: PLC0415 - only those who draw wait for it
+
         with mpl.rc_context({"svg.hashsalt": "gyro_pipeline"}):
             with replacing(self._path) as temporary:
                 data.savefig(temporary, dpi=_PNG_DPI)
             with replacing(self._path.with_name(f"{self._path.stem}.svg")) as temporary:
                 data.savefig(temporary, metadata={"Date": None})
-        plt.close(data)
 
     def _exists(self) -> bool:
         return self._path.is_file()

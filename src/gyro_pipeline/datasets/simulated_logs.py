@@ -1,6 +1,5 @@
 """The stand-in for sensors whose logs are not at hand."""
 
-import hashlib
 import logging
 import math
 import zlib
@@ -17,6 +16,7 @@ from gyro_pipeline.conventions import AXES, MDPS, InputError
 from gyro_pipeline.datasets.array_logs import LAYOUT, ArrayLogs
 from gyro_pipeline.datasets.atomic import replacing, require_room
 from gyro_pipeline.datasets.recordings import Recordings, open_recordings
+from gyro_pipeline.datasets.stored import digest_of
 from gyro_pipeline.fingerprints import fingerprint
 from gyro_pipeline.logs import Logs
 from gyro_pipeline.parameters import Sensor, SimulatedSensor
@@ -71,12 +71,12 @@ class SimulatedLogs(ArrayLogs):
             InputError: As the cause of Kedro's ``DatasetError``, files that cannot be written, or
                 that were damaged since.
         """
-        earlier = self._settings_on_disk()
-        if earlier != self._settings():
-            why = "" if earlier is None else " anew, since their settings have changed"
+        truth = self._truth_on_disk()
+        if truth is None or truth.attrs.get("settings") != self._settings():
+            why = "" if truth is None else " again, since their settings have changed"
             _LOG.info("writing simulated %s logs%s: %s", self._sensor, why, self._path)
             self._write()
-        truth = open_recordings(self._truth).load()
+            truth = open_recordings(self._truth).load()
         if truth.attrs["files_hash"] != self._files_hash():
             raise InputError(
                 f"simulated {self._sensor}: {self._train.name} or {self._test.name} has changed "
@@ -95,13 +95,13 @@ class SimulatedLogs(ArrayLogs):
         """A hash of all that the files depend on."""
         return fingerprint([self._stand_in.model_dump(mode="json"), self._seed])
 
-    def _settings_on_disk(self) -> str | None:
-        """What the files were written with; None where they are not complete."""
+    def _truth_on_disk(self) -> xr.Dataset | None:
+        """What was drawn for the files that are there; None where they are not complete."""
         if not self._exists():
             return None
         try:
             with open_recordings(self._truth) as truth:
-                return truth.attrs.get("settings")
+                return truth.load()
         except InputError:  # damaged: as good as not written
             return None
 
@@ -119,9 +119,7 @@ class SimulatedLogs(ArrayLogs):
 
     def _files_hash(self) -> str:
         """Of the arrays' bytes."""
-        files = [path.open("rb") for path in (self._train, self._test)]
-        with files[0], files[1]:
-            return " ".join(hashlib.file_digest(file, "sha256").hexdigest() for file in files)
+        return " ".join(map(digest_of, (self._train, self._test)))
 
 
 def _to_simulate(sensor: str, entry: Sensor) -> SimulatedSensor:

@@ -3,6 +3,7 @@
 from typing import ClassVar
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from gyro_pipeline.conventions import NOTHING, RECORDING_MEAN
@@ -47,6 +48,4 @@ class TrimmedMean(Estimator):
     cut: ClassVar[float] = 0.1
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
-        from scipy import stats  # noqa: PLC0415 - it starts slowly
-
-        return stats.trim_mean(windows.samples.astype(np.float64), self.cut, axis=-1), np.nan
+        return scipy.stats.trim_mean(windows.samples.astype(np.float64), self.cut, axis=-1), np.nan

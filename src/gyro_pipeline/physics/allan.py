@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from gyro_pipeline.conventions import InputError
 
@@ -187,6 +187,6 @@ def fit_noise(
     terms = np.stack([1 / times, np.full_like(times, FLICKER_FLOOR), times / 3], axis=1)
     durations_s = np.broadcast_to(duration_s, times_s.shape)[kept]
     weight = np.sqrt(durations_s / times) / measured
-    squares, _ = nnls(terms * weight[:, None], measured * weight)
+    squares, _ = scipy.optimize.nnls(terms * weight[:, None], measured * weight)
     white, instability, random_walk = np.sqrt(squares)
     return NoiseFigures(float(white), float(instability), float(random_walk))

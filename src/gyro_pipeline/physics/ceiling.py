@@ -31,6 +31,7 @@ the pooled values.
 """
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from gyro_pipeline.conventions import DISJOINT, PAPER, TRUE, InputError
@@ -209,10 +210,8 @@ def joint_draws(
     Returns:
         (1 + draws, axes, axes), (deg/s)^2; positive semidefinite.
     """
-    from scipy import stats  # noqa: PLC0415 - it starts slowly
-
     scatter, freedom = np.cov(recording_means.T), len(recording_means) - 1
-    pivots = stats.wishart.rvs(freedom, np.eye(len(scatter)) / freedom, draws, random_state=0)
+    pivots = scipy.stats.wishart.rvs(freedom, np.eye(len(scatter)) / freedom, draws, random_state=0)
     root = np.linalg.cholesky(scatter)
     drawn = root @ np.linalg.inv(pivots) @ root.T
     values, vectors = np.linalg.eigh(np.concatenate([scatter[None], drawn]) - np.diag(averaging))

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import optimize
 
 from gyro_pipeline.physics.recording_model import RecordingModel
 
@@ -86,7 +86,9 @@ class BiasHistory:
 
         starts = [scale + np.array(start) for start in ((-1.0, -0.5), (-4.0, 0.0))]
         bounds = [(scale - 9, scale + 3)] * 2
-        found = [optimize.minimize(deviance, x, bounds=bounds, method="L-BFGS-B") for x in starts]
+        found = [
+            scipy.optimize.minimize(deviance, x, bounds=bounds, method="L-BFGS-B") for x in starts
+        ]
         best = min(found, key=lambda result: result.fun)
         return cls(numbers, labels, averaging, *map(float, np.exp(best.x)))
 

@@ -1,8 +1,8 @@
 """Simulated gyroscope noise: white (also correlated over one sample), flicker, random walk."""
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy import fft
 
 from gyro_pipeline.conventions import InputError
 
@@ -96,7 +96,7 @@ def _add_flicker(
     twice the length is drawn and half of the signal kept, because the inverse transform is
     periodic: kept whole, a recording would end where it began.
     """
-    length = fft.next_fast_len(2 * noise.shape[-1], real=True)
+    length = scipy.fft.next_fast_len(2 * noise.shape[-1], real=True)
     k = np.arange(1, length // 2 + 1)
     # one-sided density = 2 |X_k|^2 length / rate for x_i = sum of X_k exp(2 pi j i k / length)
     amplitude = (instability_dps / (2 * np.sqrt(np.pi * k))).astype(np.float32)
@@ -104,7 +104,7 @@ def _add_flicker(
     for row in noise.reshape(-1, noise.shape[-1]):
         parts = generator.standard_normal((k.size, 2), dtype=np.float32)
         spectrum[1:] = amplitude * parts.view(np.complex64)[:, 0]
-        row[:] += fft.irfft(spectrum, length, norm="forward")[: row.size]
+        row[:] += scipy.fft.irfft(spectrum, length, norm="forward")[: row.size]
 
 
 def _add_random_walk(

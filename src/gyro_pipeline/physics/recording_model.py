@@ -21,8 +21,8 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft, linalg
 
 from gyro_pipeline.conventions import DISJOINT, PAPER, TRUE, InputError
 from gyro_pipeline.physics.allan import NoiseFigures
@@ -124,7 +124,7 @@ def innovations(
     deviations = block_means(windows, window.edges) - window.design @ model.mean
     prior = window.design @ model.covariance @ window.design.T
     root = np.linalg.cholesky(window.covariance + prior)
-    return np.asarray(linalg.solve_triangular(root, deviations.T, lower=True).T)
+    return np.asarray(scipy.linalg.solve_triangular(root, deviations.T, lower=True).T)
 
 
 def best_linear(
@@ -216,7 +216,7 @@ def joint_squares(
         own = slice(first, first + model.mean.size)
         priors[:, own, own] = np.diag(np.diag(model.covariance))
     priors[:, firsts[:-1, None], firsts[:-1]] = covariances
-    information = linalg.block_diag(*(window.information for window in windows))
+    information = scipy.linalg.block_diag(*(window.information for window in windows))
     posterior = np.linalg.solve(np.eye(firsts[-1]) + priors @ information, priors)
     of_axes = [
         window.error_variance(posterior[:, first:stop, first:stop])
@@ -303,7 +303,7 @@ class WindowModel:
     def _solved(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The inverse of the covariance of e times ``shared``, (m,), and times X."""
         both = np.column_stack([self.shared, self.design])
-        solved = linalg.solve(self.covariance, both, assume_a="pos")
+        solved = scipy.linalg.solve(self.covariance, both, assume_a="pos")
         return solved[:, 0], solved[:, 1:]
 
     @cached_property
@@ -423,10 +423,10 @@ def _flicker_sum_variance(samples: int) -> NDArray[np.float64]:
 
     The autocovariance is that of ``physics.noise``: (1 / pi) sum of cos(2 pi k lag / length) / k.
     """
-    length = fft.next_fast_len(2 * samples, real=True)
+    length = scipy.fft.next_fast_len(2 * samples, real=True)
     spectrum = np.zeros(length // 2 + 1)
     spectrum[1:] = 1 / (2 * np.pi * np.arange(1, length // 2 + 1))
-    autocovariance = fft.irfft(spectrum, length, norm="forward")[:samples]
+    autocovariance = scipy.fft.irfft(spectrum, length, norm="forward")[:samples]
     steps = 2 * np.cumsum(autocovariance) - autocovariance[0]
     return np.concatenate([[0.0], np.cumsum(steps)])
 

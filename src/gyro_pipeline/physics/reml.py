@@ -21,8 +21,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy import linalg, optimize, stats
 from threadpoolctl import threadpool_limits
 
 from gyro_pipeline.conventions import InputError
@@ -147,7 +147,7 @@ def guarded_spread(scatter: ArrayLike, freedom: ArrayLike, averaging: ArrayLike)
 
     # negative where tau is nothing beside v, positive where it explains more than all scatter
     limits = np.log(largest) + np.array([-60.0, 5.0])
-    return float(np.exp(optimize.brentq(slope, *limits) / 2))
+    return float(np.exp(scipy.optimize.brentq(slope, *limits) / 2))
 
 
 class _Likelihood:
@@ -171,7 +171,7 @@ class _Likelihood:
         self.levels = self.means.mean(axis=1)
         self.rest = (self.means - self.levels[:, None]).T
         # as many columns as there are blocks have the same squares as all recordings'
-        self.scatter = linalg.qr(self.rest.T, mode="economic")[1].T
+        self.scatter = scipy.linalg.qr(self.rest.T, mode="economic")[1].T
         self.noise = lru_cache(maxsize=16)(self._noise)  # of a gradient's steps, most keep it
         self.rate_hz, self.duration_s, self.warm_up = rate_hz, samples / rate_hz, warm_up
         self.unit = noise_covariances(self.edges, samples, rate_hz)
@@ -209,8 +209,10 @@ class _Likelihood:
         figures, spreads, time_constant_s = self.unpack(x)
         root, log_determinant, squares = self.noise(*figures.tolist())
         design = profiles(self.edges, self.rate_hz, time_constant_s)[:, : spreads.size]
-        white = linalg.solve_triangular(root, design, lower=True, check_finite=False)
-        weighted = linalg.solve_triangular(root, white, lower=True, trans="T", check_finite=False)
+        white = scipy.linalg.solve_triangular(root, design, lower=True, check_finite=False)
+        weighted = scipy.linalg.solve_triangular(
+            root, white, lower=True, trans="T", check_finite=False
+        )
         information = white.T @ white
         own = np.linalg.solve(information, weighted.T @ self.rest)
         squares = squares - np.sum(own * (information @ own))
@@ -228,7 +230,7 @@ class _Likelihood:
         The squares are those of the block means about each recording's level, whitened.
         """
         root = np.linalg.cholesky(np.tensordot(np.square(figures), self.unit, axes=1))
-        white = linalg.solve_triangular(root, self.scatter, lower=True, check_finite=False)
+        white = scipy.linalg.solve_triangular(root, self.scatter, lower=True, check_finite=False)
         return root, float(2 * np.log(np.diag(root)).sum()), float(np.sum(white**2))
 
     def criterion(self, x: NDArray[np.float64]) -> float:
@@ -254,16 +256,16 @@ class _Likelihood:
             profiles(self.edges, self.rate_hz, share * self.duration_s)[:, 1] for share in shares
         ]
         both = np.column_stack([(self.means - mean[0]).T, *decays])
-        white = linalg.solve_triangular(root, both, lower=True, check_finite=False)
+        white = scipy.linalg.solve_triangular(root, both, lower=True, check_finite=False)
         y, decay = white[:, : len(self.means)], white[:, len(self.means) :]
         amplitudes = decay.T @ y / np.sqrt(np.sum(decay**2, axis=0))[:, None]  # in their sigma
         count, looks = len(self.means), 2 * len(shares)
         alike = np.abs(amplitudes.sum(axis=1)).max() / np.sqrt(count)
         scatter = np.sum(amplitudes**2, axis=1).max()
-        chances = stats.chi2.sf([alike**2, scatter], [1, count])
+        chances = scipy.stats.chi2.sf([alike**2, scatter], [1, count])
         return bool(chances.min() < _CHANCE / looks)
 
-    def maximise(self, time_constant_s: float) -> optimize.OptimizeResult:
+    def maximise(self, time_constant_s: float) -> "scipy.optimize.OptimizeResult":
         """Search from the guess with this time constant."""
         start = self.guess(time_constant_s)
         reach = np.log(_RANGE)
@@ -278,6 +280,6 @@ class _Likelihood:
                 [(self.deviance(x + h)[0] - self.deviance(x - h)[0]) / (2 * _STEP) for h in steps]
             )
 
-        return optimize.minimize(
+        return scipy.optimize.minimize(
             lambda x: self.deviance(x)[0], start, jac=gradient, bounds=bounds, method="L-BFGS-B"
         )

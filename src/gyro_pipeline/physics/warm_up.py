@@ -12,8 +12,8 @@ and whoever knows the device, even by a constant, knows that in advance.
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 
 from gyro_pipeline.conventions import PAPER
 from gyro_pipeline.physics.ceiling import ceiling_rmse, pooled, running_mean_rmse
@@ -132,4 +132,4 @@ def _half(values: Array) -> Array:
     if n == 1:
         return np.full(values.shape[1:], np.nan)
     error = values.std(axis=0, ddof=1) / np.sqrt(n)
-    return np.asarray(stats.t.ppf(0.975, n - 1) * error)
+    return np.asarray(scipy.stats.t.ppf(0.975, n - 1) * error)

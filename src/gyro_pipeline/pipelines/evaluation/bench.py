@@ -28,7 +28,7 @@ from gyro_pipeline.physics.ceiling import oracle
 from gyro_pipeline.physics.recording_model import LinearEstimate, RecordingModel, best_linear
 from gyro_pipeline.pipelines.evaluation.ceilings import Ceilings
 from gyro_pipeline.pipelines.evaluation.device import TestDevice
-from gyro_pipeline.protocol.scores import (
+from gyro_pipeline.scoring.scores import (
     Estimate,
     SquaredErrors,
     WeightedCurve,
@@ -43,13 +43,13 @@ from gyro_pipeline.protocol.scores import (
     squared_errors,
     with_interval,
 )
-from gyro_pipeline.protocol.truths import (
+from gyro_pipeline.scoring.truths import (
     TestRecording,
     error_columns,
     running_mean_curve,
     stacked,
 )
-from gyro_pipeline.protocol.windows import cut_windows, window_size
+from gyro_pipeline.windows import cut_windows, window_size
 
 SCORES = ["weights", "truth", "windows", "score", "value", "lo", "hi"]
 """Columns of a table of scores."""

@@ -16,7 +16,7 @@ from gyro_pipeline.physics.ceiling import (
 )
 from gyro_pipeline.physics.recording_model import RecordingModel, joint_squares, mean_squares
 from gyro_pipeline.pipelines.evaluation.device import TestDevice
-from gyro_pipeline.protocol.scores import CONFIDENCE_PCT, Estimate, WeightedCurve
+from gyro_pipeline.scoring.scores import CONFIDENCE_PCT, Estimate, WeightedCurve
 
 PREMISE = "linear, axis by axis, recordings exchangeable, no history"
 """What the ceiling of measured data is: honest estimators can be better where it does not hold."""

@@ -28,7 +28,7 @@ from gyro_pipeline.pipelines.evaluation.device import (
     describe_devices,
     training_labels,
 )
-from gyro_pipeline.protocol.truths import CURVE_STEP_S
+from gyro_pipeline.scoring.truths import CURVE_STEP_S
 from gyro_pipeline.studies import MEAN, RunSpec, planned
 from gyro_pipeline.tracking import (
     CURVE,

@@ -17,7 +17,7 @@ from gyro_pipeline.physics.allan import (
     mean_variance,
 )
 from gyro_pipeline.physics.bias import settling_time_s
-from gyro_pipeline.protocol.recordings import bias_rows, one_by_one
+from gyro_pipeline.recordings import bias_rows, one_by_one
 
 logger = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ def measure_bias(
         ground_truth: The tolerance of the settling time.
 
     Returns:
-        The rows of :func:`~gyro_pipeline.protocol.recordings.bias_rows`, and of each bias its
+        The rows of :func:`~gyro_pipeline.recordings.bias_rows`, and of each bias its
         standard error N / sqrt(T), ``standard_error_dps``, where T is the time of all samples that
         are not masked; and ``settling_time_s``, after which the running mean stays within the
         tolerance.

@@ -8,7 +8,7 @@ import xarray as xr
 
 from gyro_pipeline.conventions import AXES
 from gyro_pipeline.logs import REJECTED
-from gyro_pipeline.protocol.rejections import reasons
+from gyro_pipeline.quality.rejections import reasons
 
 logger = logging.getLogger(__name__)
 

@@ -15,10 +15,10 @@ from gyro_pipeline.executors import run_jobs
 from gyro_pipeline.fingerprints import code_hash, fingerprint
 from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding, Listing, Logs, Recording
 from gyro_pipeline.parameters import Execution, Quality, Splits
-from gyro_pipeline.protocol import inspection
-from gyro_pipeline.protocol.inspection import Inspection, judge
-from gyro_pipeline.protocol.rejections import NAMED, reasons
-from gyro_pipeline.protocol.splits import split_recordings
+from gyro_pipeline.pipelines.raw_logs import inspection
+from gyro_pipeline.pipelines.raw_logs.inspection import Inspection, judge
+from gyro_pipeline.quality.rejections import NAMED, reasons
+from gyro_pipeline.splits import split_recordings
 
 logger = logging.getLogger(__name__)
 

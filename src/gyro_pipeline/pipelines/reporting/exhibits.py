@@ -3,11 +3,10 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from gyro_pipeline.conventions import ALL, AXES, FIRST, LEAVE_ONE_DEVICE_OUT, MDPS
 from gyro_pipeline.parameters import Published, PublishedResult
@@ -16,6 +15,9 @@ from gyro_pipeline.physics.warm_up import amplitude_needed
 from gyro_pipeline.pipelines.reporting.recordings import WARM_UPS_S
 from gyro_pipeline.pipelines.reporting.results import column
 from gyro_pipeline.studies import CNN, CONSTANT, MEAN
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PREMISE = "white noise without drift"
 """Of the ceiling, to be named wherever it is."""
@@ -54,7 +56,7 @@ class Exhibit:
     name: str
     title: str
     caption: str
-    content: pd.DataFrame | Figure
+    content: "pd.DataFrame | Figure"
     shown: Sequence[str] | None = None
 
 

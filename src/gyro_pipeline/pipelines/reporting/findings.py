@@ -8,7 +8,7 @@ from gyro_pipeline.conventions import ALL, FIRST
 from gyro_pipeline.estimators import DEFAULT
 from gyro_pipeline.pipelines.reporting.exhibits import Material, beyond_ceiling, from_to, label
 from gyro_pipeline.pipelines.reporting.results import column
-from gyro_pipeline.protocol.scores import holm
+from gyro_pipeline.scoring.scores import holm
 from gyro_pipeline.studies import CNN, CONSTANT, MEAN
 
 _GAIN = column("accuracy_gain_pct", ALL)

@@ -10,7 +10,7 @@ from gyro_pipeline.conventions import ALL, BEST, BEST_EPOCH_ON_TEST, LAST, PAPER
 from gyro_pipeline.parameters import Sensor, Study, Training
 from gyro_pipeline.pipelines.reporting.results import errors_of, scores_of
 from gyro_pipeline.pipelines.reporting.tables import WAYS
-from gyro_pipeline.protocol.scores import (
+from gyro_pipeline.scoring.scores import (
     curve_errors,
     holm,
     leave_one_out,

@@ -1,17 +1,19 @@
-"""The report of a source: its tables, its figures, and the page that shows them, as Markdown."""
+"""The report of a source: its tables, its figures, and the page that shows them, as Markdown.
+
+Modules that draw are imported where they are used, since every run imports this one.
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from matplotlib.figure import Figure
 
 from gyro_pipeline.conventions import AXES
 from gyro_pipeline.estimators import DEFAULT, ESTIMATORS, estimator_class
 from gyro_pipeline.markup import escape, pipe_table
 from gyro_pipeline.parameters import GroundTruth, Only, Published, Study
-from gyro_pipeline.pipelines.reporting import figures, signals, tables
+from gyro_pipeline.pipelines.reporting import tables
 from gyro_pipeline.pipelines.reporting.exhibits import PREMISE, Exhibit, Material, label
 from gyro_pipeline.pipelines.reporting.findings import answer, findings
 from gyro_pipeline.pipelines.reporting.results import CNN_BEST, NOT_RUN, ROW, WARNINGS
@@ -36,7 +38,7 @@ def write_report(
     sensors: dict[str, Any],
     earlier: Tables,
     **made: Tables,
-) -> tuple[dict[str, pd.DataFrame], dict[str, Figure], str]:
+) -> tuple[dict[str, pd.DataFrame], dict[str, Any], str]:
     """Make the tables, the figures and the page of a source.
 
     Args:
@@ -56,11 +58,9 @@ def write_report(
     fresh = {f"{name}/{table}": load for name, own in made.items() for table, load in own.items()}
     material = _material(source, published, dict(earlier) | fresh)
     exhibits = {
-        "drift": _made([signals.drift(material)]),
-        "forest": _made([figures.forest(material)]),
+        **_figures(material, ground_truth),
         "start_up": _made([tables.start_up(material)]),
         "tables": _tables(material),
-        "figures": _figures(material, ground_truth),
         "files": _files(material),
     }
     shown = [exhibit for part in exhibits.values() for exhibit in part]
@@ -78,8 +78,8 @@ def write_report(
         runs=_runs(material),
     )
     return (
-        {one.name: one.content for one in shown if isinstance(one.content, pd.DataFrame)},
-        {one.name: one.content for one in shown if isinstance(one.content, Figure)},
+        {item.name: item.content for item in shown if isinstance(item.content, pd.DataFrame)},
+        {item.name: item.content for item in shown if not isinstance(item.content, pd.DataFrame)},
         page,
     )
 
@@ -123,11 +123,14 @@ def _tables(material: Material) -> list[Exhibit]:
     ])  # fmt: skip
 
 
-def _figures(material: Material, ground_truth: GroundTruth) -> list[Exhibit]:
+def _figures(material: Material, ground_truth: GroundTruth) -> dict[str, list[Exhibit]]:
+    """Those that the page begins with, and all others."""
+    from gyro_pipeline.pipelines.reporting import figures, signals  # noqa: PLC0415
+
     compared = [
         figures.estimators(material, study, sensor) for study, sensor in _compared(material)
     ]
-    return _made([
+    others = [
         *compared,
         figures.saving_against_turn_on_spread(material),
         figures.input_channels(material),
@@ -142,7 +145,12 @@ def _figures(material: Material, ground_truth: GroundTruth) -> list[Exhibit]:
         signals.calibrated_signal(material),
         signals.mg_convergence(material, ground_truth),
         figures.leakage_against_stride(material),
-    ])  # fmt: skip
+    ]
+    return {
+        "drift": _made([signals.drift(material)]),
+        "forest": _made([figures.forest(material)]),
+        "figures": _made(others),
+    }
 
 
 def _files(material: Material) -> list[Exhibit]:

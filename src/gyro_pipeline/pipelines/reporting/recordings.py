@@ -17,7 +17,7 @@ from gyro_pipeline.physics.bias import fill_masked, settling_time_s
 from gyro_pipeline.physics.ceiling import turn_on_spread
 from gyro_pipeline.physics.recording_model import block_edges, block_means
 from gyro_pipeline.physics.warm_up import LAST, fit_common_warm_up, settling
-from gyro_pipeline.protocol.recordings import one_by_one, tested_imu
+from gyro_pipeline.recordings import one_by_one, tested_imu
 
 SIGMAS_MDPS = (1.0, 0.5)
 """The accuracy of the bias for which the times of a start-up are given."""

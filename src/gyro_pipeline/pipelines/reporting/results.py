@@ -14,7 +14,7 @@ import pandas as pd
 from gyro_pipeline.conventions import ALL, AXES, BEST, FIRST, LAST, PAPER
 from gyro_pipeline.estimators import DEFAULT
 from gyro_pipeline.parameters import Only, Study
-from gyro_pipeline.protocol.scores import (
+from gyro_pipeline.scoring.scores import (
     Estimate,
     SquaredErrors,
     WeightedCurve,

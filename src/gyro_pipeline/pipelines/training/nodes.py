@@ -33,7 +33,6 @@ from gyro_pipeline.estimators.training import TrainingSet
 from gyro_pipeline.fingerprints import code_hash, data_hash, fingerprint
 from gyro_pipeline.parameters import Execution, Only, Splits, Study, Training, VirtualGyros
 from gyro_pipeline.physics.bias import fill_masked
-from gyro_pipeline.protocol.windows import window_size
 from gyro_pipeline.studies import (
     LEFT_OUT,
     RunSpec,
@@ -43,6 +42,7 @@ from gyro_pipeline.studies import (
     study_rows,
 )
 from gyro_pipeline.tracking import FINGERPRINT, HISTORY, FittedRun, RunIdentity, StoredRun
+from gyro_pipeline.windows import window_size
 
 logger = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from gyro_pipeline.conventions import AXES, DIMENSIONS, MDPS, TRAIN, InputError
 from gyro_pipeline.fingerprints import data_hash
 from gyro_pipeline.parameters import VirtualGyros
 from gyro_pipeline.physics.bias import recording_mean
-from gyro_pipeline.protocol.recordings import common_length
+from gyro_pipeline.recordings import common_length
 
 
 def synthesise(

@@ -28,7 +28,7 @@ from gyro_pipeline.conventions import (
     InputError,
 )
 from gyro_pipeline.parameters import Splits
-from gyro_pipeline.protocol.splits import choose_validation, deal
+from gyro_pipeline.splits import choose_validation, deal
 
 Texts = NDArray[np.object_]
 Folds = Iterator[tuple[str, Texts]]

@@ -3,7 +3,7 @@ import pandas as pd
 import pytest
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.protocol.windows import (
+from gyro_pipeline.windows import (
     cut_windows,
     describe_losses,
     usable_starts,

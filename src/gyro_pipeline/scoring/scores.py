@@ -16,6 +16,7 @@ from functools import cached_property
 
 import numpy as np
 import pandas as pd
+import scipy
 
 from gyro_pipeline.conventions import FIRST
 
@@ -132,10 +133,8 @@ class WeightedCurve:
         do not fall are pooled (isotonic regression), and the middles of the pools are joined by
         lines.
         """
-        from scipy import optimize  # noqa: PLC0415 - it starts slowly
-
         given = self.rmse[0] ** 2, self.counts.astype(float)
-        fit = optimize.isotonic_regression(given[0], weights=given[1], increasing=False)
+        fit = scipy.optimize.isotonic_regression(given[0], weights=given[1], increasing=False)
         middles = (fit.blocks[:-1] + fit.blocks[1:] - 1) / 2
         squares = np.interp(np.arange(given[0].size), middles, fit.x[fit.blocks[:-1]])
         return np.asarray(np.sqrt(squares))
@@ -182,7 +181,7 @@ def curve_errors(curve: pd.DataFrame, truth: str, windows: str) -> Curve:
     """The chosen running-mean curve by recording (or device, see :func:`clusters`), in order.
 
     Args:
-        curve: From :func:`gyro_pipeline.protocol.truths.running_mean_curve`, concatenated.
+        curve: From :func:`gyro_pipeline.scoring.truths.running_mean_curve`, concatenated.
         truth: One of the truths.
         windows: ``first`` or ``all``.
     """
@@ -222,10 +221,9 @@ def with_interval(
         scaled = np.log(values) if positive else values
     if not (n and np.isfinite(scaled).all()):
         return Estimate(value)
-    from scipy import stats  # noqa: PLC0415 - it starts slowly
-
     error = np.sqrt((n - 1) * scaled[1:].var())
-    ends = scaled[0] + stats.t.ppf(0.5 + confidence_pct / 200, n - 1) * error * np.array([-1, 1])
+    reach = scipy.stats.t.ppf(0.5 + confidence_pct / 200, n - 1) * error
+    ends = scaled[0] + np.array([-reach, reach])
     lo, hi = np.exp(ends) if positive else ends
     return Estimate(value, float(lo), float(hi))
 
@@ -369,12 +367,10 @@ def prior_conflict(trained: np.ndarray, tested: np.ndarray) -> np.ndarray:
     variance = trained.var(axis=0, ddof=1) if n > 1 else np.zeros(trained.shape[1])
     if not variance.all():
         return np.ones(trained.shape[1])
-    from scipy import stats  # noqa: PLC0415 - it starts slowly
-
     off = tested - trained.mean(axis=0)
     # the inverse of I + 1 1' / n is I - 1 1' / (n + k)
     squares = np.sum(off**2, axis=0) - np.sum(off, axis=0) ** 2 / (n + k)
-    return np.asarray(stats.f.sf(squares / k / variance, k, n - 1))
+    return np.asarray(scipy.stats.f.sf(squares / k / variance, k, n - 1))
 
 
 def beats_oracle(errors: SquaredErrors, oracle: SquaredErrors) -> float:
@@ -388,9 +384,7 @@ def beats_oracle(errors: SquaredErrors, oracle: SquaredErrors) -> float:
     difference = errors.sums / errors.counts - oracle.sums / oracle.counts
     if np.ptp(difference) == 0:
         return 1.0
-    from scipy import stats  # noqa: PLC0415 - it starts slowly
-
-    return float(stats.ttest_1samp(difference, 0.0, alternative="less").pvalue)
+    return float(scipy.stats.ttest_1samp(difference, 0.0, alternative="less").pvalue)
 
 
 def holm(p_values: Sequence[float]) -> np.ndarray:

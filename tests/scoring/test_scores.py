@@ -7,7 +7,7 @@ from scipy import stats
 
 from gyro_pipeline.conventions import ALL, DISJOINT, FIRST, MDPS, PAPER, TRUE
 from gyro_pipeline.physics.ceiling import best_gain, best_saving, ceiling_rmse, running_mean_rmse
-from gyro_pipeline.protocol.scores import (
+from gyro_pipeline.scoring.scores import (
     Curve,
     SquaredErrors,
     WeightedCurve,

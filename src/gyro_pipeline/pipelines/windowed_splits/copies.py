@@ -9,8 +9,8 @@ a drift that recordings share is in few frequencies, and so does not count.
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft
 
 SAMPLES = 4096
 """Of a recording that are compared, the first ones."""
@@ -39,11 +39,11 @@ def near_copies(recordings: NDArray[np.floating]) -> list[NearCopy]:
     """
     count, axes, samples = recordings.shape
     taper = np.hanning(samples)
-    turns = np.exp(2j * np.pi * np.arange(_LAGS + 1)[:, None] * fft.rfftfreq(samples))
+    turns = np.exp(2j * np.pi * np.arange(_LAGS + 1)[:, None] * scipy.fft.rfftfreq(samples))
     most = np.zeros((count, count), np.float32)
     for axis in range(axes):
         rates = recordings[:, axis] - np.nanmean(recordings[:, axis], axis=-1, keepdims=True)
-        spectra = fft.rfft(np.nan_to_num(rates) * taper)
+        spectra = scipy.fft.rfft(np.nan_to_num(rates) * taper)
         sizes = np.abs(spectra)
         heard = sizes > 1e-9 * samples * np.nanmax(np.abs(recordings), initial=1.0)
         phases = np.divide(spectra, sizes, out=np.zeros_like(spectra), where=heard)

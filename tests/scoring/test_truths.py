@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from gyro_pipeline.conventions import ALL, AXES, DISJOINT, FIRST, PAPER, TRUE
 from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.noise import simulate_noise
-from gyro_pipeline.protocol import truths
-from gyro_pipeline.protocol.windows import usable_starts
+from gyro_pipeline.scoring import truths
+from gyro_pipeline.windows import usable_starts
 
 RATE_HZ, NOISE = 8.0, np.array([1.0, 2.0, 3.0])
 FIGURES = tuple(NoiseFigures(white, 0.0, 0.0) for white in NOISE)

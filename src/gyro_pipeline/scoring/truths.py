@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gyro_pipeline.conventions import ALL, AXES, DISJOINT, FIRST, PAPER, TRUE
 from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.recording_model import outside_noise
-from gyro_pipeline.protocol.windows import usable_starts
+from gyro_pipeline.windows import usable_starts
 
 CURVE_STEP_S = 0.25
 """Resolution of the running-mean curve; the equivalent time is interpolated between points."""
