@@ -313,6 +313,12 @@ def test_an_estimator_of_ones_own_is_trained_on_what_rows_name_and_only_what_cha
     left, nodes, _ = re.search(UP_TO_DATE, run("virtual_gyros").output).groups()
     assert left == nodes
     assert project.files() == states
+    # a damaged file is made again, and the run says so
+    bias = project.folder / "data/03_primary/simulated_smoke/sparkfun/bias.csv"
+    bias.write_bytes(bias.read_bytes().replace(b"1", b"2", 1))
+    mended = run("virtual_gyros").output
+    assert "sparkfun.ground_truth.bias: missing, damaged or changed" in mended
+    assert re.search(UP_TO_DATE, mended)
     again = run().output  # tables that lack runs are tried
     assert re.search(UP_TO_DATE, again)
     assert "runs planned" not in again
@@ -327,7 +333,6 @@ def test_an_estimator_of_ones_own_is_trained_on_what_rows_name_and_only_what_cha
     assert f"{len(runs)} skipped (made before)" in other.output
     assert f"sparkfun: {len(runs)} runs evaluated, 0 skipped" in other.output
     # a node that is named is run
-    bias = project.folder / "data/03_primary/simulated_smoke/sparkfun/bias.csv"
     before = bias.stat().st_mtime_ns
     node = "--nodes=ground_truth.bias_sparkfun"
     named = project.command("--pipeline=ground_truth", "--env=smoke", node)

@@ -102,12 +102,17 @@ class ChangedNodesRunner(SequentialRunner):
 
     def _changed(self, node: Node) -> bool:
         kept = [name for name in node.outputs if not _in_memory(name, self._catalog)]
-        if ALWAYS in node.tags or not all(map(self._catalog.exists, kept)):
+        if ALWAYS in node.tags:
             return True
         if node.outputs and not kept:
             return False  # it is run where another node needs what it makes
-        content = [self._fingerprints[node.name], _states(node, self._catalog)]
-        return bool(self._ended.get(_key(node, self._catalog)) != content)
+        before, states = self._ended.get(_key(node, self._catalog)), _states(node, self._catalog)
+        if before is not None and before[0] == self._fingerprints[node.name]:
+            for name, earlier, now in zip(kept, before[1], states, strict=True):
+                if isinstance(earlier, str) and now != earlier:  # a file: run stores grow
+                    logger.warning("%s: missing, damaged or changed, so it is made again", name)
+        there = all(map(self._catalog.exists, kept))
+        return not there or before != [self._fingerprints[node.name], states]
 
 
 def _fingerprints(pipeline: Pipeline, catalog: CatalogProtocol) -> dict[str, str]:
