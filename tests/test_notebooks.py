@@ -8,9 +8,7 @@ import pytest
 from nbclient import NotebookClient
 
 ROOT = Path(__file__).parents[1]
-NOTEBOOKS = [
-    ROOT / f"notebooks/{name}.ipynb" for name in ("01_explore_recordings", "02_compare_runs")
-]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 # The kernel is another process; what it is sent and how is not our concern.
 pytestmark = pytest.mark.filterwarnings("ignore")
