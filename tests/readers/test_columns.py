@@ -215,7 +215,7 @@ def test_accelerations_are_kept_in_g(unit, factor, read, details):
         ({"units": "deg/s", "increments": True}, "expected a unit of an angle"),
         ({"units": "raw"}, "units: raw and scale_dps go together"),
         ({"scale_dps": 0.1}, "units: raw and scale_dps go together"),
-        ({"offset": 3}, "offset: is of raw counts"),
+        ({"offset": 3}, "offset: applies to raw counts"),
         ({"time_units": "deg"}, "expected a unit of time"),
         ({"time_units": -1}, "greater than 0"),
         ({"acceleration_units": "s"}, "expected a unit of acceleration"),
