@@ -178,7 +178,7 @@ def test_other_settings_are_written_anew_and_said(tmp_path, caplog, changes):
     new = recordings(simulated(tmp_path, **changes))
     assert not new.identical(old)
     assert len(caplog.records) == 1
-    assert "writing simulated dot logs anew, since their settings have changed" in caplog.text
+    assert "writing simulated dot logs again, since their settings have changed" in caplog.text
     xr.testing.assert_identical(new, recordings(simulated(tmp_path / "fresh", **changes)))
 
 

@@ -139,7 +139,7 @@ def test_ranges_and_scales_of_other_sensors_are_none_of_the_rates(line, read):
 
 
 @pytest.mark.parametrize(
-    ("dps", "taken"), [(0.00106423, "deg/s a count"), (0.0609759, "rad/s a count")]
+    ("dps", "taken"), [(0.00106423, "deg/s per count"), (0.0609759, "rad/s per count")]
 )
 def test_of_a_scale_with_two_readings_the_one_taken_is_said(dps, taken, read, details):
     above = {"preamble": "tscale,0.001\ngscale,0.00106423", "time_units": 1e-3}
@@ -164,7 +164,7 @@ def test_rates_that_are_free_of_their_bias_are_said(name, read):
 
 @pytest.mark.parametrize("name", ["tilt_#", "jerk_#", "field_#", "#"])
 def test_rates_by_units_alone_are_said_and_never_a_quaternion(name, read, details):
-    assert "nothing but units" in details(read(axes(name), S, X, **DEG), "rates")[0]
+    assert "only the option units says" in details(read(axes(name), S, X, **DEG), "rates")[0]
     assert not read(axes(name), S, X, **BY_NUMBER).findings
     header = axes(name, "xyzw")
     with pytest.raises(InputError, match="are by name of a quaternion; give columns"):
@@ -181,7 +181,7 @@ def test_rates_by_units_alone_are_said_and_never_a_quaternion(name, read, detail
         ("T_temp [K]", {}, -248.15, ""),
         ("imu_degC", {}, 25, ""),
         ("T(℃)", {}, 25, ""),
-        ("temp_c", {}, 25, "'temp_c' has no unit and is taken for degrees Celsius"),
+        ("temp_c", {}, 25, "'temp_c' has no unit; degrees Celsius are assumed"),
         ("temp_gyro", {}, 25, "has no unit"),
         ("temp_gyro,temp_board", {}, None, "none of 'temp_gyro', 'temp_board' is kept"),
         ("temp_gyro,temp_board", {"temperature_column": "temp_gyro"}, 25, ""),

@@ -46,7 +46,7 @@ def test_the_first_column_that_holds_times_gives_the_rate(header, columns, optio
 @pytest.mark.parametrize(
     ("header", "column", "words"),
     [
-        ("k", S * 0, "no column of times: rate and gaps are unseen; give time_column"),
+        ("k", S * 0, "no column of times: rate and gaps are not measured; give time_column"),
         ("Time", ["no times"] * N, "no column of times"),
         ("time (s)", S * np.nan, "no column of times"),
         ("exposure (ms)", S, "no column of times"),
