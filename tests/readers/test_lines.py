@@ -65,7 +65,10 @@ def test_groups_may_be_missing_and_unreadable(table):
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ("(", "`row:` in `reader:` of the catalog entry in catalog.yml is no expression"),
+        (
+            "(",
+            "`row:` in `reader:` of the catalog entry in catalog.yml is not a regular expression",
+        ),
         (r"(\d), (\d)", "expected named groups.*got 0 groups.*row: '.gyro="),
         (r"acc=(?P<x>\d)", "got 1 groups and 0 of 9 lines.*row: '.gyro="),
     ],
