@@ -35,10 +35,10 @@ def install(project: Path) -> None:
     """Explain uncaught errors, and mask passwords in everything that is logged."""
     sys.excepthook = partial(_show, project)
     if logging.getLogRecordFactory() is logging.LogRecord:
-        logging.setLogRecordFactory(_masked_record)
+        logging.setLogRecordFactory(_record_without_passwords)
 
 
-def masked(text: str) -> str:
+def mask_passwords(text: str) -> str:
     """Mask the passwords of addresses in a text."""
     return _PASSWORD.sub(r"\1:***@", text)
 
@@ -48,19 +48,19 @@ def explanation(error: BaseException, project: Path) -> str | None:
     causes = [*_causes(error)]
     for cause in causes:
         if isinstance(cause, InputError):
-            return masked(str(cause))
+            return mask_passwords(str(cause))
     for cause in reversed(causes):  # from the original error on
         for kind in type(cause).__mro__:
             explain = _EXPLAINED.get(f"{kind.__module__.partition('.')[0]}.{kind.__name__}")
             if explain is not None:
-                return masked(explain(cause))
+                return mask_passwords(explain(cause))
     files = [Path(frame.f_code.co_filename) for frame, _ in traceback.walk_tb(error.__traceback__)]
     if any(_CONFIGURATION.search(file.as_posix()) for file in files):
-        return f"configuration: {_faulty_file(project / 'conf') or masked(_line(error))}"
+        return f"configuration: {_faulty_file(project / 'conf') or mask_passwords(_line(error))}"
     if _OTHER_ARGUMENTS in str(error):
-        return f"catalog: {masked(_line(error))}"
+        return f"catalog: {mask_passwords(_line(error))}"
     if isinstance(error, ValueError) and _is_about_the_command(files):
-        return masked(_line(error))
+        return mask_passwords(_line(error))
     return None
 
 
@@ -72,19 +72,19 @@ def _show(
     if message is not None:
         logger.error("error: %s", message)
         return
-    text = masked("".join(traceback.format_exception(kind, error, trace)))
+    text = mask_passwords("".join(traceback.format_exception(kind, error, trace)))
     sys.stderr.write(text)
     log, command = project / "data" / "defect.log", " ".join(sys.argv)
     with suppress(OSError):
-        log.write_text(masked(f"{time.strftime('%F %T')} {command}\n{text}"))
+        log.write_text(mask_passwords(f"{time.strftime('%F %T')} {command}\n{text}"))
         logger.error("error: this is a defect; please report it with %s", log)
 
 
-def _masked_record(*arguments: Any, **options: Any) -> logging.LogRecord:
+def _record_without_passwords(*arguments: Any, **options: Any) -> logging.LogRecord:
     record = logging.LogRecord(*arguments, **options)
-    record.msg, record.args = masked(record.getMessage()), ()
+    record.msg, record.args = mask_passwords(record.getMessage()), ()
     if record.exc_info and record.exc_info[0]:
-        record.exc_text = masked("".join(traceback.format_exception(*record.exc_info)))
+        record.exc_text = mask_passwords("".join(traceback.format_exception(*record.exc_info)))
     return record
 
 

@@ -151,7 +151,7 @@ class Recording:
     variables: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
 
     @property
-    def place(self) -> tuple[int, int]:
+    def labels(self) -> tuple[int, int]:
         """IMU and recording."""
         return self.imu, self.recording
 

@@ -29,7 +29,7 @@ def common_length(recordings: xr.Dataset) -> int:
     return int(lengths[np.argmax(lengths * counts)])
 
 
-def one_by_one(recordings: xr.Dataset) -> Iterator[tuple[int, int, NDArray[np.floating]]]:
+def iterate_recordings(recordings: xr.Dataset) -> Iterator[tuple[int, int, NDArray[np.floating]]]:
     """Iterate over all existing recordings with one in memory at a time.
 
     Yields:
@@ -44,7 +44,7 @@ def one_by_one(recordings: xr.Dataset) -> Iterator[tuple[int, int, NDArray[np.fl
         yield imus[imu], numbers[number], rates[imu, number, :, stretch].to_numpy()
 
 
-def cut(recordings: xr.Dataset, length: int) -> xr.Dataset:
+def cut_to_length(recordings: xr.Dataset, length: int) -> xr.Dataset:
     """Cut recordings to a length in samples and drop shorter ones, without reading samples."""
     samples = recordings["samples"].load()
     if bool(((samples == length) | (samples == 0)).all()):
@@ -77,6 +77,6 @@ def bias_rows(
                 **(more(imu, samples) if more else {}),
             }
         )
-        for imu, number, samples in one_by_one(recordings)
+        for imu, number, samples in iterate_recordings(recordings)
     ]
     return pd.concat(tables, ignore_index=True)

@@ -161,7 +161,7 @@ def run_spec(row: RunSpec, unseen_devices: bool) -> RunSpec:
     )
 
 
-def planned(plan: pd.DataFrame) -> dict[str, RunSpec]:
+def possible_runs(plan: pd.DataFrame) -> dict[str, RunSpec]:
     """The possible runs of a plan, by fingerprint."""
     possible = plan[plan[LEFT_OUT].isna() | (plan[LEFT_OUT] == "")]
     return {

@@ -146,7 +146,9 @@ class _Writer:
     def add(self, recording: Recording) -> None:
         """Write the samples now, and the description within ``every_s`` seconds."""
         require_room(Path(self._file.filename), sum(v.nbytes for v in recording.variables.values()))
-        index = tuple(indices[n] for indices, n in zip(self._indices, recording.place, strict=True))
+        index = tuple(
+            indices[n] for indices, n in zip(self._indices, recording.labels, strict=True)
+        )
         for name, values in recording.variables.items():
             if name not in self._arrays or self._arrays[name].shape[-1] < values.shape[-1]:
                 _enlarge(self._file, name, values)
@@ -253,7 +255,7 @@ def _stored(path: Path, keys: Mapping[tuple[int, int], str] | None = None) -> It
             recording = Recording(**description)
             if keys is None:
                 yield recording
-            elif recording.key and recording.key == keys.get(recording.place):
+            elif recording.key and recording.key == keys.get(recording.labels):
                 stretch = (*index, ..., slice(recording.stop - recording.start))
                 with suppress(*damage):  # damage to a recording must not hide the following ones
                     variables = {name: file[name][stretch] for name in hashes}

@@ -18,6 +18,7 @@ import scipy
 from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import InputError
+from gyro_pipeline.physics.bias import runs
 
 SHORTEST_FIT_SAMPLES = 8
 """Shortest average for fits. Shorter ones show the correlation of successive samples (by an
@@ -90,7 +91,7 @@ def allan_variance(
             f"got {times_s}"
         )
     squares, counts = np.zeros(factors.shape), np.zeros(factors.shape, np.int64)
-    gaps = _gaps(samples)
+    gaps = runs(np.isnan(samples))  # start and end, exclusive, of each gap
     closed = np.searchsorted(np.sort(gaps[:, 1] - gaps[:, 0]), factors // _CLOSED, side="right")
     for group in (closed == number for number in np.unique(closed)):
         for stretch in _stretches(samples, gaps, factors[group].min() // _CLOSED):
@@ -119,14 +120,8 @@ def mean_variance(
         return np.asarray(np.nansum(variances * weights, axis=0) / weights.sum(axis=0))
 
 
-def _gaps(samples: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Start and end, exclusive, of each gap of masked samples, (gaps, 2)."""
-    masked = np.concatenate([[False], np.isnan(samples), [False]])
-    return np.flatnonzero(masked[1:] != masked[:-1]).reshape(-1, 2)
-
-
 def _stretches(
-    samples: NDArray[np.floating], gaps: NDArray[np.int64], longest: int
+    samples: NDArray[np.floating], gaps: NDArray[np.integer], longest: int
 ) -> Iterator[NDArray[np.floating]]:
     """Unmasked samples between gaps longer than ``longest`` samples; shorter gaps are closed."""
     ends = gaps[gaps[:, 1] - gaps[:, 0] > longest].ravel()

@@ -49,6 +49,12 @@ def fill_masked(samples: NDArray[np.floating]) -> NDArray[np.floating]:
     return np.where(masked, means, samples)
 
 
+def runs(mask: NDArray[np.bool_]) -> NDArray[np.integer]:
+    """Start and end, exclusive, of each run of true values, (run, 2)."""
+    edges = np.concatenate([[False], mask, [False]])
+    return np.flatnonzero(edges[1:] != edges[:-1]).reshape(-1, 2)
+
+
 def windows_at(
     samples: NDArray[np.floating], size: int, starts: NDArray[np.integer]
 ) -> NDArray[np.floating]:

@@ -7,7 +7,8 @@ import numpy as np
 from gyro_pipeline.conventions import AXES
 from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED
 from gyro_pipeline.parameters import LEAST_BLOCKS
-from gyro_pipeline.quality.recording import Recording, median, runs
+from gyro_pipeline.physics.bias import runs
+from gyro_pipeline.quality.recording import Recording, median
 from gyro_pipeline.quality.rest import Array, Mask
 
 

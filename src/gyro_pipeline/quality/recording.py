@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gyro_pipeline.logs import REJECTED, REPAIRED, Finding, Log
 from gyro_pipeline.parameters import Quality
+from gyro_pipeline.physics.bias import runs
 from gyro_pipeline.quality.rest import Array, Mask
 
 
@@ -145,9 +146,3 @@ def median(values: Array) -> Array:
     """Median along the last axis; for few values, several times as fast as numpy.median."""
     ordered, middle = np.sort(values, axis=-1), values.shape[-1] // 2
     return (ordered[..., middle] + ordered[..., ~middle]) / 2
-
-
-def runs(mask: Mask) -> NDArray[np.integer]:
-    """Start and end, exclusive, of each run of true values, (run, 2)."""
-    edges = np.concatenate([[False], mask, [False]])
-    return np.flatnonzero(edges[1:] != edges[:-1]).reshape(-1, 2)

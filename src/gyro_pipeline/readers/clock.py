@@ -208,10 +208,14 @@ def from_counter(counts: Floats, bits: int) -> Timing:
     return Timing(gap_rows=skips, findings=(*_at("packet counter", skips, text, REPAIRED),))
 
 
-def _at(check: str, rows: Rows, text: str, outcome: str = KEPT, place: str = "at") -> list[Finding]:
+def _at(
+    check: str, rows: Rows, text: str, outcome: str = KEPT, preposition: str = "at"
+) -> list[Finding]:
     """A finding with the number of rows and the first three; none without rows."""
     if not len(rows):
         return []
     first = ", ".join(map(str, rows[:3])) + (", …" if len(rows[3:]) else "")
-    count = f"once, {place} row" if len(rows) == 1 else f"{len(rows)} times, {place} rows"
+    count = (
+        f"once, {preposition} row" if len(rows) == 1 else f"{len(rows)} times, {preposition} rows"
+    )
     return [Finding(check, outcome, f"{text}: {count} {first}")]

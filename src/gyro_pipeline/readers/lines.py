@@ -57,15 +57,15 @@ def read_lines(where: str, data: bytes, expression: str) -> Table:
     texts = [pa.array([match[name] for match in matches.values()], pa.string()) for name in names]
     columns, damage = columns_of(names, texts)
 
-    def place(row: int) -> str:
+    def position(row: int) -> str:
         return f"row {row} (line {numbers[row]})"
 
-    findings = [*unreadable(damage, len(matches), place)]
+    findings = [*unreadable(damage, len(matches), position)]
     if skipped := [number for number in nonblank if number not in matches]:
         detail = f"{len(skipped)} of {len(nonblank)} lines do not match `row` and were skipped, "
         detail += f"the first is line {skipped[0]}: {nonblank[skipped[0]][:60]!r}"
         findings.insert(0, Finding("row", KEPT, detail))
-    return Table(where, names, columns, "\n".join(lines[: numbers[0] - 1]), (*findings,), place)
+    return Table(where, names, columns, "\n".join(lines[: numbers[0] - 1]), (*findings,), position)
 
 
 def advice(lines: Sequence[str]) -> str:

@@ -38,7 +38,7 @@ class Table:
             arrays can differ.
         preamble: Lines above the header.
         findings: Findings of the reader.
-        place: Position of a row, for messages: ``row 5 (line 12)``, rows count from 0.
+        position: Position of a row, for messages: ``row 5 (line 12)``, rows count from 0.
     """
 
     where: str
@@ -46,7 +46,7 @@ class Table:
     columns: tuple[NDArray[Any], ...]
     preamble: str = ""
     findings: tuple[Finding, ...] = ()
-    place: Callable[[int], str] = "row {}".format
+    position: Callable[[int], str] = "row {}".format
 
     def listed(self) -> str:
         """The first thirty names, for a message."""
@@ -71,7 +71,7 @@ class Table:
         bad = {n: text for n, text in texts.items() if not re.match(_NUMBER, text)} or texts
         row, text = next(iter(bad.items()))
         raise InputError(
-            f"{expected}, without thousands separators, got {text[:40]!r} in {self.place(row)}, "
+            f"{expected}, without thousands separators, got {text[:40]!r} in {self.position(row)}, "
             f"{len(bad)} of {len(values)} rows are like it; export the file again, or give other "
             f"columns, or `row:` {IN_READER}"
         )
@@ -101,10 +101,12 @@ def columns_of(
     return tuple(columns), damage
 
 
-def unreadable(damage: dict[int, str], rows: int, place: Callable[[int], str]) -> Iterator[Finding]:
+def unreadable(
+    damage: dict[int, str], rows: int, position: Callable[[int], str]
+) -> Iterator[Finding]:
     """A finding about the rows that cannot be read, wholly or in a cell, if any."""
     if damage:
-        first = "; ".join(f"{place(row)}: {text}" for row, text in sorted(damage.items())[:3])
+        first = "; ".join(f"{position(row)}: {text}" for row, text in sorted(damage.items())[:3])
         detail = f"{len(damage)} of {rows} rows cannot be read and are NaN, or a cell of them: "
         yield Finding("unreadable rows", KEPT, detail + first + ", …" * (len(damage) > 3))  # noqa: PLR2004
 

@@ -54,7 +54,7 @@ class _Rows:
         lines = enumerate(bytes(self.body).splitlines(), self.above + 1)
         return [(n, line.decode("utf-8", "replace")) for n, line in lines if line.strip()]
 
-    def place(self, row: int) -> str:
+    def position(self, row: int) -> str:
         """Position of a row, for messages."""
         return f"row {row} (line {self.numbered[row][0]})"
 
@@ -90,8 +90,8 @@ def read_text(path: Path, options: ReaderOptions) -> Table:
     if damage or misshapen:
         damage |= misshapen
         _refuse_damage(rows, damage, misshapen)
-    findings = unreadable(damage, len(columns[0]), rows.place)
-    return Table(where, rows.names, columns, rows.preamble, (*findings,), rows.place)
+    findings = unreadable(damage, len(columns[0]), rows.position)
+    return Table(where, rows.names, columns, rows.preamble, (*findings,), rows.position)
 
 
 def _parse(body: memoryview | bytes, rows: _Rows, number: pa.DataType | None) -> list[Any]:
@@ -130,13 +130,13 @@ def _refuse_damage(rows: _Rows, damage: dict[int, str], misshapen: dict[int, str
         as_wide = len(fields) == len(rows.names) or _filled(fields) == _filled([*rows.names])
         if as_wide and not _is_row(fields):
             raise InputError(
-                f"{rows.where}: expected numbers, got a second header in {rows.place(row)}, "
+                f"{rows.where}: expected numbers, got a second header in {rows.position(row)}, "
                 f"{lines[row][:80]!r}: two recordings in one file? Split it"
             )
     count = len(misshapen)
     if not few(count, len(lines)) or count >= len(lines) - 1:
         first = [*misshapen.items()][:3]
-        problems = "; ".join(f"{rows.place(row)}: {problem}" for row, problem in first)
+        problems = "; ".join(f"{rows.position(row)}: {problem}" for row, problem in first)
         raise InputError(
             f"{rows.where}: expected rows of {len(rows.names)} columns, separated by "
             f"{rows.delimiter!r}, got {count} of {len(lines)} that are not: {problems}; correct "

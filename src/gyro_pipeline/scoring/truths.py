@@ -132,7 +132,7 @@ def error_columns(
 
     Returns:
         Columns ``imu, recording, window, start, axis, truth, error_dps, truth_variance,
-        sigma_dps``; :func:`stacked` concatenates several such results.
+        sigma_dps``; :func:`stack_columns` concatenates several such results.
     """
     value, variance = value_and_variance
     n = len(estimates)
@@ -150,7 +150,7 @@ def error_columns(
     }
 
 
-def stacked(parts: Sequence[Columns]) -> pd.DataFrame:
+def stack_columns(parts: Sequence[Columns]) -> pd.DataFrame:
     """Concatenate columns to a table; much faster than concatenating tables."""
     return pd.DataFrame({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
 
