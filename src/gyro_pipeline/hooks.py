@@ -33,7 +33,7 @@ _STAGES = "http://127.0.0.1:4141/?types=task"
 """The seven stages as boxes, without the datasets between them, which exist for each sensor."""
 
 _WITHOUT_EFFECT = ("execution", "only")
-"""Settings that change how, and how many, results are computed, but no number."""
+"""Settings that decide which results are computed, and how, but not their values."""
 
 
 class Preflight:

@@ -91,7 +91,7 @@ class Logs:
         simulated: Whether the logs are simulated.
         rate_hz: Expected sample rate, which measured rates are compared with; None if unknown.
         entries: The recordings, ordered by IMU and number.
-        drawn: True biases and noise of simulated recordings, to be stored with them.
+        truth: True biases and noise of simulated recordings, to be stored with them.
     """
 
     sensor: str
@@ -99,7 +99,7 @@ class Logs:
     simulated: bool
     rate_hz: float | None
     entries: Sequence[LogEntry]
-    drawn: "xr.Dataset | None" = None
+    truth: "xr.Dataset | None" = None
 
 
 @dataclass(frozen=True)

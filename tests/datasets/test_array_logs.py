@@ -53,7 +53,7 @@ def test_a_recording_says_where_it_is_and_can_be_read_by_another_process(tmp_pat
     array = np.asfortranarray(np.arange(5 * 6 * 200, dtype=np.int16).reshape(5, 6, 200))
     np.save(tmp_path / "all.npy", array)
     logs = array_logs(tmp_path).load()
-    told = (logs.sensor, logs.source, logs.simulated, logs.rate_hz, logs.drawn)
+    told = (logs.sensor, logs.source, logs.simulated, logs.rate_hz, logs.truth)
     assert told == ("memsense", "array", False, 250, None)
     entry = pickle.loads(pickle.dumps(logs.entries[7]))
     assert (entry.imu, entry.recording, entry.split) == (2, 3, None)

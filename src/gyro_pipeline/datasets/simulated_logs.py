@@ -83,7 +83,7 @@ class SimulatedLogs(ArrayLogs):
                 f"since it was written, so {self._truth} is not its truth; delete that file and "
                 "type the same command again. For your own logs, use another source"
             )
-        return replace(super().load(), simulated=True, drawn=truth.drop_attrs())
+        return replace(super().load(), simulated=True, truth=truth.drop_attrs())
 
     def _exists(self) -> bool:
         return self._truth.is_file() and super()._exists()

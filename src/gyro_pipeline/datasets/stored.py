@@ -152,8 +152,11 @@ def _is_intact(path: Path, record: Record) -> bool:
     if not path.is_file():
         return False
     status = path.stat()
-    same = [status.st_size, status.st_mtime_ns] == [record.get("bytes"), record.get("changed_ns")]
-    return same or digest_of(path) == record["digest"]
+    unchanged = [status.st_size, status.st_mtime_ns] == [
+        record.get("bytes"),
+        record.get("changed_ns"),
+    ]
+    return unchanged or digest_of(path) == record["digest"]
 
 
 def _difference(path: Path, settings: Mapping[str, Any]) -> str | None:

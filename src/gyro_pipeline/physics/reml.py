@@ -261,8 +261,8 @@ class _Likelihood:
         decays = [
             profiles(self.edges, self.rate_hz, share * self.duration_s)[:, 1] for share in shares
         ]
-        both = np.column_stack([(self.means - mean[0]).T, *decays])
-        white = scipy.linalg.solve_triangular(root, both, lower=True, check_finite=False)
+        columns = np.column_stack([(self.means - mean[0]).T, *decays])
+        white = scipy.linalg.solve_triangular(root, columns, lower=True, check_finite=False)
         y, decay = white[:, : len(self.means)], white[:, len(self.means) :]
         amplitudes = decay.T @ y / np.sqrt(np.sum(decay**2, axis=0))[:, None]  # over their sigma
         count, tests = len(self.means), 2 * len(shares)

@@ -136,10 +136,10 @@ def _of_arrays(path: Path, stored: Mapping[str, Any], options: ReaderOptions) ->
         for label, values in zip(labels, rows.T, strict=True):
             columns[f"{name}.{label}".strip(".")] = column(values)
     if not any(values.dtype == np.float64 for values in columns.values()):
-        shown = ", ".join(f"{a.dtype} {a.shape} {name}".rstrip() for name, a in arrays.items())
+        shapes = ", ".join(f"{a.dtype} {a.shape} {name}".rstrip() for name, a in arrays.items())
         raise InputError(
             f"{path}: expected arrays of numbers with a row per sample, such as (n, 3), got "
-            f"{shown or 'none'}; arrays of objects are not read: save their columns as arrays"
+            f"{shapes or 'none'}; arrays of objects are not read: save their columns as arrays"
         )
     return Table(str(path), tuple(columns), tuple(columns.values()))
 

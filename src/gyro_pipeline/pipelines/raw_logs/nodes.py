@@ -138,8 +138,8 @@ def label_recordings(
     contents = [[*item.labels, item.content] for item in inspected if item.labels in used.index]
     attributes["data_hash"] = fingerprint([attributes, contents])
     labels = xr.Dataset({"samples": (("imu", "recording"), samples)}, coordinates, attributes)
-    if files.drawn is not None:
-        labels = labels.assign(files.drawn.sel(imu=imus, recording=numbers).data_vars)
+    if files.truth is not None:
+        labels = labels.assign(files.truth.sel(imu=imus, recording=numbers).data_vars)
     return labels
 
 
