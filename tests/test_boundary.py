@@ -13,7 +13,7 @@ from kedro.io import DatasetError
 from mlflow.exceptions import MlflowException
 
 from gyro_pipeline import boundary
-from gyro_pipeline.boundary import explanation, masked
+from gyro_pipeline.boundary import explanation, mask_passwords
 from gyro_pipeline.conventions import InputError
 
 
@@ -82,10 +82,10 @@ def test_a_fault_in_the_configuration_is_named_by_file_and_line(tmp_path, conten
 def test_passwords_in_addresses_are_masked_wherever_something_is_logged(tmp_path, caplog):
     address = "postgresql://me:s3cr@t/x@db.example:5432/runs"
     assert (
-        masked(f"no answer: {address}, ")
+        mask_passwords(f"no answer: {address}, ")
         == "no answer: postgresql://me:***@t/x@db.example:5432/runs, "
     )
-    assert masked("http://h:80/a?b=c@d") == "http://h:80/a?b=c@d"
+    assert mask_passwords("http://h:80/a?b=c@d") == "http://h:80/a?b=c@d"
     factory = logging.getLogRecordFactory()
     try:
         boundary.install(tmp_path)

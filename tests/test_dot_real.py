@@ -13,7 +13,7 @@ from gyro_pipeline.datasets.recordings import open_recordings
 from gyro_pipeline.parameters import ReaderOptions
 from gyro_pipeline.physics.bias import recording_mean
 from gyro_pipeline.readers import read_log
-from gyro_pipeline.recordings import cut, one_by_one
+from gyro_pipeline.recordings import cut_to_length, iterate_recordings
 
 IMUS, RATE_HZ = (1, 2, 3, 4, 5), 120.0
 START, STOP = 1, 13_000
@@ -88,7 +88,7 @@ def test_rows_are_read_as_they_are_and_those_that_are_cut_are_what_they_are_call
 def test_biases_and_noise_are_those_of_numpy_over_unmasked_rows_to_ten_digits(ran, bias, rows):
     recordings = open_recordings(ran[0].folder / "data/02_intermediate/dot_real/dot/recordings.nc")
     assert recordings.attrs["rate_hz"] == RATE_HZ
-    for imu, number, samples in one_by_one(recordings):
+    for imu, number, samples in iterate_recordings(recordings):
         measured = ~np.isnan(samples).any(axis=0)
         used = rows[imu][START : START + len(measured)][measured]
         assert number == 1
@@ -96,7 +96,7 @@ def test_biases_and_noise_are_those_of_numpy_over_unmasked_rows_to_ten_digits(ra
         found = bias.loc[imu]
         np.testing.assert_allclose(found.bias_dps, used.mean(axis=0), rtol=5e-11)
         np.testing.assert_allclose(found.sample_sigma_dps, used.std(axis=0, ddof=1), rtol=5e-11)
-    for imu, _, samples in one_by_one(cut(recordings, STOP - START)):
+    for imu, _, samples in iterate_recordings(cut_to_length(recordings, STOP - START)):
         means = rows[imu][START:STOP].mean(axis=0)
         np.testing.assert_allclose(recording_mean(samples), means, rtol=5e-11)
 
@@ -142,6 +142,6 @@ def test_copies_in_other_formats_and_units_give_the_same_biases(
     recordings, table = read_logs(source.load(), asked, tmp_path)
     assert table.outcome.tolist() == ["repaired", "kept", "kept", "kept", "kept"]
     assert recordings.attrs["rate_hz"] == pytest.approx(RATE_HZ, rel=1e-3)
-    means = [recording_mean(samples) for _, _, samples in one_by_one(recordings)]
+    means = [recording_mean(samples) for _, _, samples in iterate_recordings(recordings)]
     expected = bias.bias_dps.to_numpy().reshape(5, 3)
     np.testing.assert_allclose(means, expected, rtol=0, atol=1e-6)

@@ -282,11 +282,11 @@ def test_a_scheduler_that_is_killed_or_was_never_there_is_an_error(here, tmp_pat
 def test_what_a_cluster_is_handed_is_small(tmp_path):
     jobs = [Job("large" * 10**5, 1.0), Job("small", 1.0)]
     starts = executors._write(jobs, tmp_path / "jobs.pkl")
-    call = executors._call_written, square, str(tmp_path / "jobs.pkl"), starts[1]
+    call = executors._call_from_file, square, str(tmp_path / "jobs.pkl"), starts[1]
     assert len(pickle.dumps(call)) < 1000
     assert call[0](*call[1:])[2] == 1.0
     with pytest.raises(InputError, match="--params=execution.folder=FOLDER"):
-        executors._call_written(square, "/not/there", 0)
+        executors._call_from_file(square, "/not/there", 0)
 
 
 if __name__ == "__main__":

@@ -109,8 +109,12 @@ def test_one_line_is_enough(make):
     ("env", "params", "words"),
     [
         ("base", {"logs": FOLDER, "only": {"sensor": "ng"}}, ["logs of --params", "--env=logs"]),
-        ("mine", {"reader": {"units": "deg/s"}}, ["reader of --params", "not taken", FOLDER]),
-        ("logs", {"reader": {"unit": "deg/s"}}, ["reader.unit: unknown key; there are format"]),
+        ("mine", {"reader": {"units": "deg/s"}}, ["reader of --params", "not used", FOLDER]),
+        (
+            "logs",
+            {"reader": {"unit": "deg/s"}},
+            ["reader.unit: unknown key; expected one of format"],
+        ),
         ("logs", {"log": FOLDER}, ["log: unknown key"]),
         ("logs", {"logs": "nowhere"}, ["nowhere: no such folder"]),
         (
@@ -154,7 +158,7 @@ def test_one_short_recording_of_a_sensor_with_studies_that_ask_for_more(make):
     check(project.run_here("ground_truth", "mine"), [(1, 1)], seconds=20)
     refused = project.run_here("real2real", "mine")
     assert refused.code == 1
-    assert "studies.real2real.dot: 12 real gyroscopes asked, dot has 3" in refused.output
+    assert "studies.real2real.dot: 12 real gyroscopes needed, dot has 3" in refused.output
 
 
 def test_without_times_the_rate_is_asked_for_and_taken(make):

@@ -6,7 +6,7 @@ from pydantic import ValidationError
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.parameters import Parameters
-from gyro_pipeline.session import checked
+from gyro_pipeline.session import parse_parameters
 from gyro_pipeline.settings import CONFIG_LOADER_ARGS
 from gyro_pipeline.studies import check_possible
 
@@ -28,12 +28,12 @@ def loaded():
 def refusal(parameters):
     """What a user is told about parameters, before any pipeline is made."""
     with pytest.raises(InputError) as refused:
-        checked(parameters)
+        parse_parameters(parameters)
     return str(refused.value)
 
 
 def test_the_configuration_of_this_project_is_accepted(loaded):
-    assert checked(loaded()) == Parameters(**loaded())
+    assert parse_parameters(loaded()) == Parameters(**loaded())
 
 
 def of_study(name, **changes):
@@ -72,10 +72,10 @@ REFUSED = [
     (
         of_study("estimators", estimators=["mean", "mean"]),
         "studies.estimators:",
-        "estimators: ['mean', 'mean'] names one of them twice",
+        "estimators: expected different values, got one of them twice in ['mean', 'mean']",
     ),
     (of_study("leakage", strides_s=[1, 0]), "studies.leakage.strides_s.1:", "greater than 0"),
-    (of_study("leakage", strides_s=[1, 1]), "studies.leakage:", "names one of them twice"),
+    (of_study("leakage", strides_s=[1, 1]), "studies.leakage:", "got one of them twice"),
     (
         of_study("leakage", also={"leave_one_device_out": ["mean"]}),
         "studies.leakage:",
@@ -90,7 +90,7 @@ REFUSED = [
     ({"training": {"learning_rate": 2.0}}, "training.learning_rate:", "less than or equal to 1"),
     ({"training": {"stop_below": 5}}, "training:", "stop_below: 5 leaves no epoch to train"),
     ({"seeds": [-1]}, "seeds.0:", "greater than or equal to 0"),
-    ({"reader": {"unit": "deg/s"}}, "reader.unit:", "unknown key; there are format, "),
+    ({"reader": {"unit": "deg/s"}}, "reader.unit:", "unknown key; expected one of format, "),
 ]
 
 
@@ -138,22 +138,22 @@ ASKED = {
     "real gyroscopes": (
         {"sensors": {"dot": {"imus": 1}}},
         "augmentation",
-        "studies.augmentation.dot: 12 real gyroscopes asked, dot has 3 (its imus: 1)",
+        "studies.augmentation.dot: 12 real gyroscopes needed, dot has 3 (imus: 1)",
     ),
     "virtual gyroscopes": (
         {"virtual_gyros": {"imus": 4}},
         "augmentation",
-        "studies.augmentation.sparkfun: 24 virtual gyroscopes asked, virtual_gyros.imus makes 12",
+        "studies.augmentation.sparkfun: 24 virtual gyroscopes needed, virtual_gyros.imus makes 12",
     ),
     "windows": (
         {"sensors": {"dot": {"recording_s": 20}}},
         "real2real",
-        "studies.real2real.dot: 30 s windows asked, longer than a recording of dot, 20 s",
+        "studies.real2real.dot: 30 s windows needed, longer than a recording of dot, 20 s",
     ),
     "leaking windows": (
         {"studies": {"leakage": {"windows_s": [53]}}},
         "leakage",
-        "studies.leakage.memsense: 53 s windows asked, longer than a recording of memsense, 52 s",
+        "studies.leakage.memsense: 53 s windows needed, longer than a recording of memsense, 52 s",
     ),
     "estimator": (
         {"studies": {"real2real": {"estimators": ["kalman"]}}},

@@ -40,7 +40,7 @@ def test_a_second_run_says_who_is_first_waits_and_goes_on(tmp_path, caplog):
     said = caplog.text
     assert f"another run works in {path.parent}, process {first.pid} on " in said
     assert "waiting until it ends (Ctrl-C ends the wait)" in said
-    assert "this run goes on" in said
+    assert "this run continues" in said
     caplog.clear()
     with only_run(path):  # nobody holds it
         assert caplog.text == ""
@@ -67,12 +67,12 @@ def test_an_interrupt_that_python_could_not_raise_ends_the_run_at_the_next_resul
             time.sleep(0.01)
 
     interrupts = Interrupts()
-    with pytest.raises(KeyboardInterrupt), interrupts.heard():
+    with pytest.raises(KeyboardInterrupt), interrupts.watch():
         interrupts.after_dataset_saved()
         del_me = Finaliser()
         del del_me  # "Exception ignored in"
         interrupts.after_dataset_saved()
-    with pytest.raises(KeyboardInterrupt), Interrupts().heard():
+    with pytest.raises(KeyboardInterrupt), Interrupts().watch():
         del_me = Finaliser()
         del del_me
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -81,7 +81,7 @@ def test_an_interrupt_that_python_could_not_raise_ends_the_run_at_the_next_resul
 @pytest.mark.parametrize("name", ["a?b", "x[1]", "%41", "a{1}", "c#"])
 def test_a_folder_that_others_would_misread_is_refused(tmp_path, name):
     check_folder(tmp_path / "blanks and 'quotes' and ü")
-    with pytest.raises(InputError, match="move the project to a folder without"):
+    with pytest.raises(InputError, match="move the project to a folder whose path has no such"):
         check_folder(tmp_path / name)
 
 

@@ -78,6 +78,6 @@ def test_a_deleted_study_is_shown_as_such(moved):
 
 
 def test_without_a_store_there_is_an_error_and_no_new_store(tmp_path):
-    with pytest.raises(SystemExit, match="there is no store"):
+    with pytest.raises(SystemExit, match="no such file; type --store FILE"):
         main(["--store", str(tmp_path / "mlflow.db")])
     assert list(tmp_path.iterdir()) == []

@@ -16,7 +16,7 @@ from gyro_pipeline.studies import (
     RESIDUAL_NETWORK,
     RunSpec,
     check_possible,
-    planned,
+    possible_runs,
     run_params,
     run_spec,
     run_specs,
@@ -156,9 +156,9 @@ def test_one_imu_is_the_same_in_both_methods_and_two_are_not():
 def test_a_plan_gives_its_runs_back_without_those_that_are_left_out():
     other = replace(ROW, seed=4)
     rows = [vars(row) | {"fingerprint": f"f{row.seed}"} for row in (ROW, other)]
-    for nothing in ("", None):  # as it is planned, and as a file gives it back
+    for nothing in ("", None):  # as it is possible_runs, and as a file gives it back
         plan = pd.DataFrame(rows).assign(**{LEFT_OUT: [nothing, "too few recordings"]})
-        assert planned(plan) == {"f3": ROW}
+        assert possible_runs(plan) == {"f3": ROW}
 
 
 # only

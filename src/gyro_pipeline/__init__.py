@@ -4,7 +4,7 @@ import os
 
 __version__ = "0.1.0"
 
-# MLflow reads these when it is first imported: runs send nothing over the network, and MLflow's
-# own progress stays out of theirs.
+# MLflow reads these when it is first imported. Runs send nothing over the network, and do not show
+# MLflow's messages.
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
 os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")

@@ -12,11 +12,11 @@ def main(*args: Any, **kwargs: Any) -> Any:
     """Run the project's pipelines.
 
     Args:
-        *args: Command line arguments, as a list; by default the process's own.
+        *args: Command line arguments, as a list; by default those of the process.
         **kwargs: Further options of :meth:`click.Command.main`.
 
     Returns:
-        What the run returns, in an interactive session; else the process exits with its code.
+        The result of the run in an interactive session; otherwise the process exits with its code.
     """
     package_name = Path(__file__).parent.name
     configure_project(package_name)

@@ -1,8 +1,8 @@
-"""Where every error of a run ends: as one line that says what, where, and what to type.
+"""Shows errors of a run in one line that says what is wrong, where, and what to type.
 
-Code raises :class:`InputError` where it knows more than the error itself says. What the file
-system, the run store, the configuration or a worker throws is explained here and nowhere else. Any
-other exception is a defect, of which the traceback is shown and kept.
+Code raises :class:`InputError` where it knows more than the original error says. Errors of the file
+system, the run store, the configuration and of workers are explained here and nowhere else. Any
+other exception is a defect, whose traceback is shown and stored.
 """
 
 import errno
@@ -28,68 +28,68 @@ _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
 _CONFIGURATION = re.compile(r"-packages/(kedro/config|omegaconf|yaml)/")
 _OTHER_ARGUMENTS = "must only contain arguments valid for the constructor"
-"""In Kedro's words: a key of a catalog entry is unknown, or lacking."""
+"""Part of Kedro's message about an unknown or missing key of a catalog entry."""
 
 
 def install(project: Path) -> None:
-    """Let errors that nobody catches end here, and mask passwords in all that is logged."""
+    """Explain uncaught errors, and mask passwords in everything that is logged."""
     sys.excepthook = partial(_show, project)
     if logging.getLogRecordFactory() is logging.LogRecord:
-        logging.setLogRecordFactory(_masked_record)
+        logging.setLogRecordFactory(_record_without_passwords)
 
 
-def masked(text: str) -> str:
-    """A text without the passwords in addresses."""
+def mask_passwords(text: str) -> str:
+    """Mask the passwords of addresses in a text."""
     return _PASSWORD.sub(r"\1:***@", text)
 
 
 def explanation(error: BaseException, project: Path) -> str | None:
-    """What is wrong, where, and what to type; None for a defect of ours."""
+    """Say what is wrong, where, and what to type; None for a defect of this package."""
     causes = [*_causes(error)]
     for cause in causes:
         if isinstance(cause, InputError):
-            return masked(str(cause))
-    for cause in reversed(causes):  # from what happened to who noticed
+            return mask_passwords(str(cause))
+    for cause in reversed(causes):  # from the original error on
         for kind in type(cause).__mro__:
             explain = _EXPLAINED.get(f"{kind.__module__.partition('.')[0]}.{kind.__name__}")
             if explain is not None:
-                return masked(explain(cause))
+                return mask_passwords(explain(cause))
     files = [Path(frame.f_code.co_filename) for frame, _ in traceback.walk_tb(error.__traceback__)]
     if any(_CONFIGURATION.search(file.as_posix()) for file in files):
-        return f"configuration: {_faulty_file(project / 'conf') or masked(_line(error))}"
+        return f"configuration: {_faulty_file(project / 'conf') or mask_passwords(_line(error))}"
     if _OTHER_ARGUMENTS in str(error):
-        return f"catalog: {masked(_line(error))}"
+        return f"catalog: {mask_passwords(_line(error))}"
     if isinstance(error, ValueError) and _is_about_the_command(files):
-        return masked(_line(error))
+        return mask_passwords(_line(error))
     return None
 
 
 def _show(
     project: Path, kind: type[BaseException], error: BaseException, trace: TracebackType | None
 ) -> None:
-    """In place of Python's own way to end with an error."""
-    said = explanation(error, project)
-    if said is not None:
-        logger.error("error: %s", said)
+    """Show an uncaught error, as a replacement of ``sys.excepthook``."""
+    message = explanation(error, project)
+    if message is not None:
+        logger.error("error: %s", message)
         return
-    whole = masked("".join(traceback.format_exception(kind, error, trace)))
-    sys.stderr.write(whole)
+    text = mask_passwords("".join(traceback.format_exception(kind, error, trace)))
+    sys.stderr.write(text)
     log, command = project / "data" / "defect.log", " ".join(sys.argv)
     with suppress(OSError):
-        log.write_text(masked(f"{time.strftime('%F %T')} {command}\n{whole}"))
+        log.write_text(mask_passwords(f"{time.strftime('%F %T')} {command}\n{text}"))
         logger.error("error: this is a defect; please report it with %s", log)
 
 
-def _masked_record(*arguments: Any, **options: Any) -> logging.LogRecord:
+def _record_without_passwords(*arguments: Any, **options: Any) -> logging.LogRecord:
     record = logging.LogRecord(*arguments, **options)
-    record.msg, record.args = masked(record.getMessage()), ()
+    record.msg, record.args = mask_passwords(record.getMessage()), ()
     if record.exc_info and record.exc_info[0]:
-        record.exc_text = masked("".join(traceback.format_exception(*record.exc_info)))
+        record.exc_text = mask_passwords("".join(traceback.format_exception(*record.exc_info)))
     return record
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    """An error and what it was raised from; what a worker raised is a cause as well."""
+    """An error and the errors that it was raised from, also those from a worker."""
     while error is not None:
         yield error
         error = error.__cause__
@@ -100,10 +100,10 @@ def _line(error: BaseException) -> str:
 
 
 def _of_files(error: Any) -> str:
-    """A file that cannot be read or written."""
+    """Explain why a file cannot be read or written."""
     text = _line(error)
-    found = _ERRNO_OF_HDF5.search(text)
-    number = int(found[1]) if found else error.errno
+    match = _ERRNO_OF_HDF5.search(text)
+    number = int(match[1]) if match else error.errno
     where = error.filename or "a file"
     if number in _NO_ROOM:
         reason = error.strerror or "no space left"
@@ -120,15 +120,15 @@ def _of_files(error: Any) -> str:
 
 def _of_store(error: BaseException) -> str:
     return (
-        f"the run store cannot be used ({_line(error)}); what was stored before is kept: see that "
+        f"the run store cannot be used ({_line(error)}); stored results are kept: make sure that "
         "it can be reached and written to, with space left, and type the same command again"
     )
 
 
 def _of_workers(error: BaseException) -> str:
     return (
-        f"a worker process was killed, probably as memory ran out ({_line(error)}); type the same "
-        "command again, with --params=execution.workers=1 to use less: what is finished is kept"
+        f"a worker process was killed, probably because memory ran out ({_line(error)}); type the "
+        "same command with --params=execution.workers=1 to use less: finished work is kept"
     )
 
 
@@ -149,11 +149,11 @@ _EXPLAINED: dict[str, Callable[[Any], str]] = {
     "sqlite3.Error": _of_store,
     "mlflow.MlflowException": _of_store,
 }
-"""By package and class: nothing is imported for an error that does not come."""
+"""Explanations by package and class name, so that no package is imported for them."""
 
 
 def _faulty_file(conf: Path) -> str | None:
-    """The first file of a configuration that cannot be read, and where in it."""
+    """Name the first configuration file that cannot be read, and the line."""
     from omegaconf import DictConfig, OmegaConf  # noqa: PLC0415
 
     for path in sorted(conf.rglob("*.yml")):
@@ -172,9 +172,9 @@ def _faulty_file(conf: Path) -> str | None:
 
 
 def _is_about_the_command(files: list[Path]) -> bool:
-    """Whether Kedro itself refused what it was asked for, before a node ran."""
+    """Whether Kedro itself refused the command, before a node ran."""
     import kedro  # noqa: PLC0415
 
-    kedros = Path(kedro.__file__).parent
-    in_runner = any(file.is_relative_to(kedros / "runner") for file in files)
-    return bool(files) and files[-1].is_relative_to(kedros) and not in_runner
+    package = Path(kedro.__file__).parent
+    in_runner = any(file.is_relative_to(package / "runner") for file in files)
+    return bool(files) and files[-1].is_relative_to(package) and not in_runner

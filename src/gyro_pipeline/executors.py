@@ -1,4 +1,4 @@
-"""Running pure jobs one after the other, in one process per core, or on a cluster."""
+"""Runs pure jobs one after the other, in one process per core, or on a cluster."""
 
 import logging
 import os
@@ -25,11 +25,11 @@ logger = logging.getLogger(__name__)
 _LOG_EVERY_S = 30
 _POLL_S = 1.0
 _AHEAD = 2
-"""Jobs of each thread of a cluster that are given out before results are taken."""
+"""Jobs per thread of a cluster that are submitted before results are collected."""
 
 
 class Job(Protocol):
-    """What an executor needs to know of a job."""
+    """The interface of a job."""
 
     @property
     def work(self) -> float:
@@ -48,25 +48,25 @@ def run_jobs(
     noun: str = "jobs",
     at_once: int = 1,
 ) -> Iterator[tuple[J, R]]:
-    """Run ``function(job)`` for every job and yield results as they are there.
+    """Run ``function(job)`` for every job and yield results as they become available.
 
-    The longest jobs start first, so that the last ones do not wait. Processes are started afresh,
-    never forked (a fork after torch used threads can deadlock), and end with this one, however it
-    ends.
+    The longest jobs start first, so that none of them runs alone at the end. Processes are spawned,
+    never forked (a fork after torch used threads can deadlock), and end with this process, however
+    it ends.
 
     Args:
-        jobs: Picklable, independent of each other.
-        function: At module level.
-        execution: ``serial``, ``dask``, or else processes; how many workers.
-        label: Names the work in progress lines.
-        noun: What the jobs are, for the same lines.
-        at_once: How many short ones go to a process together.
+        jobs: Picklable jobs, independent of each other.
+        function: A function at module level.
+        execution: The executor (``serial``, ``dask``, or else processes) and number of workers.
+        label: Name of the work in progress messages.
+        noun: Name of the jobs in progress messages.
+        at_once: Number of short jobs that are sent to a process together.
 
     Yields:
         A job and its result.
 
     Raises:
-        InputError: A process or the cluster was lost; what was yielded before is not.
+        InputError: A process or the cluster was lost; earlier results remain valid.
     """
     ordered = sorted(jobs, key=lambda job: job.work, reverse=True)
     if not ordered:
@@ -78,21 +78,23 @@ def run_jobs(
         workers = 1 if serial else min(execution.workers or available_cores(), len(ordered))
         logger.info("%s: %d %s on %d processes", label, len(ordered), noun, workers)
         results = _in_processes(ordered, function, workers, at_once)
-    with closing(results):  # now, not when it is collected: it ends the workers
-        for number, result in _shown(results, [job.work for job in ordered], label, noun):
+    with closing(results):  # at once rather than by garbage collection, since it ends the workers
+        for number, result in _with_progress(results, [job.work for job in ordered], label, noun):
             yield ordered[number], result
 
 
 def available_cores() -> int:
-    """Cores this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 Numbered = Generator[tuple[int, R], None, None]
 
 
-def _shown(results: Numbered[R], works: Sequence[float], label: str, noun: str) -> Numbered[R]:
-    """The results, with a bar on a terminal and a line every half minute elsewhere."""
+def _with_progress(
+    results: Numbered[R], works: Sequence[float], label: str, noun: str
+) -> Numbered[R]:
+    """Show progress: a bar on a terminal, elsewhere a line every half minute."""
     started = logged = time.monotonic()
     done = count = 0.0
     form = "{desc} {percentage:3.0f}%|{bar}| {elapsed}, {remaining} left"
@@ -103,8 +105,8 @@ def _shown(results: Numbered[R], works: Sequence[float], label: str, noun: str) 
             if bar.disable and time.monotonic() - logged >= _LOG_EVERY_S:
                 logged = time.monotonic()
                 left_s = (logged - started) * (sum(works) / done - 1)
-                told = label, count, len(works), noun, 100 * done / sum(works), _clock(left_s)
-                logger.info("%s: %d of %d %s done, %.0f %%, about %s left", *told)
+                values = label, count, len(works), noun, 100 * done / sum(works), _clock(left_s)
+                logger.info("%s: %d of %d %s done, %.0f %%, about %s left", *values)
             yield number, result
     logger.info("%s: %d %s in %s", label, count, noun, _clock(time.monotonic() - started))
 
@@ -127,8 +129,8 @@ def _in_processes(
         yield from results
     except BrokenProcessPool as error:
         raise InputError(
-            "a worker process was killed, perhaps since memory ran out; try fewer, with "
-            "--params=execution.workers=1; what has ended is stored, and not done again"
+            "a worker process was killed, perhaps because memory ran out; type the same command "
+            "with --params=execution.workers=1; finished work is stored and not repeated"
         ) from error
     finally:
         results.close()
@@ -140,7 +142,7 @@ def _call(function: Callable[[J], R], number: int, job: J) -> tuple[int, R]:
 
 @contextmanager
 def _no_interrupts() -> Iterator[None]:
-    """Processes that are started meanwhile leave Ctrl-C to this one."""
+    """Let processes that start inside the block ignore Ctrl-C, which this process handles."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -161,10 +163,10 @@ def _end_with(parent: int) -> None:
 def _on_cluster(
     jobs: Sequence[J], function: Callable[[J], R], execution: Execution, label: str
 ) -> Numbered[R]:
-    """Results from the workers of a dask scheduler, a few jobs for each of them at a time.
+    """Run jobs on the workers of a dask scheduler, with a few jobs per worker at a time.
 
-    A job goes there as the name of a file and a number, and is repeated where a worker is lost, as
-    it is pure. A result is handed out once.
+    A job is sent as a file name and an offset, and is repeated, as it is pure, when its worker is
+    lost. Each result is yielded once.
     """
     with _connected(execution) as client, TemporaryDirectory(dir=execution.folder) as folder:
         path = Path(folder, "jobs.pkl")
@@ -174,14 +176,14 @@ def _on_cluster(
             threads = sum(client.nthreads().values())
             while waiting and len(running) < _AHEAD * max(threads, 1):
                 number = waiting.popleft()
-                given = str(path), starts[number]
-                running[client.submit(_call_written, function, *given, pure=False)] = number
-            for future in _finished(client, [*running], label):
+                job = str(path), starts[number]
+                running[client.submit(_call_from_file, function, *job, pure=False)] = number
+            for future in _wait(client, [*running], label):
                 yield running.pop(future), future.result()
 
 
 def _write(jobs: Iterable[J], path: Path) -> list[int]:
-    """Where in the file each job begins."""
+    """Write jobs to a file and return the offset of each."""
     starts = []
     with path.open("wb") as file:
         for job in jobs:
@@ -190,25 +192,25 @@ def _write(jobs: Iterable[J], path: Path) -> list[int]:
     return starts
 
 
-def _call_written(function: Callable[[J], R], path: str, start: int) -> R:
-    """On a worker."""
+def _call_from_file(function: Callable[[J], R], path: str, start: int) -> R:
+    """Run a job from a file; this runs on a worker."""
     try:
         with open(path, "rb") as file:
             file.seek(start)
             job = pickle.load(file)
     except FileNotFoundError as error:
         raise InputError(
-            f"{error}; name a folder that all workers see: --params=execution.folder=FOLDER"
+            f"{error}; name a folder that all workers can read: --params=execution.folder=FOLDER"
         ) from error
     return function(job)
 
 
 @contextmanager
 def _connected(execution: Execution) -> Iterator[Any]:
-    """A client of the scheduler.
+    """Connect to the scheduler.
 
     Raises:
-        InputError: There is none, or it is gone.
+        InputError: The scheduler does not answer, or the connection was lost.
     """
     try:
         from distributed import CancelledError, Client, KilledWorker  # noqa: PLC0415
@@ -218,7 +220,7 @@ def _connected(execution: Execution) -> Iterator[Any]:
     try:
         client = Client(execution.scheduler, timeout=_LOG_EVERY_S)
     except OSError as error:
-        raise InputError(f"execution.scheduler: {error}; docs/cluster.md") from error
+        raise InputError(f"execution.scheduler: {error}; see docs/cluster.md") from error
     with client:
         try:
             yield client
@@ -226,18 +228,18 @@ def _connected(execution: Execution) -> Iterator[Any]:
             raise InputError(f"a job was lost with every worker that had it: {error}") from error
         except (CancelledError, CommClosedError) as error:
             raise InputError(
-                "the scheduler of the cluster is gone; start it, and this run again: what has "
-                "ended is stored, and not done again"
+                "the scheduler of the cluster is gone; start it, then this run again: finished "
+                "work is stored and not repeated"
             ) from error
 
 
-def _finished(client: Any, futures: Sequence[Any], label: str) -> Iterable[Any]:
-    """Those that have ended, of which there is at least one; meanwhile a line every half minute."""
+def _wait(client: Any, futures: Sequence[Any], label: str) -> Iterable[Any]:
+    """Wait for at least one future, with a line every half minute, and return all finished ones."""
     from distributed import wait  # noqa: PLC0415 - an extra
 
     while True:
         try:
             return wait(futures, timeout=_LOG_EVERY_S, return_when="FIRST_COMPLETED").done
         except TimeoutError:
-            workers = len(client.nthreads())  # of a scheduler that answers
-            logger.info("%s: %d jobs given out, %d workers", label, len(futures), workers)
+            workers = len(client.nthreads())  # raises if the scheduler does not answer
+            logger.info("%s: %d jobs submitted, %d workers", label, len(futures), workers)

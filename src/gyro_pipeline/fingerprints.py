@@ -1,4 +1,4 @@
-"""Hashes that decide whether a result is still the result of its inputs."""
+"""Hashes that decide whether a stored result is up to date."""
 
 import ast
 import hashlib
@@ -20,8 +20,8 @@ _THIS = __name__.partition(".")[0]
 
 def data_hash(array: np.ndarray, labels: Any) -> str:
     """Hash of an array's values and labels."""
-    described = json.dumps([array.shape, str(array.dtype), labels], sort_keys=True)
-    digest = hashlib.sha256(described.encode())
+    header = json.dumps([array.shape, str(array.dtype), labels], sort_keys=True)
+    digest = hashlib.sha256(header.encode())
     digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()[:_DIGITS]
 
@@ -31,27 +31,27 @@ def fingerprint(content: Any) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:_DIGITS]
 
 
-@cache  # of what was imported, which does not change
+@cache  # the code does not change while it runs
 def code_hash(*entries: str) -> str:
-    """Hash of what modules do, with all modules that they import, directly or not.
+    """Hash of the code of modules and of all modules that they import, directly or not.
 
-    Imports inside functions count; modules of Python and of installed packages do not. Neither do
-    comments, docstrings and layout. C sources and templates that lie beside a module count as they
-    are.
+    Imports inside functions count. Python's own modules, installed packages, comments, docstrings
+    and layout do not. C sources and templates beside a module count byte by byte.
 
     Args:
-        entries: ``package.module`` or ``package.module:Class``; of a package, all its modules.
+        entries: ``package.module`` or ``package.module:Class``; a package stands for all its
+            modules.
 
     Raises:
-        ModuleNotFoundError: There is no such module.
+        ModuleNotFoundError: A module does not exist.
     """
-    asked = [name for entry in entries for name in _members(entry.partition(":")[0])]
-    contents = {name: _version(name).encode() for name in asked if _source(name) is None}
-    for name, path in _imported(asked).items():
+    names = [name for entry in entries for name in _members(entry.partition(":")[0])]
+    contents = {name: _version(name).encode() for name in names if _source(name) is None}
+    for name, path in _imported(names).items():
         package = _package(name, path)
         contents[name], _ = _parsed(path, package)
-        beside = [file for file in path.parent.iterdir() if file.suffix in _SOURCES]
-        contents |= {f"{package}/{file.name}": file.read_bytes() for file in beside}
+        sources = [file for file in path.parent.iterdir() if file.suffix in _SOURCES]
+        contents |= {f"{package}/{file.name}": file.read_bytes() for file in sources}
     digest = hashlib.sha256()
     for name in sorted(contents):
         digest.update(b"\0".join([name.encode(), contents[name], b""]))
@@ -59,25 +59,25 @@ def code_hash(*entries: str) -> str:
 
 
 def own_code(entry: str) -> list[Path]:
-    """Files and folders of packages that a class needs, of neither this package nor installed ones.
+    """The user's files and package folders that a class needs, besides installed packages.
 
     Args:
-        entry: As for :func:`code_hash`.
+        entry: The class, as for :func:`code_hash`.
     """
     tops = {name.partition(".")[0] for name in _imported([entry.partition(":")[0]])}
     return sorted({path for top in tops - {_THIS} for path in _roots(top)})
 
 
 def _imported(names: Iterable[str]) -> dict[str, Path]:
-    """The files of modules and of all that they import, directly or not, but installed ones."""
-    paths, waiting = dict[str, Path](), [*names]
-    while waiting:
-        name = waiting.pop()
+    """The files of modules and of all modules that they import, without installed ones."""
+    paths, queue = dict[str, Path](), [*names]
+    while queue:
+        name = queue.pop()
         path = _source(name)
         if path is not None and name not in paths:
             paths[name] = path
             package = _package(name, path)
-            waiting += [package, *_parsed(path, package)[1]]
+            queue += [package, *_parsed(path, package)[1]]
     return paths
 
 
@@ -86,31 +86,31 @@ def _package(name: str, path: Path) -> str:
 
 
 def _members(name: str) -> list[str]:
-    """The module, and all modules in it if it is a package."""
+    """The module itself and, if it is a package, all its modules."""
     path = _source(name)
     if path is None and importlib.util.find_spec(name) is None:
         raise ModuleNotFoundError(f"no module {name!r}", name=name)
-    if path is None:  # installed: its version counts
+    if path is None:  # of an installed package, whose version counts
         return [name]
-    inside = path.parent.rglob("*.py") if path.name == "__init__.py" else []
-    parts = [file.relative_to(path.parent).with_suffix("").parts for file in inside]
+    files = path.parent.rglob("*.py") if path.name == "__init__.py" else []
+    parts = [file.relative_to(path.parent).with_suffix("").parts for file in files]
     return [name, *(".".join([name, *part]) for part in parts if part[-1] != "__init__")]
 
 
 def _version(name: str) -> str:
-    """Name and version of the package that an installed module is of."""
+    """Name and version of the installed package that has a module."""
     packages = packages_distributions().get(name.partition(".")[0], [])
     return ", ".join(f"{package} {version(package)}" for package in packages)
 
 
 def _source(name: str) -> Path | None:
-    """The file of a module, which is not imported; None of one that is installed or not there."""
+    """The file of a module, found without importing it; None if installed or non-existent."""
     first, *rest = name.split(".")
-    for path in _roots(first):
-        if not rest and path.is_file():
-            return path
-        place = path.joinpath(*rest)
-        for file in (place / "__init__.py", place.with_suffix(".py")):
+    for root in _roots(first):
+        if not rest and root.is_file():
+            return root
+        stem = root.joinpath(*rest)
+        for file in (stem / "__init__.py", stem.with_suffix(".py")):
             if file.is_file():
                 return file
     return None
@@ -118,32 +118,30 @@ def _source(name: str) -> Path | None:
 
 @cache
 def _roots(name: str) -> tuple[Path, ...]:
-    """The file of a module that is in no package, or the folders of a package; none if installed.
+    """The file of a top-level module or the folders of a package; empty if it is installed.
 
-    This package counts wherever it is.
+    This package is never taken as installed.
     """
     spec = importlib.util.find_spec(name) if name else None
     if spec is None:
         return ()
     folders = spec.submodule_search_locations
-    found = [Path(place) for place in ([spec.origin] if folders is None else folders) if place]
-    return tuple(path for path in found if name == _THIS or not _installed(path))
+    paths = [Path(path) for path in ([spec.origin] if folders is None else folders) if path]
+    return tuple(path for path in paths if name == _THIS or not _installed(path))
 
 
 def _installed(path: Path) -> bool:
-    """Whether it is of Python or of an installed package."""
-    python = [Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib")]
-    of_python = any(path.is_relative_to(place) for place in python)
-    return (
-        of_python or not path.exists() or bool({"site-packages", "dist-packages"} & {*path.parts})
-    )
+    """Whether a path is part of Python or of an installed package."""
+    python = [sysconfig.get_path(name) for name in ("stdlib", "platstdlib")]
+    in_packages = not {"site-packages", "dist-packages"}.isdisjoint(path.parts)
+    return in_packages or not path.exists() or any(map(path.is_relative_to, python))
 
 
 @cache
 def _parsed(path: Path, package: str) -> tuple[bytes, tuple[str, ...]]:
-    """What a module does, without docstrings, and the full names of all that it imports.
+    """The syntax tree of a module without docstrings, and the full names that it imports.
 
-    Names of attributes are among them, which are no modules.
+    Some of these names are attributes of modules.
     """
     tree, imported = ast.parse(path.read_text(encoding="utf-8")), []
     for node in ast.walk(tree):
@@ -155,11 +153,11 @@ def _parsed(path: Path, package: str) -> tuple[bytes, tuple[str, ...]]:
             module = ".".join([*base, *filter(None, [node.module])])
             imported += [module, *(f"{module}.{alias.name}" for alias in node.names)]
         elif isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-            node.body = [statement for statement in node.body if not _is_text(statement)]
+            node.body = [statement for statement in node.body if not _is_docstring(statement)]
     return ast.dump(tree).encode(), tuple(imported)
 
 
-def _is_text(statement: ast.stmt) -> bool:
-    """Whether it is a docstring, be it of a module, a class, a function or a constant."""
+def _is_docstring(statement: ast.stmt) -> bool:
+    """Whether a statement documents a module, a class, a function or a constant."""
     value = statement.value if isinstance(statement, ast.Expr) else None
     return isinstance(value, ast.Constant) and isinstance(value.value, str)

@@ -1,6 +1,6 @@
-"""What happens around a run: checks before it, provenance for its runs, directions after it.
+"""Hooks around a run: checks before it, provenance of its results, directions after it.
 
-Every ``kedro`` command imports this file, so it imports what is large only where it is used.
+Every ``kedro`` command imports this file, so large packages are imported where they are used.
 """
 
 import getpass
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _STAGES = "http://127.0.0.1:4141/?types=task"
-"""The seven stages as boxes, without the datasets between them, which there are for each sensor."""
+"""The seven stages as boxes, without the datasets between them, which exist for each sensor."""
 
 _WITHOUT_EFFECT = ("execution", "only")
-"""Settings that change how much is made, and how, but no number."""
+"""Settings that decide which results are computed, and how, but not their values."""
 
 
 class Preflight:
-    """Refuses what cannot end well, before any node runs."""
+    """Refuses runs that would fail, before any node runs."""
 
     def __init__(self) -> None:
         self._parameters: Parameters | None = None
@@ -45,14 +45,14 @@ class Preflight:
 
     @hook_impl
     def after_context_created(self, context: "Context") -> None:
-        """Note what the context has checked."""
+        """Keep the checked parameters."""
         self._project, self._parameters = Path(context.project_path), context.parameters
 
-    @hook_impl(tryfirst=True)  # before any dataset is made
+    @hook_impl(tryfirst=True)  # before any dataset is created
     def before_pipeline_run(
         self, run_params: dict[str, Any], pipeline: "Pipeline", catalog: "CatalogProtocol"
     ) -> None:
-        """Check what these pipelines ask for, and that every result can be written."""
+        """Check the studies, the logs, the run store, stored inputs and the paths of results."""
         from gyro_pipeline.datasets.atomic import check_writable, remove_leftovers  # noqa: PLC0415
         from gyro_pipeline.datasets.stored import StoredFile  # noqa: PLC0415
         from gyro_pipeline.datasets.tracked_runs import TrackedRuns  # noqa: PLC0415
@@ -70,8 +70,8 @@ class Preflight:
         for folder in sorted({path.parent for path in outputs}):
             remove_leftovers(folder)
         settings = _settings(self._parameters)
-        _hand_over(settings, pipeline, catalog)
-        sensor = self._parameters.only.sensor  # of others a report shows what is there
+        _set_provenance(settings, pipeline, catalog)
+        sensor = self._parameters.only.sensor  # a report shows stored results of all others
         for name in sorted(pipeline.inputs()):
             dataset = catalog.get(name)
             if isinstance(dataset, StoredFile) and sensor in (None, *name.split(".")):
@@ -81,45 +81,45 @@ class Preflight:
     def after_pipeline_run(
         self, run_result: dict[str, Any], pipeline: "Pipeline", catalog: "CatalogProtocol"
     ) -> None:
-        """Say where the results are and how to look at them."""
+        """Log where the results are and how to look at them."""
         reports = pipeline.all_outputs() & {"reporting.report"}
         for path in (path for name in reports for path in _paths(catalog.get(name))):
             logger.info("tables and figures: %s", _relative(path.parent, self._project))
             logger.info("report:             %s", _relative(path, self._project))
-        if not reports:  # no runs either
-            ends = (".raw_logs.quality", ".ground_truth.bias")
-            for name in sorted(name for name in pipeline.all_outputs() if name.endswith(ends)):
+        if not reports:
+            tables = (".raw_logs.quality", ".ground_truth.bias")
+            for name in sorted(name for name in pipeline.all_outputs() if name.endswith(tables)):
                 for path in _paths(catalog.get(name)):
                     logger.info("table:              %s", _relative(path, self._project))
-        if run_result:  # where nothing was run, nothing is new
+        if run_result:  # empty where no node ran
             for link in _run_links(catalog.get(name) for name in sorted(pipeline.datasets())):
                 logger.info("compare runs:       %s", link)
         logger.info("see the lineage:    kedro viz, then %s", _STAGES)
 
 
 class Provenance:
-    """Marks every new run with the code, packages, settings and command that made it."""
+    """Tags every new run with the code, packages, settings and command behind it."""
 
     def __init__(self) -> None:
-        self._changed = frozenset[str]()
+        self._changed_settings = frozenset[str]()
 
     @hook_impl
     def after_context_created(self, context: "Context") -> None:
         """Compare the settings of runs with those of ``conf/base``."""
         import yaml  # noqa: PLC0415
 
-        # not by a second loader, whose globals would take the place of the first one's
-        files = Path(context.config_loader.conf_source, "base", "parameters").glob("*.yml")
+        # a second configuration loader would replace the globals of the first
+        folder = Path(context.config_loader.conf_source, "base", "parameters")
         base: dict[str, Any] = {}
-        for path in files:
+        for path in folder.glob("*.yml"):
             base |= yaml.safe_load(path.read_text())
-        self._changed = _changed(base, context.given)
+        self._changed_settings = _changed_settings(base, context.configuration)
 
     @hook_impl
     def before_pipeline_run(
         self, run_params: dict[str, Any], pipeline: "Pipeline", catalog: "CatalogProtocol"
     ) -> None:
-        """Hand the tags to the datasets that create runs."""
+        """Pass the tags to the datasets that create runs."""
         from gyro_pipeline.datasets.tracked_runs import TrackedRuns  # noqa: PLC0415
 
         project = Path(run_params["project_path"])
@@ -138,43 +138,45 @@ class Provenance:
             dataset = catalog.get(name)
             if isinstance(dataset, TrackedRuns):
                 dataset.provenance |= tags
-                dataset.changed = self._changed
+                dataset.changed = self._changed_settings
 
 
 def _settings(parameters: "Parameters") -> dict[str, Any]:
-    """All parameters, and each study by the name that nodes ask for it by, as JSON holds them."""
-    given = parameters.model_dump(mode="json")
-    return given | {f"studies.{name}": study for name, study in given["studies"].items()}
+    """All parameters as JSON holds them, and each study also under its name in the catalog."""
+    groups = parameters.model_dump(mode="json")
+    return groups | {f"studies.{name}": study for name, study in groups["studies"].items()}
 
 
-def _hand_over(given: dict[str, Any], pipeline: "Pipeline", catalog: "CatalogProtocol") -> None:
-    """Tell each stored file with which settings, and from which other ones, it is made."""
+def _set_provenance(
+    parameters: dict[str, Any], pipeline: "Pipeline", catalog: "CatalogProtocol"
+) -> None:
+    """Set, for each stored file, the settings and the stored files that it depends on."""
     from gyro_pipeline.datasets.stored import StoredFile  # noqa: PLC0415
 
-    passed: dict[str, tuple[dict[str, Any], list[StoredFile]]] = {}  # on in memory
+    in_memory: dict[str, tuple[dict[str, Any], list[StoredFile]]] = {}
     for node in pipeline.nodes:
         names = [name.removeprefix("params:") for name in node.inputs if name.startswith("params:")]
-        settings = {name: given[name] for name in names if name not in _WITHOUT_EFFECT}
+        settings = {name: parameters[name] for name in names if name not in _WITHOUT_EFFECT}
         sources = []
         for name in node.inputs:
             if isinstance(source := catalog.get(name), StoredFile):
                 sources.append(source)
-            elif name in passed:
-                settings |= passed[name][0]
-                sources += passed[name][1]
+            elif name in in_memory:
+                settings |= in_memory[name][0]
+                sources += in_memory[name][1]
         for name in node.outputs:
             if isinstance(dataset := catalog.get(name), StoredFile):
                 dataset.settings, dataset.sources = settings, sources
             else:
-                passed[name] = settings, sources
+                in_memory[name] = settings, sources
 
 
-def _changed(base: Mapping[str, Any], given: Mapping[str, Any]) -> frozenset[str]:
+def _changed_settings(base: Mapping[str, Any], configuration: Mapping[str, Any]) -> frozenset[str]:
     """Names of the settings of runs that differ from those of ``conf/base``."""
     return frozenset(
         f"virtual_{key}" if group == "virtual_gyros" else key
         for group in ("splits", "virtual_gyros", "training")
-        for key, value in (given.get(group) or {}).items()
+        for key, value in (configuration.get(group) or {}).items()
         if base.get(group, {}).get(key) != value
     )
 
@@ -182,25 +184,25 @@ def _changed(base: Mapping[str, Any], given: Mapping[str, Any]) -> frozenset[str
 def _check_logs_are_read(
     parameters: "Parameters", project: Path, pipeline: "Pipeline", catalog: "CatalogProtocol"
 ) -> None:
-    """Refuse a folder of logs that nothing reads, rather than to run on other recordings."""
-    asked: dict[str, Any] = {}
+    """Refuse a folder of logs that no catalog entry reads, instead of using other recordings."""
+    options: dict[str, Any] = {}
     if parameters.logs is not None:
-        asked["path"] = str(project / parameters.logs)
+        options["path"] = str(project / parameters.logs)
     if parameters.reader is not None:
-        asked["reader"] = parameters.reader.model_dump(exclude_defaults=True)
-    sources = [name for name in pipeline.inputs() if name.endswith(".raw_logs.files")]
-    read = [source._describe() for name in sources if (source := catalog.get(name))]
-    if read and not any(asked.items() <= source.items() for source in read):
-        given = [name for name in ("logs", "reader") if getattr(parameters, name) is not None]
+        options["reader"] = parameters.reader.model_dump(exclude_defaults=True)
+    names = [name for name in pipeline.inputs() if name.endswith(".raw_logs.files")]
+    sources = [source._describe() for name in names if (source := catalog.get(name))]
+    if sources and not any(options.items() <= source.items() for source in sources):
+        params = [name for name in ("logs", "reader") if getattr(parameters, name) is not None]
         raise InputError(
-            f"{' and '.join(given)} of --params: not taken by what is read here, "
-            f"{', '.join(source['path'] for source in read)}; "
-            "type --env=logs --params=logs=FOLDER, or give it in a catalog entry of your own"
+            f"{' and '.join(params)} of --params: not used by this environment, which reads "
+            f"{', '.join(source['path'] for source in sources)}; "
+            "type --env=logs --params=logs=FOLDER, or write a catalog entry"
         )
 
 
 def _run_links(datasets: Iterable[Any]) -> list[str]:
-    """Where to look at the runs of each study."""
+    """How to look at the runs of each study."""
     from gyro_pipeline.datasets.tracked_runs import (  # noqa: PLC0415
         USER_INTERFACE,
         TrackedRuns,
@@ -223,11 +225,11 @@ def _user() -> str:
 
 
 def _paths(dataset: Any) -> list[Path]:
-    """Where a dataset is stored; nowhere if it is kept in memory."""
-    described = dataset._describe()
-    if "dataset_type" in described:  # a folder of files of any name
-        return [Path(described["path"], "*")]
-    return [Path(described[key]) for key in ("filepath", "path") if key in described]
+    """The path of a dataset; empty for a dataset in memory."""
+    description = dataset._describe()
+    if "dataset_type" in description:  # a folder of files with any name
+        return [Path(description["path"], "*")]
+    return [Path(description[key]) for key in ("filepath", "path") if key in description]
 
 
 def _relative(path: Path, project: Path) -> Path:
@@ -239,10 +241,10 @@ def _file_hash(path: Path) -> str:
 
 
 def _version(project: Path) -> dict[str, str]:
-    """The commit of the project, and whether files differ from it; unknown if git cannot say."""
+    """Tags for the commit of the project and for uncommitted changes; unknown without git."""
     tags = dict.fromkeys(("mlflow.source.git.commit", "git_dirty"), "unknown")
     top = _git(project, "rev-parse", "--show-toplevel")
-    if top is None or Path(top).resolve() != project.resolve():  # none, or of another project
+    if top is None or Path(top).resolve() != project.resolve():  # a checkout of another project
         return tags
     commit, changes = _git(project, "rev-parse", "HEAD"), _git(project, "status", "--porcelain")
     if commit is None or changes is None:
@@ -251,10 +253,10 @@ def _version(project: Path) -> dict[str, str]:
 
 
 def _git(project: Path, *arguments: str) -> str | None:
-    """What git says; None where the project is no checkout of this user, or git is absent."""
+    """The output of git; None where git is absent or fails, e.g. as the project is no checkout."""
     command = ["git", "-C", str(project), *arguments]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        git = subprocess.run(command, capture_output=True, text=True, check=False)
     except OSError:
         return None
-    return done.stdout.strip() if done.returncode == 0 else None
+    return git.stdout.strip() if git.returncode == 0 else None

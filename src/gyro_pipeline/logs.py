@@ -1,7 +1,7 @@
 """Raw logs: the contract between the sources, the quality control and the raw-logs stage.
 
-A source lists its recordings without reading them. Each is read once, in whichever process inspects
-it, and what is kept of it is stored before others are read, so that few are in memory at a time.
+A source lists its recordings without reading them. Each recording is read once, by the process that
+inspects it, and is stored before others are read, so that few recordings are in memory at a time.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,18 +15,18 @@ if TYPE_CHECKING:
     import xarray as xr
 
 KEPT, REPAIRED, REJECTED = "kept", "repaired", "rejected"
-"""How a finding, and a recording, can end."""
+"""Outcomes of a finding and of a recording."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that was noticed about a recording.
+    """A result of a check of a recording.
 
     Attributes:
-        check: What looked, in two or three words, such as ``zero rows`` or ``sample rate``.
+        check: Name of the check in two or three words, such as ``zero rows`` or ``sample rate``.
         outcome: KEPT, REPAIRED or REJECTED.
-        detail: What was found, where (data rows of the file, from 0), and what was cut or why it
-            cannot be used; a sentence without a full stop.
+        detail: What the check found, where (data rows of the file, from 0), and what was cut or why
+            the recording is unusable; a sentence without a full stop.
     """
 
     check: str
@@ -36,19 +36,17 @@ class Finding:
 
 @dataclass(frozen=True)
 class Log:
-    """One recording of one IMU, as its file has it.
+    """The contents of a file for one recording of one IMU.
 
     Attributes:
-        samples: (n, 3), float64, or float32 where they were stored so; deg/s; may hold NaN and
-            infinity.
-        rate_hz: Measured from timestamps; None where there are none.
+        samples: (n, 3), deg/s, float64, or float32 if stored as such; may contain NaN and infinity.
+        rate_hz: Sample rate measured from timestamps; None without timestamps.
         gap_rows: Rows before which samples are missing or out of order, increasing; a stretch
-            between two of them is gap-free. Findings say why.
-        temperature_c: (n,), degrees Celsius; None where the file has none.
-        acceleration_g: (n, 3), g; None where the file has none.
-        rows: (n,), the row of the file that each sample is from, increasing; None where every row
-            is a sample.
-        findings: Of the reading.
+            between two of them is gap-free. Findings give the reasons.
+        temperature_c: (n,), degrees Celsius; None if the file has none.
+        acceleration_g: (n, 3), g; None if the file has none.
+        rows: (n,), the row of the file of each sample, increasing; None if every row is a sample.
+        findings: Findings of the reader.
     """
 
     samples: NDArray[np.floating]
@@ -65,13 +63,13 @@ class LogEntry:
     """A recording that a source lists.
 
     Attributes:
-        imu: From 1.
-        recording: From 1.
-        where: For messages: the file, and where in it.
-        read: Reads it; can be pickled. Raises InputError where the file cannot be used.
-        size: Bytes to read, about: what reading and inspecting it costs.
-        key: Hash of all that ``read`` depends on: the file as it is now, and how it is read.
-        split: ``train`` or ``test``, where the source came split.
+        imu: Number of the IMU, from 1.
+        recording: Number of the recording, from 1.
+        where: The file and the position in it, for messages.
+        read: Reads the recording; picklable. Raises InputError if the file cannot be used.
+        size: Approximate number of bytes, the cost of reading and inspecting the recording.
+        key: Hash of everything that ``read`` depends on: the file's state and the options.
+        split: ``train`` or ``test`` if the source comes split.
     """
 
     imu: int
@@ -85,15 +83,15 @@ class LogEntry:
 
 @dataclass(frozen=True)
 class Logs:
-    """What a source gives.
+    """The logs of a source.
 
     Attributes:
-        sensor: Its name.
-        source: Where the logs come from, as stored paths name it.
-        simulated: Whether they are.
-        rate_hz: Expected; measured ones are compared with it. None where it is not known.
-        entries: The recordings, by IMU and number.
-        drawn: What was drawn for simulated recordings, to be stored with them.
+        sensor: Name of the sensor.
+        source: Name of the source, as in stored paths.
+        simulated: Whether the logs are simulated.
+        rate_hz: Expected sample rate, which measured rates are compared with; None if unknown.
+        entries: The recordings, ordered by IMU and number.
+        truth: True biases and noise of simulated recordings, to be stored with them.
     """
 
     sensor: str
@@ -101,7 +99,7 @@ class Logs:
     simulated: bool
     rate_hz: float | None
     entries: Sequence[LogEntry]
-    drawn: "xr.Dataset | None" = None
+    truth: "xr.Dataset | None" = None
 
 
 @dataclass(frozen=True)
@@ -109,7 +107,7 @@ class Listing:
     """The recordings that are about to be read.
 
     Attributes:
-        keys: By IMU and recording, a hash of all that a :class:`Recording` depends on.
+        keys: Hash of everything that a :class:`Recording` depends on, by IMU and recording.
     """
 
     keys: Mapping[tuple[int, int], str]
@@ -117,25 +115,25 @@ class Listing:
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording that was read and judged.
+    """A recording after reading and quality control.
 
     Attributes:
-        imu: From 1.
-        recording: From 1.
-        where: For messages: the file, and where in it.
-        key: As in :class:`Listing`; empty where reading it again may end otherwise.
+        imu: Number of the IMU, from 1.
+        recording: Number of the recording, from 1.
+        where: The file and the position in it, for messages.
+        key: As in :class:`Listing`; empty if reading again may have another outcome.
         outcome: KEPT, REPAIRED or REJECTED.
-        findings: Why.
-        rows: Samples of its log: rows of the file, but for those that the reading left out.
-        start: First of them that is kept, counted from 0.
-        stop: The one after the last that is kept.
-        masked: How many between them hold no measurement.
-        rate_hz: Measured from timestamps; None where there are none, or it cannot be read.
-        content: Hash of the samples that are kept (:func:`~gyro_pipeline.fingerprints.data_hash`);
-            two recordings of one hash are one.
-        variables: What is kept, float32, by its name in the recordings: ``angular_rate``
+        findings: The findings behind the outcome.
+        rows: Number of samples of the log: rows of the file without those that the reader left out.
+        start: First kept sample, from 0.
+        stop: End of the kept samples, exclusive.
+        masked: Number of masked samples between them.
+        rate_hz: Sample rate measured from timestamps; None without timestamps, or if unreadable.
+        content: Hash of the kept samples (:func:`~gyro_pipeline.fingerprints.data_hash`), by which
+            copies of a recording are detected.
+        variables: Kept values, float32, by their names in the recordings: ``angular_rate``
             (axis, sample), NaN where masked; ``temperature_c`` (sample) and ``acceleration_g``
-            (axis, sample) where the file has them. Empty for a rejected recording.
+            (axis, sample) if the file has them. Empty for a rejected recording.
     """
 
     imu: int
@@ -153,25 +151,25 @@ class Recording:
     variables: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
 
     @property
-    def place(self) -> tuple[int, int]:
+    def labels(self) -> tuple[int, int]:
         """IMU and recording."""
         return self.imu, self.recording
 
 
 def printable(text: str) -> str:
-    """A text that any terminal and file can show: bytes that are no UTF-8 and controls escaped."""
+    """Escape control characters and bytes that are not UTF-8, so that any file can hold them."""
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def with_recordings(recordings: "xr.Dataset") -> "xr.Dataset":
-    """Leave out IMUs of which no recording can be used, and recordings of which no IMU's can.
+    """Leave out the IMUs and the recording numbers without any usable recording.
 
     Args:
-        recordings: With ``samples`` (imu, recording), how many samples each recording has.
+        recordings: With ``samples`` (imu, recording), the number of samples of each recording.
     """
-    there = recordings["samples"].load() > 0
+    usable = recordings["samples"].load() > 0
     for dimension, other in (("imu", "recording"), ("recording", "imu")):
-        used = there.any(other).to_numpy()
-        if not used.all():  # an index of single places makes reading slow
+        used = usable.any(other).to_numpy()
+        if not used.all():  # an integer index makes reading slow
             recordings = recordings.isel({dimension: np.flatnonzero(used)})
     return recordings

@@ -1,4 +1,4 @@
-"""Tables and texts as Markdown, with everything in them escaped."""
+"""Tables and texts as escaped Markdown."""
 
 import re
 from typing import Any
@@ -11,23 +11,15 @@ _INTERVAL = re.compile(r"[-+−\d.]+ \[[-+−\d.]+, [-+−\d.]+\]")
 
 
 def escape(text: str) -> str:
-    """Write a text so that Markdown shows it as it is, on one line.
-
-    Args:
-        text: Anything, such as the name of a file.
-    """
+    """Escape a text, such as a file name, so that Markdown shows it literally, on one line."""
     return _SPECIAL.sub(lambda match: f"\\{match[0]}" if match[0] else "\\", " ".join(text.split()))
 
 
 def pipe_table(table: pd.DataFrame) -> str:
-    """Write a table as Markdown.
+    """Format a table, without its index, as a Markdown pipe table.
 
-    Args:
-        table: Its index is not written.
-
-    Returns:
-        Lines of a pipe table; numeric columns are aligned to the right. Numbers have four
-        significant digits, and what is not there is a dash.
+    Numeric columns are aligned to the right. Numbers have four significant digits, and a missing
+    value is a dash.
     """
     numeric = [pd.api.types.is_numeric_dtype(dtype) for dtype in table.dtypes]
     rules = ["---:" if right else "---" for right in numeric]
@@ -37,7 +29,7 @@ def pipe_table(table: pd.DataFrame) -> str:
 
 
 def plain(value: Any) -> str:
-    """A cell of a table that people read."""
+    """Format the value of a table cell for readers."""
     if pd.isna(value):
         return "–"
     if not isinstance(value, float):
@@ -47,6 +39,6 @@ def plain(value: Any) -> str:
 
 def _cell(value: Any) -> str:
     text = plain(value)
-    if _INTERVAL.fullmatch(text):  # which stays on one line
+    if _INTERVAL.fullmatch(text):  # keep it on one line
         return text.replace(" ", "\N{NO-BREAK SPACE}")
     return escape(text) or "–"

@@ -1,8 +1,8 @@
 """Typed parameters: every key that ``conf/*/parameters`` may hold, with its unit and source.
 
-An unknown key or a value out of bounds is refused whatever runs. What one part asks of another,
-such as a study of a sensor, is checked for the studies that are to run
-(:func:`gyro_pipeline.studies.check_possible`). Both before any node runs.
+An unknown key or a value out of bounds is refused in every run. What one part requires of another,
+for example a study of a sensor, is checked only for the studies that will run
+(:func:`gyro_pipeline.studies.check_possible`). Both checks happen before any node runs.
 """
 
 import json
@@ -32,18 +32,18 @@ Gyroscopes = Annotated[int, Field(ge=0, multiple_of=len(AXES), description="a co
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
 LEAST_BLOCKS = 10
-"""Whose means quality control compares: the scatter of fewer is not known well enough."""
+"""Fewest blocks whose means quality control compares; fewer do not determine their scatter."""
 
 
 class Parameter(BaseModel):
-    """Base of all groups: no unknown keys, numbers that are numbers and finite, no change."""
+    """Base of all groups: immutable, without unknown keys, with numbers that are finite."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
-def _refuse_twice(name: str, values: Sequence[Any]) -> None:
+def _refuse_duplicates(name: str, values: Sequence[Any]) -> None:
     if len(set(values)) < len(values):
-        raise ValueError(f"{name}: {values} names one of them twice")
+        raise ValueError(f"{name}: expected different values, got one of them twice in {values}")
 
 
 class WarmUp(Parameter):
@@ -52,7 +52,7 @@ class WarmUp(Parameter):
     amplitude_mdps: float = Field(description="its mean over power-ons, at power-on")
     spread_mdps: float = Field(ge=0, description="its standard deviation over power-ons")
     time_constant_s: Annotated[tuple[Seconds, Seconds], Strict(False)] = Field(
-        description="shortest and longest, uniform between them; one number: of all power-ons"
+        description="shortest and longest, uniform between them; one number: for all power-ons"
     )
 
     @field_validator("time_constant_s", mode="before")
@@ -69,43 +69,43 @@ class WarmUp(Parameter):
 
 
 class SimulatedNoise(Parameter):
-    """The stand-in for a sensor whose files are not at hand (sources: conf/base/globals.yml)."""
+    """Noise of a simulated sensor, the stand-in for files (sources: conf/base/globals.yml)."""
 
     noise_mdps_rts: PerAxis = Field(description="N per axis: the mean of t s scatters by N/sqrt(t)")
     turn_on_spread_mdps: PerAxis = Field(description="tau per axis: bias from power-on to power-on")
-    unit_bias_dps: float = Field(ge=0, description="unit-to-unit biases are uniform in +- this")
+    unit_bias_dps: float = Field(ge=0, description="biases of units are uniform within +- this")
     lag1_correlation: float = Field(0.0, gt=-0.5, lt=0.5, description="of successive samples")
     flicker_mdps: float = Field(0.0, ge=0, description="bias instability B; 0 is white noise")
     random_walk_mdps_per_rts: float = Field(
         0.0, ge=0, description="K: a walk from power-on, whose variance after t s is K^2 t"
     )
-    warm_up: WarmUp | None = Field(None, description="of each axis on its own; null for none")
+    warm_up: WarmUp | None = Field(None, description="drawn for each axis separately; null: none")
 
 
-def _implied_rate(given: dict[str, Any]) -> float | None:
-    """Sample rate in Hz that the counts of a sensor imply, if both are there."""
-    samples, recording_s = given.get("samples"), given.get("recording_s")
+def _implied_rate(fields: dict[str, Any]) -> float | None:
+    """Sample rate in Hz from the samples and the length of a recording, if both are set."""
+    samples, recording_s = fields.get("samples"), fields.get("recording_s")
     return samples / recording_s if samples and recording_s else None
 
 
 class Sensor(Parameter):
     """One brand of gyroscope.
 
-    Files need nothing of it, or the rate where they have no timestamps; all else describes a
-    simulated stand-in (:class:`SimulatedSensor`), and lets studies of it be checked beforehand.
+    Files need none of these values, except the rate where they have no timestamps. All others
+    describe a simulated stand-in (:class:`SimulatedSensor`) and allow studies to be checked early.
     """
 
     imus: int | None = Field(None, ge=1)
     recordings: int | None = Field(None, ge=2, description="power-ons per IMU")
     train_recordings: int | None = Field(
-        None, ge=1, description="of these, the ones in the training file"
+        None, ge=1, description="number of them in the training file"
     )
     samples: int | None = Field(None, ge=2, description="per recording and axis")
     recording_s: float | None = Field(None, gt=0, description="T, seconds (paper, section IV-A)")
     rate_hz: float | None = Field(
         default_factory=_implied_rate,
         gt=0,
-        description="expected sample rate; else samples / recording_s, or what timestamps say",
+        description="expected sample rate; null: samples / recording_s, or measured by timestamps",
     )
     simulated: SimulatedNoise | None = None
 
@@ -121,7 +121,7 @@ class Sensor(Parameter):
 
 
 class SimulatedSensor(Sensor):
-    """A sensor with all that it takes to simulate it."""
+    """A sensor with everything that a simulation needs."""
 
     imus: int = Field(ge=1)
     recordings: int = Field(ge=2)
@@ -141,15 +141,17 @@ class SimulatedSensor(Sensor):
         return self
 
 
-Column = Annotated[str | Annotated[int, Field(ge=0)], Field(description="a name, or from 0")]
+Column = Annotated[
+    str | Annotated[int, Field(ge=0)], Field(description="a name, or a number from 0")
+]
 Triple = Annotated[tuple[Column, Column, Column], Strict(False)]
 
 
 class ReaderOptions(Parameter):
-    """How the files of a logger are read; what is null comes from the header or the format.
+    """How the files of a logger are read; the header or the format decides what is null.
 
-    What the options say and what a file says of itself must agree: where they differ, the file is
-    refused, unless ``trust: options`` says which is right.
+    The options must agree with what a file says about itself. Where they differ, the file is
+    refused unless ``trust: options`` is set.
     """
 
     format: Literal[
@@ -161,24 +163,24 @@ class ReaderOptions(Parameter):
         "openlog_artemis",
         "ros_imu",
         "px4_sensor_combined",
-    ] = Field("auto", description="the vendor's (readers.FORMATS); general: none; auto: told")
+    ] = Field(
+        "auto", description="of a vendor (readers.FORMATS); general: no vendor; auto: recognised"
+    )
     columns: Triple | dict[int, Triple] | None = Field(
-        None, description="of the angular rates about x, y, z; or these of each IMU, by number"
+        None, description="angular rates about x, y, z; or a mapping from IMU numbers to these"
     )
     units: str | None = Field(
-        None, description="of the rates: any of angle per time, or raw; of the angle, of increments"
+        None, description="of the rates, angle per time or raw; with increments, of the angle"
     )
-    scale_dps: float | None = Field(
-        None, gt=0, description="deg/s in one count; with units: raw only"
-    )
-    offset: float | None = Field(None, description="count of a rate of 0; with units: raw only")
+    scale_dps: float | None = Field(None, gt=0, description="deg/s per count; with units: raw only")
+    offset: float | None = Field(None, description="count at a rate of 0; with units: raw only")
     signed_bits: int | None = Field(
-        None, ge=2, le=32, description="of signed counts that were written as unsigned ones"
+        None, ge=2, le=32, description="width of signed counts that were written as unsigned ones"
     )
     increments: bool = Field(False, description="the columns hold angles turned since the last row")
     time_column: Column | None = None
     time_units: str | Seconds | None = Field(
-        None, description="of the time column; a number: seconds a tick"
+        None, description="of the time column; a number: seconds per tick"
     )
     time_is: Literal["steps"] | None = Field(
         None, description="steps: the time column holds the time since the last row"
@@ -187,39 +189,47 @@ class ReaderOptions(Parameter):
         None, description="degrees Celsius, unless its header says another unit"
     )
     acceleration_columns: Triple | None = Field(None, description="along x, y, z")
-    acceleration_units: str | None = Field(None, description="of them, such as g, mg, m/s^2")
-    counter_column: Column | None = Field(None, description="counts packets, one a row")
+    acceleration_units: str | None = Field(None, description="such as g, mg or m/s^2")
+    counter_column: Column | None = Field(None, description="packet counter, one packet per row")
     counter_bits: int | None = Field(
-        None, ge=2, le=32, description="it starts anew after 2 to this; null: the format's, or 16"
+        None,
+        ge=2,
+        le=32,
+        description="width of the counter, which wraps; null: the format's, or 16",
     )
     trust: Literal["options"] | None = Field(
-        None, description="options: these options overrule what the file says of itself"
+        None, description="options: these options overrule what the file says about itself"
     )
-    encoding: str | None = Field(None, description="of a text; null: UTF-8 or UTF-16")
+    encoding: str | None = Field(None, description="of a text file; null: UTF-8 or UTF-16")
     delimiter: str | None = Field(
-        None, min_length=1, max_length=1, description="of a text; a blank: runs of them; null: told"
+        None,
+        min_length=1,
+        max_length=1,
+        description="of a text file; a blank: one or more blanks; null: recognised",
     )
     row: str | None = Field(
-        None, description="expression with named groups; each line that it matches is a row"
+        None, description="regular expression with named groups; each line it matches is a row"
     )
     rows: dict[Column, str | float] = Field(
         {}, description="only rows with these values in these columns, such as {sensor: 1}"
     )
     repeats: Literal["drop"] | None = Field(
-        None, description="drop: rows whose rates are those of the row before are no samples"
+        None, description="drop: a row that repeats the rates of the previous row is not a sample"
     )
-    topic: str | None = Field(None, description="of a flight log or a bag, that with the rates")
-    instance: int | None = Field(None, ge=0, description="of several sensors in such a log, from 0")
+    topic: str | None = Field(None, description="of the rates in a flight log or a bag")
+    instance: int | None = Field(
+        None, ge=0, description="of the sensor, from 0, in a flight log of several"
+    )
     largest_mb: float = Field(
-        1000.0, gt=0, description="of the values of a binary file, unpacked, at 8 bytes each"
+        1000.0, gt=0, description="size of a binary file's unpacked values, at 8 bytes each"
     )
     rate_tolerance_pct: float = Field(
-        2.0, gt=0, description="that a measured sample rate may differ from the expected one"
+        2.0, gt=0, description="by which a measured sample rate may differ from the expected one"
     )
 
     @field_validator("time_units", "acceleration_units")
     @classmethod
-    def _other_units_are_read(
+    def _units_of_time_and_acceleration_are_valid(
         cls, value: str | float | None, info: ValidationInfo
     ) -> str | float | None:
         quantity = "time" if info.field_name == "time_units" else "acceleration"
@@ -228,13 +238,13 @@ class ReaderOptions(Parameter):
         return value
 
     @model_validator(mode="after")
-    def _units_suit_what_the_columns_hold(self) -> Self:
+    def _units_suit_the_columns(self) -> Self:
         if self.units not in (None, "raw"):
             _check_unit("units", str(self.units), "angle" if self.increments else "rate")
         if (self.units == "raw") != (self.scale_dps is not None):
-            raise ValueError("units: raw and scale_dps go together: give both or none")
+            raise ValueError("units: raw and scale_dps go together: give both or neither")
         if self.offset is not None and self.units != "raw":
-            raise ValueError("offset: is of raw counts: give units: raw and scale_dps as well")
+            raise ValueError("offset: applies to raw counts: give units: raw and scale_dps as well")
         if self.increments and self.units == "raw":
             raise ValueError("increments: expected an angle in units, got raw")
         return self
@@ -245,34 +255,35 @@ def _check_unit(option: str, text: str, quantity: str) -> None:
     if unit is None or unit.quantity != quantity:
         examples = {
             "rate": "of angle per time, such as deg/s, rad/s, mdps, deg/h or rpm, or raw",
-            "angle": "of an angle, such as deg or rad, as increments are",
-            "time": "of time, such as s, ms, us or ns, or seconds a tick",
+            "angle": "of an angle, such as deg or rad, as increments are angles",
+            "time": "of time, such as s, ms, us or ns, or a number of seconds per tick",
             "acceleration": "of acceleration, such as g, mg or m/s^2",
         }
         raise ValueError(f"{option}: expected a unit {examples[quantity]}, got {text!r}")
 
 
 class Quality(Parameter):
-    """What quality control asks of a recording (gyro_pipeline.quality).
+    """Thresholds of the quality control of recordings (gyro_pipeline.quality).
 
     Other thresholds are multiples of the recording's own noise, chosen by ``false_alarm``.
     """
 
-    least_s: float = Field(gt=0, description="of samples that can be used, seconds")
+    least_s: float = Field(gt=0, description="least length of the usable samples, seconds")
     least_share: float = Field(
-        gt=0, le=1, description="of the rows between two gaps that must remain unmasked"
+        gt=0, le=1, description="least share of unmasked rows between two gaps"
     )
     false_alarm: float = Field(
         gt=0, lt=0.5, description="probability of an alarm, for each check of a recording at rest"
     )
-    block_s: float = Field(gt=0, description="of the blocks whose means are compared, seconds")
+    block_s: float = Field(gt=0, description="length of the blocks whose means are compared, s")
     least_change_dps: float = Field(
         gt=0,
-        description="of the mean within half a minute, for motion, deg/s; the bias moves by less",
+        description="change of the mean within half a minute that is motion, deg/s; a bias drifts "
+        "by less",
     )
-    shock_s: float = Field(gt=0, description="a burst at least so long, in seconds, is a motion")
+    shock_s: float = Field(gt=0, description="a burst of at least this length, seconds, is motion")
     largest_step: float = Field(
-        gt=0, description="quantisation step over noise, of a mean that can be trusted"
+        gt=0, description="largest ratio of quantisation step to noise at which means are accurate"
     )
     drift_mdps: float = Field(ge=0, description="least warm-up or drift that is reported, mdps")
     largest_noise_dps: float = Field(gt=0, description="of a sample at rest, deg/s")
@@ -280,14 +291,15 @@ class Quality(Parameter):
     length_s: float | None = Field(
         None,
         gt=0,
-        description="to which recordings are cut, and shorter ones rejected, seconds; null: they "
-        "keep their own, and studies use as many of their first samples as the shortest has",
+        description="length to which recordings are cut, seconds; shorter ones are rejected; "
+        "null: recordings keep their length, and studies cut them to a common one",
     )
     needed_pct: float = Field(
         90.0,
         gt=0,
         le=100,
-        description="of a sensor's recordings that must remain, and of the tested IMU's, percent",
+        description="least share of recordings, of a sensor and of the tested IMU, that must "
+        "remain, percent",
     )
 
     @model_validator(mode="after")
@@ -303,7 +315,7 @@ class Quality(Parameter):
 class GroundTruth(Parameter):
     """How the bias of a recording and the noise of a gyroscope are measured."""
 
-    tolerance_mdps: float = Field(gt=0, description="band that the running mean must stay within")
+    tolerance_mdps: float = Field(gt=0, description="band in which the running mean must stay")
 
 
 class VirtualGyros(Parameter):
@@ -311,7 +323,7 @@ class VirtualGyros(Parameter):
 
     imus: int = Field(ge=1, description="virtual IMUs of three gyroscopes each")
     recordings: int = Field(ge=1)
-    train_recordings: int = Field(ge=1, description="the first so many are trained on")
+    train_recordings: int = Field(ge=1, description="number of the first recordings, which train")
     turn_on_jitter_mdps: float = Field(
         ge=0, description="0: one bias for all recordings of a virtual gyroscope, as in the paper"
     )
@@ -321,22 +333,24 @@ class VirtualGyros(Parameter):
 class Splits(Parameter):
     """Which recordings train, validate and test."""
 
-    test_fraction: float = Field(gt=0, lt=1, description="of recordings, where none is given")
-    validation_recordings: int = Field(ge=0, description="of the training ones; 0: the paper's")
-    fold_validation_recordings: int = Field(ge=0, description="the same in each fold of a k-fold")
+    test_fraction: float = Field(
+        gt=0, lt=1, description="of the recordings, unless the source comes split"
+    )
+    validation_recordings: int = Field(ge=0, description="of the training ones; paper: 0")
+    fold_validation_recordings: int = Field(ge=0, description="of each fold of a k-fold")
     training_windows: Literal["all", "first"] | Seconds = Field(
         "all",
-        description="of a recording: all that do not overlap, the first alone, or, as a number, "
-        "one every so many seconds",
+        description="of a recording: all that do not overlap, only the first, or a stride in "
+        "seconds from one window to the next",
     )
     k_fold_below: int = Field(ge=0, description="fewer recordings than this: k-fold by recording")
-    leave_one_out_up_to: int = Field(ge=0, description="so many recordings: one fold each")
+    leave_one_out_up_to: int = Field(ge=0, description="up to this many recordings: one fold each")
     folds: int = Field(ge=2, description="of a k-fold that is not leave-one-out")
     split_seed: Seed
 
 
 class NetworkSizes(Parameter):
-    """What the paper leaves open of the network (section III-D)."""
+    """Sizes of the network that the paper leaves open (section III-D)."""
 
     channels: int = Field(ge=1)
     kernel: int = Field(ge=1, description="samples")
@@ -354,68 +368,68 @@ class Training(NetworkSizes):
     """The network's sizes and its schedule (paper, sections III-D and IV)."""
 
     centring: Literal["per_device", "global"] = Field(
-        description="subtract each gyroscope's own training mean, or one mean for all"
+        description="subtract each gyroscope's own training mean, or one mean of all gyroscopes"
     )
     epochs: int = Field(ge=1, le=10**6)
     batch_size: int = Field(ge=1)
     learning_rate: float = Field(gt=0, le=1, description="of Adam, at the first epoch")
     decay: float = Field(gt=0, le=1, description="factor on the learning rate ...")
-    decay_every: int = Field(ge=1, description="... after so many epochs")
+    decay_every: int = Field(ge=1, description="... after this many epochs")
     stop_below: float = Field(
         0.0,
         ge=0,
-        description="end once the learning rates still to come sum to less; 0: never early",
+        description="training ends once the remaining learning rates sum to less; 0: never early",
     )
     steps: int | None = Field(
         None,
         ge=1,
         le=10**7,
-        description="of the optimiser, at least: in place of epochs, of which the number of "
-        "windows then decides how many there are; null: epochs",
+        description="least number of optimiser steps, instead of epochs, whose number then follows "
+        "from the number of windows; null: epochs",
     )
 
     @model_validator(mode="after")
-    def _there_is_something_to_train(self) -> Self:
+    def _an_epoch_remains(self) -> Self:
         if self.steps is None:
             self.learning_rates(1)
         return self
 
     @property
     def schedule(self) -> dict[str, Any]:
-        """What all networks are trained with, whatever their options are."""
+        """The settings that all networks share, whatever their options."""
         return self.model_dump(exclude={*NetworkSizes.model_fields})
 
     def learning_rates(self, windows: int) -> np.ndarray:
-        """Learning rate of every epoch until the end, shape (epochs,), for so many windows.
+        """Learning rate of every epoch, shape (epochs,), for a number of training windows.
 
         Raises:
-            InputError: The end comes before the first epoch.
+            InputError: Training would end before the first epoch.
         """
         epochs = self.epochs
         if self.steps is not None:
             epochs = -(-self.steps // -(-windows // self.batch_size))
         rates = self.learning_rate * self.decay ** (np.arange(epochs) // self.decay_every)
-        to_come = rates[::-1].cumsum()[::-1]
-        if to_come[0] < self.stop_below:
+        remaining = rates[::-1].cumsum()[::-1]
+        if remaining[0] < self.stop_below:
             raise InputError(
                 f"stop_below: {self.stop_below:g} leaves no epoch to train, as all learning rates "
-                f"sum to {to_come[0]:.3g}; expected less"
+                f"sum to {remaining[0]:.3g}; expected less"
             )
-        return rates[to_come >= self.stop_below]
+        return rates[remaining >= self.stop_below]
 
 
 class Execution(Parameter):
-    """How the trainings are run; has no effect on their results but rounding."""
+    """How the trainings are run; this affects their results by rounding only."""
 
     executor: Literal["auto", "processes", "serial", "batched", "dask"] = Field(
-        description="many at once (on a GPU, else on the CPU), in processes or one after the other "
-        "(both on the CPU), or on the workers of a dask scheduler; auto: batched where there is a "
-        "GPU, else processes"
+        description="batched: many at once, on a GPU if there is one; processes and serial: on the "
+        "CPU, in parallel or one after the other; dask: on the workers of a scheduler; auto: "
+        "batched with a GPU, else processes"
     )
     workers: int | None = Field(ge=1, description="processes; null: one per core")
-    scheduler: str | None = Field(None, description="of dask: its address, tcp://HOST:8786")
+    scheduler: str | None = Field(None, description="address of dask's, tcp://HOST:8786")
     folder: str | None = Field(
-        None, description="of dask: one that all workers see; null: this machine's for such files"
+        None, description="for dask, visible to all workers; null: the temporary folder"
     )
 
     @model_validator(mode="after")
@@ -426,16 +440,18 @@ class Execution(Parameter):
 
 
 class Grid(Parameter):
-    """The networks one study trains on one sensor: all combinations of the lists."""
+    """The networks that a study trains on a sensor: all combinations of the lists."""
 
-    method: int = Field(ge=1, le=2, description="1: input channels; 2: training data")
+    method: int = Field(
+        ge=1, le=2, description="more gyroscopes are 1: input channels; 2: training data"
+    )
     real_gyros: list[Gyroscopes] = Field(min_length=1)
     virtual_gyros: list[Gyroscopes] = Field([0], min_length=1)
 
     @model_validator(mode="after")
-    def _possible(self) -> Self:
+    def _has_gyroscopes(self) -> Self:
         for name in ("real_gyros", "virtual_gyros"):
-            _refuse_twice(name, getattr(self, name))
+            _refuse_duplicates(name, getattr(self, name))
         if min(self.real_gyros) < len(AXES):
             raise ValueError("real_gyros: at least one IMU, 3 gyroscopes, is needed")
         if self.method == 1 and any(self.virtual_gyros):
@@ -453,8 +469,8 @@ Protocol = Literal[
 ]
 
 
-def _as_typed(value: Any) -> Any:
-    """A number where a text is one, as one number may be typed in several ways."""
+def _as_number(value: Any) -> Any:
+    """A number where a text spells one, since 1e-4 and 0.0001 are the same value."""
     try:
         return json.loads(value) if isinstance(value, str) else value
     except ValueError:
@@ -462,49 +478,49 @@ def _as_typed(value: Any) -> Any:
 
 
 class Study(Parameter):
-    """Estimators to compare, tracked in one MLflow experiment; each of the paper's has networks."""
+    """Estimators to compare, tracked in one MLflow experiment."""
 
-    experiment: str = Field(description="name of the MLflow experiment; the study's own name")
+    experiment: str = Field(description="name of the MLflow experiment: the name of the study")
     estimators: list[str] = Field(
         ["cnn"],
         min_length=1,
-        description="beside the running mean; names of gyro_pipeline.estimators, or "
+        description="besides the running mean; names of gyro_pipeline.estimators, or "
         "package.module:Class",
     )
     windows_s: list[Seconds] | None = Field(
-        None, min_length=1, description="its own; null: those of all studies"
+        None, min_length=1, description="of this study; null: those of all studies"
     )
     default: bool = Field(True, description="part of `kedro run` and `--pipeline=reporting`")
     protocol: Protocol = Field(
         "by_recording",
-        description="what tests: recordings of the first IMU, or every IMU in turn, as an unseen "
-        "device (docs/honest_protocol.md)",
+        description="the test data: recordings of the first IMU, or every IMU in turn, as an "
+        "unseen device (docs/honest_protocol.md)",
     )
     also: dict[Protocol, list[str]] = Field(
-        {}, description="further protocols, and the estimators to compare under them"
+        {}, description="further protocols, and the estimators to compare under each"
     )
     strides_s: list[Seconds] | None = Field(
         None,
         min_length=1,
-        description="from the start of one window to that of the next, seconds; null: windows do "
-        "not overlap",
+        description="from the start of a window to the start of the next, seconds; null: windows "
+        "do not overlap",
     )
     recordings: int | None = Field(
-        None, ge=2, description="of the first IMU; the first so many; null: the split decides"
+        None, ge=2, description="number of the first IMU's first recordings to use; null: all"
     )
-    folds: int | None = Field(None, ge=2, description="its own; null: those of splits")
+    folds: int | None = Field(None, ge=2, description="of this study; null: those of splits")
     training_windows: Literal["all", "first"] | Seconds | None = Field(
-        None, description="its own; null: those of splits"
+        None, description="of this study; null: those of splits"
     )
-    training: dict[str, Any] = Field({}, description="settings of training that it changes")
+    training: dict[str, Any] = Field({}, description="settings of training that the study changes")
     sweep: dict[str, list[str | float | int | bool]] = Field(
         {},
-        description="values of settings of training or options of networks, of which all "
-        "combinations are trained; in --params separated by slashes: 1e-4/1e-3",
+        description="values of training settings or network options, all combinations of which are "
+        "trained; in --params separated by slashes: 1e-4/1e-3",
     )
     sensors: dict[str, Grid] = {}
     any_sensor: Grid | None = Field(
-        None, description="of every other sensor of globals.yml; null: they are no part of it"
+        None, description="grid of every other sensor of globals.yml; null: the study has no other"
     )
 
     @field_validator("sweep", mode="before")
@@ -514,11 +530,11 @@ class Study(Parameter):
             name: values if isinstance(values, list) else str(values).split("/")
             for name, values in sweep.items()
         }
-        return {name: [_as_typed(value) for value in values] for name, values in separated.items()}
+        return {name: [_as_number(value) for value in values] for name, values in separated.items()}
 
     @property
     def unseen_devices(self) -> bool:
-        """Whether the devices that test are unseen ones."""
+        """Whether the tested devices are unseen in training."""
         return self.protocol == LEAVE_ONE_DEVICE_OUT
 
     @property
@@ -527,32 +543,32 @@ class Study(Parameter):
         return {self.protocol: self.estimators} | dict(self.also)
 
     def sensors_among(self, sensors: Iterable[str]) -> list[str]:
-        """Which sensors are part of it: those that it names, and others if it takes any."""
+        """The study's sensors: those that it names, and all others if ``any_sensor`` is set."""
         others = [name for name in sensors if name not in self.sensors] if self.any_sensor else []
         return [*self.sensors, *others]
 
     def grid_of(self, sensor: str) -> Grid:
-        """Networks that it trains on a sensor.
+        """The networks that the study trains on a sensor.
 
         Raises:
-            InputError: The sensor is no part of it.
+            InputError: The sensor is not part of the study.
         """
         grid = self.sensors.get(sensor, self.any_sensor)
         if grid is None:
             raise InputError(
-                f"studies.{self.experiment}.sensors: {sensor!r} is none of "
-                f"{', '.join(self.sensors)}; name it there"
+                f"studies.{self.experiment}.sensors: expected one of {', '.join(self.sensors)}, "
+                f"got {sensor!r}; add it there"
             )
         return grid
 
     def training_of(self, base: Training) -> Training:
-        """Settings of training with what the study changes."""
+        """The settings of training, with the study's changes."""
         return Training.model_validate(base.model_dump() | self.training)
 
     def splits(self, base: Splits) -> Splits:
-        """Settings of the splits with what the study changes.
+        """The settings of the splits, with the study's changes.
 
-        Where windows of all roles are at a stride, this is the one at which they train.
+        Where the study sets a stride for the windows of all roles, it applies to training as well.
         """
         windows = self.training_windows or base.training_windows
         windows = "all" if self.strides_s else windows
@@ -562,7 +578,7 @@ class Study(Parameter):
     @model_validator(mode="after")
     def _nothing_is_named_twice(self) -> Self:
         for name in ("estimators", "windows_s", "strides_s"):
-            _refuse_twice(name, getattr(self, name) or [])
+            _refuse_duplicates(name, getattr(self, name) or [])
         return self
 
     @model_validator(mode="after")
@@ -573,7 +589,7 @@ class Study(Parameter):
 
 
 class Only(Parameter):
-    """Narrows every study to the rows that match; an absent key matches everything."""
+    """Narrows every study to the rows that match; an unset key matches every row."""
 
     sensor: str | None = None
     real_gyros: Gyroscopes | None = None
@@ -585,8 +601,8 @@ class Only(Parameter):
 class PublishedResult(Parameter):
     """One row of the paper's result tables."""
 
-    table: str = Field(description="our name of the paper's table")
-    section: str = Field(description="where the paper says so")
+    table: str = Field(description="our name for the paper's table")
+    section: str = Field(description="of the paper")
     approach: str
     sensor: str
     real_gyros: Gyroscopes
@@ -597,11 +613,11 @@ class PublishedResult(Parameter):
 
 
 class PublishedSpecification(Parameter):
-    """One row of the paper's table of sensor specifications: what the manufacturer states."""
+    """One row of the paper's table of sensor specifications, as the manufacturer states them."""
 
     section: str
     sensor: str
-    name: str = Field(description="as the paper writes it")
+    name: str = Field(description="as the paper spells it")
     rate_hz: Annotated[tuple[float, float], Strict(False)] = Field(
         description="lowest and highest sample rate, Hz"
     )
@@ -620,11 +636,11 @@ class PublishedHours(Parameter):
     train_h: float
     test_h: float
     total_h: float
-    note: str = Field("", description="how it is read where the paper contradicts itself")
+    note: str = Field("", description="our reading where the paper contradicts itself")
 
 
 class Published(Parameter):
-    """What the paper states: numbers that no run made are typed in here and nowhere else."""
+    """Numbers that the paper states; only these do not come from runs of the pipelines."""
 
     results: list[PublishedResult]
     specifications: list[PublishedSpecification]
@@ -635,7 +651,7 @@ class Published(Parameter):
         return [row for row in self.results if row.table == table]
 
     def of_networks(self, sensor: str, **gyros: int) -> list[PublishedResult]:
-        """Results of a sensor with some counts, e.g. ``real_gyros=3``."""
+        """Results of a sensor with given counts, e.g. ``real_gyros=3``."""
         return [
             row
             for row in self.results
@@ -644,7 +660,7 @@ class Published(Parameter):
 
 
 class Parameters(Parameter):
-    """All of it, as one tree."""
+    """All parameters, as one tree."""
 
     source: str = Field(pattern=r"^[a-z0-9_]+$", description="where the logs come from")
     published_address: str = Field(
@@ -653,7 +669,7 @@ class Parameters(Parameter):
     logs: str | None = Field(
         None, description="folder of a logger's files; the catalog of the environment logs reads it"
     )
-    reader: ReaderOptions | None = Field(None, description="how these are read; likewise")
+    reader: ReaderOptions | None = Field(None, description="how these files are read; likewise")
     sensors: dict[str, Sensor]
     quality: Quality
     ground_truth: GroundTruth
@@ -665,22 +681,24 @@ class Parameters(Parameter):
     seeds: list[Seed] = Field(min_length=1)
     studies: dict[str, Study]
     only: Only
-    sweep: dict[str, Any] = Field({}, description="of the study of this name: see there")
+    sweep: dict[str, Any] = Field({}, description="of the study sweep: see Study.sweep")
     published: Published
 
     @model_validator(mode="after")
     def _names_are_used_once(self) -> Self:
         for name in ("seeds", "windows_s"):
-            _refuse_twice(name, getattr(self, name))
-        for study, asked in self.studies.items():
-            if asked.experiment != study:
-                raise ValueError(f"studies.{study}.experiment: expected {study!r}")
+            _refuse_duplicates(name, getattr(self, name))
+        for name, study in self.studies.items():
+            if study.experiment != name:
+                raise ValueError(
+                    f"studies.{name}.experiment: expected {name!r}, got {study.experiment!r}"
+                )
             try:
-                asked.training_of(self.training)
+                study.training_of(self.training)
             except ValidationError as error:
                 problem = error.errors()[0]
                 where = ".".join(map(str, problem["loc"]))
-                raise ValueError(f"studies.{study}.training.{where}: {problem['msg']}") from None
+                raise ValueError(f"studies.{name}.training.{where}: {problem['msg']}") from None
         return self
 
     @model_validator(mode="after")
@@ -693,14 +711,14 @@ class Parameters(Parameter):
         """Refuse an unknown sensor.
 
         Args:
-            where: The parameter that names it, for the message.
-            name: Of the sensor.
+            where: The parameter that names the sensor, for the message.
+            name: The sensor.
 
         Raises:
-            InputError: There is none of this name.
+            InputError: No sensor has this name.
         """
         if name not in self.sensors:
             raise InputError(
-                f"{where}: unknown sensor {name!r}; conf/base/globals.yml and the environment's "
-                f"know {', '.join(self.sensors)}"
+                f"{where}: unknown sensor {name!r}; expected one of {', '.join(self.sensors)}, or "
+                "a new entry in conf/base/globals.yml or in that of the environment"
             )

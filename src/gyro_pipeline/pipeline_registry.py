@@ -1,4 +1,7 @@
-"""The pipelines by name. Every ``kedro`` command imports this file, so it imports little."""
+"""The pipelines by name.
+
+Every ``kedro`` command imports this file, so large packages are imported where they are used.
+"""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,16 +15,16 @@ _selected: "Parameters | None" = None
 
 
 def select(parameters: "Parameters") -> None:
-    """Register pipelines for the studies, sensors and ``only`` of these parameters.
+    """Register the pipelines for the studies, sensors and ``only`` of parameters.
 
-    Kedro builds pipelines after the context of a run, which is where this is called from.
+    The context of a run calls this before Kedro builds the pipelines.
     """
     global _selected  # noqa: PLW0603 - Kedro calls register_pipelines without arguments
     _selected = parameters
 
 
 def register_pipelines() -> dict[str, "Pipeline"]:
-    """All pipelines; without a run those of ``conf/base``, as for ``kedro registry list``."""
+    """All pipelines; those of ``conf/base`` for commands without a context."""
     from gyro_pipeline.pipelines.assembly import assemble  # noqa: PLC0415
 
     return assemble(_selected or base_parameters())

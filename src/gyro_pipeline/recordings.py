@@ -1,4 +1,4 @@
-"""Recordings of a length each, one by one, and cut to one length."""
+"""Functions on recordings of different lengths: to cut them, and to go through them one by one."""
 
 from collections.abc import Callable, Iterator, Mapping
 
@@ -14,26 +14,27 @@ from gyro_pipeline.physics.bias import recording_mean, sample_sigma
 
 
 def tested_imu(recordings: xr.Dataset) -> int:
-    """The IMU whose recordings test, the first one: IMU 1 of the paper (section IV-B)."""
+    """The IMU whose recordings test: the first, as IMU 1 of the paper (section IV-B)."""
     return int(recordings.imu[0])
 
 
 def common_length(recordings: xr.Dataset) -> int:
     """The length to which studies cut all recordings, in samples.
 
-    It is the one that keeps most samples of all recordings together; shorter ones are left out. So
-    a single short recording does not shorten all others.
+    This length keeps the most samples in total. Shorter recordings are left out, so that a single
+    short recording does not shorten all others.
     """
     lengths = np.sort(recordings["samples"].to_numpy().ravel())
-    kept = np.arange(len(lengths), 0, -1)  # recordings that are at least as long as each
-    return int(lengths[np.argmax(lengths * kept)])
+    counts = np.arange(len(lengths), 0, -1)  # recordings of at least each length
+    return int(lengths[np.argmax(lengths * counts)])
 
 
-def one_by_one(recordings: xr.Dataset) -> Iterator[tuple[int, int, NDArray[np.floating]]]:
-    """Recordings that are there, one in memory at a time.
+def iterate_recordings(recordings: xr.Dataset) -> Iterator[tuple[int, int, NDArray[np.floating]]]:
+    """Iterate over all existing recordings with one in memory at a time.
 
     Yields:
-        IMU, number and samples (axis, n), deg/s, of the recording's own length; NaN where masked.
+        IMU, recording number and samples (axis, n), deg/s, of the recording's full length; NaN
+        where masked.
     """
     rates = recordings.angular_rate.transpose("imu", "recording", "axis", "sample")
     lengths = recordings["samples"].transpose("imu", "recording").to_numpy()
@@ -43,15 +44,14 @@ def one_by_one(recordings: xr.Dataset) -> Iterator[tuple[int, int, NDArray[np.fl
         yield imus[imu], numbers[number], rates[imu, number, :, stretch].to_numpy()
 
 
-def cut(recordings: xr.Dataset, length: int) -> xr.Dataset:
-    """The first so many samples of each recording that has them. No samples are read."""
+def cut_to_length(recordings: xr.Dataset, length: int) -> xr.Dataset:
+    """Cut recordings to a length in samples and drop shorter ones, without reading samples."""
     samples = recordings["samples"].load()
     if bool(((samples == length) | (samples == 0)).all()):
         return recordings.isel(sample=slice(length))
-    used = samples >= length
-    changed = fingerprint([recordings.attrs["data_hash"], length])
-    part = recordings.isel(sample=slice(length)).assign(samples=used * length)
-    return with_recordings(part.assign_attrs(data_hash=changed))
+    data_hash = fingerprint([recordings.attrs["data_hash"], length])
+    part = recordings.isel(sample=slice(length)).assign(samples=(samples >= length) * length)
+    return with_recordings(part.assign_attrs(data_hash=data_hash))
 
 
 def bias_rows(
@@ -62,11 +62,11 @@ def bias_rows(
 
     Args:
         recordings: Angular rates, deg/s.
-        more: Further columns, from an IMU's number and the samples (axis, n) of a recording.
+        more: Computes further columns from the IMU's number and the samples (axis, n).
 
     Returns:
-        A row per recording that is there and axis: ``sensor, imu, recording, axis``, ``bias_dps``
-        and ``sample_sigma_dps``.
+        A row per existing recording and axis: ``sensor, imu, recording, axis``, ``bias_dps`` and
+        ``sample_sigma_dps``.
     """
     tables = [
         pd.DataFrame(
@@ -77,6 +77,6 @@ def bias_rows(
                 **(more(imu, samples) if more else {}),
             }
         )
-        for imu, number, samples in one_by_one(recordings)
+        for imu, number, samples in iterate_recordings(recordings)
     ]
     return pd.concat(tables, ignore_index=True)

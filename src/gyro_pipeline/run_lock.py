@@ -1,4 +1,4 @@
-"""One run at a time in a project's folder, and Ctrl-C that ends it for certain."""
+"""One run at a time in a project's folder, and a Ctrl-C that always ends it."""
 
 import json
 import logging
@@ -26,25 +26,26 @@ _READ_AS_PATTERNS = "?*[]{}#%"
 
 
 def check_folder(project: Path) -> None:
-    """Refuse a project whose path Kedro or MLflow would take for another one.
+    """Refuse a project whose path Kedro or MLflow would misread.
 
     Raises:
-        InputError: It names the characters.
+        InputError: The path has a character that has a meaning for Kedro or MLflow.
     """
-    odd = [character for character in _READ_AS_PATTERNS if character in str(project)]
-    if odd:
+    special = [character for character in _READ_AS_PATTERNS if character in str(project)]
+    if special:
         raise InputError(
-            f"{project}: Kedro and MLflow read {' '.join(odd)} in a path as a pattern or as part "
-            "of an address, and would use other files; move the project to a folder without"
+            f"{project}: Kedro and MLflow read {' '.join(special)} in a path as a pattern or as "
+            "part of an address, and would use other files; move the project to a folder whose "
+            "path has no such character"
         )
 
 
 @contextmanager
 def only_run(path: Path) -> Iterator[None]:
-    """Hold the lock of a project, after waiting for whoever holds it.
+    """Hold the lock of a project; wait while another run holds it.
 
     Args:
-        path: The lock file; the lock of a process that is gone is none.
+        path: The lock file; a process that has ended no longer holds it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     lock = FileLock(path)
@@ -53,42 +54,42 @@ def only_run(path: Path) -> Iterator[None]:
     except Timeout:
         logger.warning("%s; waiting until it ends (Ctrl-C ends the wait)", _owner(path))
         lock.acquire(poll_interval=0.5)
-        logger.info("it has ended: this run goes on")
+        logger.info("the other run has ended; this run continues")
     with lock:
-        lock.release()  # the second of two
+        lock.release()  # the lock was acquired twice
         owner = {"pid": os.getpid(), "host": platform.node(), "since": time.strftime("%F %T")}
         path.write_text(json.dumps(owner | {"command": shlex.join(sys.argv)}))
         yield
 
 
 def _owner(path: Path) -> str:
-    """Who holds a lock, as far as is known."""
+    """Describe the process that holds a lock."""
     try:
         owner = json.loads(path.read_text())
-        who = "process {pid} on {host} since {since}: {command}".format(**owner)
+        process = "process {pid} on {host} since {since}: {command}".format(**owner)
     except (OSError, ValueError, LookupError, TypeError):
-        who = "who has not said yet who it is"
-    return f"another run works in {path.parent}, {who}"
+        process = "which is just starting"
+    return f"another run works in {path.parent}, {process}"
 
 
 class Interrupts:
-    """Ends a run on Ctrl-C, also where Python could only print and forget the exception.
+    """Ends a run on Ctrl-C, also where Python could only print and ignore the exception.
 
     An exception that a signal raises in a finaliser or in a callback of C code is not passed on.
-    So the signal is noted, and the exception raised again once the next result is stored.
+    So the signal is remembered, and the exception is raised again once the next result is stored.
     """
 
     def __init__(self) -> None:
-        self._came = False
+        self._interrupted = False
 
     @contextmanager
-    def heard(self) -> Iterator[None]:
-        """Note Ctrl-C inside the block, which ends with an exception if it came."""
+    def watch(self) -> Iterator[None]:
+        """Remember Ctrl-C inside the block, and end the block with an exception if it came."""
         default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
         if not default or threading.current_thread() is not threading.main_thread():
             yield
             return
-        signal.signal(signal.SIGINT, self._note)
+        signal.signal(signal.SIGINT, self._remember)
         try:
             yield
             self._raise()
@@ -97,18 +98,18 @@ class Interrupts:
 
     @hook_impl
     def before_node_run(self) -> None:
-        """Raise what was lost while inputs were loaded."""
+        """Raise an interrupt that was lost while inputs were loaded."""
         self._raise()
 
     @hook_impl
     def after_dataset_saved(self) -> None:
-        """Raise what was lost since the last result."""
+        """Raise an interrupt that was lost since the last result."""
         self._raise()
 
-    def _note(self, _signal: int, _frame: FrameType | None) -> None:
-        self._came = True
+    def _remember(self, _signal: int, _frame: FrameType | None) -> None:
+        self._interrupted = True
         raise KeyboardInterrupt
 
     def _raise(self) -> None:
-        if self._came:
+        if self._interrupted:
             raise KeyboardInterrupt

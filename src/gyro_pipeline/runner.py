@@ -1,10 +1,10 @@
-"""Runs the nodes whose inputs, settings or code changed, and says which are left as they are.
+"""A runner that runs only the nodes whose inputs, settings or code changed.
 
-The fingerprint of a node is a hash of the package's code, of its parameters and of its inputs: of
-an input that a node makes, the fingerprint of that node; of any other, the state of the dataset,
-which is the digest of a stored file (:mod:`gyro_pipeline.datasets.stored`).
-A node that ends leaves its fingerprint in a file. It is run again if that is another one, or if
-what it stored is not there or was changed since.
+The fingerprint of a node is a hash of the package's code, the node's parameters and its inputs. An
+input counts with the fingerprint of the node that computes it, any other with the state of its
+dataset, which for a stored file is its digest (:mod:`gyro_pipeline.datasets.stored`). The
+fingerprints of completed nodes are stored in a file. A node runs again if its fingerprint changed,
+or if its stored outputs are missing or were changed.
 """
 
 import json
@@ -31,15 +31,15 @@ _PARAMETERS = "params:"
 
 
 class ChangedNodesRunner(SequentialRunner):
-    """Leaves out the nodes whose results are those of their inputs, settings and code already.
+    """Leaves out the nodes whose stored results are up to date.
 
     Args:
-        ended: A JSON file with the fingerprints of nodes that ended.
+        path: A JSON file with the fingerprints of completed nodes.
     """
 
-    def __init__(self, ended: Path) -> None:
+    def __init__(self, path: Path) -> None:
         super().__init__()
-        self._path, self._ended = ended, _read(ended)
+        self._path, self._completed = path, _read(path)
         self._fingerprints: dict[str, str] = {}
         self._catalog: Any = None
         self._storing: Node | None = None
@@ -52,92 +52,91 @@ class ChangedNodesRunner(SequentialRunner):
         run_id: str | None = None,
         only_missing_outputs: bool = False,
     ) -> dict[str, Any]:
-        """Run what changed; see :class:`kedro.runner.AbstractRunner`."""
+        """Run the changed nodes; see :class:`kedro.runner.AbstractRunner`."""
         self._catalog, self._fingerprints = catalog, _fingerprints(pipeline, catalog)
-        nodes = self._to_run(pipeline)
-        left = [node for node in pipeline.nodes if node not in nodes]
-        if left:
-            stages = ", ".join(dict.fromkeys(str(node.namespace) for node in left))
+        nodes = self._nodes_to_run(pipeline)
+        current = [node for node in pipeline.nodes if node not in nodes]
+        if current:
+            stages = ", ".join(dict.fromkeys(str(node.namespace) for node in current))
             logger.info(
                 "%d of %d nodes are up to date and not run again (%s)",
-                *(len(left), len(pipeline.nodes), stages),
+                *(len(current), len(pipeline.nodes), stages),
             )
         if not nodes:
             return {}
         if hook_manager is not None:
             hook_manager.register(self)
-        made = super().run(Pipeline(nodes), catalog, hook_manager, run_id, only_missing_outputs)
-        for node in pipeline.nodes:  # what a later node adds to a store is no change of it
+        outputs = super().run(Pipeline(nodes), catalog, hook_manager, run_id, only_missing_outputs)
+        for node in pipeline.nodes:  # again, since a later node may have added to the same store
             self._remember(node)
-        return made
+        return outputs
 
     @hook_impl
     def after_node_run(self, node: Node) -> None:
-        """Note a node whose results are stored next: those of a generator as it makes them."""
+        """Keep the node whose results are stored next; those of a generator are still to come."""
         self._storing = node
 
     @hook_impl
     def before_node_run(self) -> None:
-        """Remember the node before, which has ended, whatever becomes of the rest of the run."""
+        """Remember the previous node as completed, even if the rest of the run fails."""
         if self._storing is not None:
             self._remember(self._storing)
         self._storing = None
 
     def _remember(self, node: Node) -> None:
         content = [self._fingerprints[node.name], _states(node, self._catalog)]
-        if self._ended.get(_key(node, self._catalog)) != content:
-            self._ended[_key(node, self._catalog)] = content
+        if self._completed.get(_key(node, self._catalog)) != content:
+            self._completed[_key(node, self._catalog)] = content
             with replacing(self._path) as temporary:
-                temporary.write_text(json.dumps(self._ended, indent=0, sort_keys=True))
+                temporary.write_text(json.dumps(self._completed, indent=0, sort_keys=True))
 
-    def _to_run(self, pipeline: Pipeline) -> list[Node]:
-        """Nodes that changed, and those that make again what is kept in memory for them."""
-        wanted: set[str] = set()
+    def _nodes_to_run(self, pipeline: Pipeline) -> list[Node]:
+        """Nodes that changed, and nodes that compute inputs of these which are not stored."""
+        missing: set[str] = set()
         nodes = []
         for node in reversed(pipeline.nodes):
-            if self._changed(node) or wanted & set(node.outputs):
+            if self._changed(node) or missing & set(node.outputs):
                 nodes.append(node)
-                wanted |= {name for name in node.inputs if _in_memory(name, self._catalog)}
+                missing |= {name for name in node.inputs if _in_memory(name, self._catalog)}
         return nodes[::-1]
 
     def _changed(self, node: Node) -> bool:
-        kept = [name for name in node.outputs if not _in_memory(name, self._catalog)]
+        stored = [name for name in node.outputs if not _in_memory(name, self._catalog)]
         if ALWAYS in node.tags:
             return True
-        if node.outputs and not kept:
-            return False  # it is run where another node needs what it makes
-        before, states = self._ended.get(_key(node, self._catalog)), _states(node, self._catalog)
+        if node.outputs and not stored:
+            return False  # it runs if another node needs its outputs
+        before, states = self._completed.get(_key(node, self._catalog)), _states(node, self._catalog)
         if before is not None and before[0] == self._fingerprints[node.name]:
-            for name, earlier, now in zip(kept, before[1], states, strict=True):
-                if isinstance(earlier, str) and now != earlier:  # a file: run stores grow
+            for name, earlier, now in zip(stored, before[1], states, strict=True):
+                if isinstance(earlier, str) and now != earlier:  # a file; run stores grow
                     logger.warning("%s: missing, damaged or changed, so it is made again", name)
-        there = all(map(self._catalog.exists, kept))
-        return not there or before != [self._fingerprints[node.name], states]
+        complete = all(map(self._catalog.exists, stored))
+        return not complete or before != [self._fingerprints[node.name], states]
 
 
 def _fingerprints(pipeline: Pipeline, catalog: CatalogProtocol) -> dict[str, str]:
-    """The fingerprint of each node by its name."""
-    makers = {name: node.name for node in pipeline.nodes for name in node.outputs}
+    """The fingerprint of each node, by the node's name."""
     states = {name: _state(name, catalog) for name in pipeline.inputs()}
-    made: dict[str, str] = {}
+    fingerprints: dict[str, str] = {}
     for node in pipeline.nodes:
-        inputs = {
-            name: made[makers[name]] if name in makers else states[name] for name in node.inputs
-        }
+        inputs = {name: states[name] for name in node.inputs}
         texts = json.dumps(inputs, sort_keys=True, default=str)
         code = code_hash("gyro_pipeline", *_own_classes(inputs.values()))
-        made[node.name] = fingerprint([node.name, node.func.__name__, code, texts])
-    return made
+        digest = fingerprint([node.name, node.func.__name__, code, texts])
+        fingerprints[node.name] = digest
+        states |= dict.fromkeys(node.outputs, digest)
+    return fingerprints
 
 
 def _own_classes(inputs: Iterable[Any]) -> list[str]:
-    """Estimators of one's own, ``package.module:Class``, in studies: their code counts as well."""
-    given = [value.get("estimators") for value in inputs if isinstance(value, Mapping)]
-    return own_classes(name for names in given if isinstance(names, list) for name in names)
+    """The user's estimators, ``package.module:Class``, in studies: their code counts as well."""
+    lists = [value.get("estimators") for value in inputs if isinstance(value, Mapping)]
+    return own_classes(name for names in lists if isinstance(names, list) for name in names)
 
 
 def _state(name: str, catalog: CatalogProtocol) -> Any:
-    """What tells that the content of a dataset changed: its parameters, its own word, its file."""
+    """A value that changes with the content of a dataset: parameters, a state, or a digest."""
     if name.startswith(_PARAMETERS) or name == "parameters":
         return catalog.load(name)
     dataset: Any = catalog.get(name)
@@ -152,20 +151,20 @@ def _states(node: Node, catalog: CatalogProtocol) -> list[Any]:
 
 
 def _in_memory(name: str, catalog: CatalogProtocol) -> bool:
-    """Whether a dataset holds what another node makes only until it was used."""
+    """Whether a dataset holds the output of a node only until other nodes have used it."""
     dataset = catalog.get(name)
-    passing = isinstance(dataset, MemoryDataset) or getattr(dataset, "used_up", False)
-    return passing or name.startswith(_PARAMETERS)
+    temporary = isinstance(dataset, MemoryDataset) or getattr(dataset, "used_up", False)
+    return temporary or name.startswith(_PARAMETERS)
 
 
 def _key(node: Node, catalog: Any) -> str:
-    """The node and where it stores: environments have the same nodes."""
+    """The node and the paths of its outputs, since environments have the same nodes."""
     paths = [str(catalog.get(name)._describe()) for name in node.outputs]
     return f"{node.name} {fingerprint(paths)}"
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """What nodes left; of a file that cannot be read nothing, so that all of them are run."""
+    """Stored fingerprints; empty if the file cannot be read, so that all nodes run."""
     try:
         content = json.loads(path.read_text())
     except (OSError, ValueError):

@@ -1,6 +1,6 @@
-"""How a command of Kedro starts here: parameters are checked, and one run works at a time.
+"""Kedro's context and session with checked parameters and one run at a time.
 
-Every ``kedro`` command imports this file, so it imports what is large only where it is used.
+Every ``kedro`` command imports this file, so large packages are imported where they are used.
 """
 
 import hashlib
@@ -27,68 +27,67 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _NAMES_NODES = ("node_names", "from_nodes", "to_nodes", "from_inputs", "to_outputs", "tags")
-"""Options that name nodes: these are run, whether they are up to date or not."""
+"""Options that name nodes, which then run even if they are up to date."""
 
 OWN_SETTINGS = "own_settings"
-"""Name of a resolver for the catalog: a folder named after the settings of a command, if any."""
+"""Resolver of the catalog for a folder that is named after the settings of a command, if any."""
 
 _CHANGE_NO_RESULT = ("execution", "logs", "reader")
 _LONGEST_NAME = 80
 
 
-def settings_in_words(given: Mapping[str, Any], prefix: str = "") -> str:
+def settings_in_words(params: Mapping[str, Any], prefix: str = "") -> str:
     """Name the settings that a command gave with ``--params``, such as ``only.sensor=dot``.
 
-    A run with settings of its own, narrowed or with other parameters, has a report of its own, and
-    never replaces that of the full study.
+    Reports of runs with such settings are kept apart, so that they never replace the report of the
+    full study.
 
     Args:
-        given: Parameters; those of execution and of where logs are read change no result.
-        prefix: Of the keys.
+        params: The settings; those that change no result, such as execution, are not named.
+        prefix: Prefix of the keys.
 
     Returns:
-        A name for a folder; empty where there are none.
+        A name for a folder; empty without settings.
     """
     words = []
-    for key, value in sorted(given.items()):
+    for key, value in sorted(params.items()):
         if isinstance(value, Mapping):
             words.append(settings_in_words(value, f"{prefix}{key}."))
         else:
             words.append(re.sub(r"[^\w.=+-]+", "-", f"{prefix}{key}={value}").strip("-"))
     if prefix:
         return ",".join(words)
-    kept = [word for word in words if word and not word.startswith(_CHANGE_NO_RESULT)]
-    name = ",".join(kept)
+    name = ",".join(word for word in words if word and not word.startswith(_CHANGE_NO_RESULT))
     if len(name) <= _LONGEST_NAME:
         return name
     return f"{name[:_LONGEST_NAME]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
-def checked(given: Mapping[str, Any]) -> "Parameters":
-    """The parameters of a configuration.
+def parse_parameters(configuration: Mapping[str, Any]) -> "Parameters":
+    """Parse and check the parameters of a configuration.
 
     Raises:
-        InputError: One is unknown, lacking or out of bounds.
+        InputError: A parameter is unknown, missing or out of bounds.
     """
     from pydantic import ValidationError  # noqa: PLC0415
 
     from gyro_pipeline.parameters import Parameters  # noqa: PLC0415
 
     try:
-        return Parameters(**given)
+        return Parameters(**configuration)
     except ValidationError as error:
-        raise InputError(_explained(error)) from None
+        raise InputError(_explanation(error)) from None
 
 
 class Context(KedroContext):
-    """A context whose parameters are checked, and from which the pipelines are built.
+    """A context that checks the parameters and selects the pipelines by them.
 
     Kedro builds pipelines after the context, for every command that has an environment, such as
     ``kedro run`` and ``kedro viz``.
 
     Attributes:
-        given: Parameters as the configuration has them.
-        parameters: All of them, checked.
+        configuration: Parameters as in the configuration files.
+        parameters: The same, checked.
     """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
@@ -96,38 +95,38 @@ class Context(KedroContext):
         from omegaconf import OmegaConf  # noqa: PLC0415
 
         boundary.install(Path(self.project_path))
-        self.given = self.config_loader["parameters"]
-        self.parameters = checked(self.given)
+        self.configuration = self.config_loader["parameters"]
+        self.parameters = parse_parameters(self.configuration)
         pipeline_registry.select(self.parameters)
         name = settings_in_words(self.config_loader.runtime_params or {})
         OmegaConf.register_new_resolver(OWN_SETTINGS, lambda: name and f"/{name}", replace=True)
 
 
 class Session(KedroSession):
-    """A session that runs what changed, alone in its project, and from wherever it was started."""
+    """A session that runs changed nodes only, from any folder, while no other run works."""
 
     def run(self, *arguments: Any, **options: Any) -> dict[str, Any]:
         """Run pipelines, as :meth:`kedro.framework.session.KedroSession.run` does.
 
         Raises:
-            InputError: The runner or an option is of no use here.
+            InputError: The runner or an option does not suit these pipelines.
         """
         from kedro.runner import ParallelRunner, SequentialRunner  # noqa: PLC0415
 
         runner = options.get("runner")
         if options.get("only_missing_outputs"):
             raise InputError(
-                "--only-missing-outputs: a run store is there or not, whatever it lacks; type "
-                "kedro run without it, which makes the runs that are not FINISHED, and no others"
+                "--only-missing-outputs: Kedro cannot see which runs a run store lacks; type "
+                "kedro run without it, which makes only the runs that are not FINISHED"
             )
         if isinstance(runner, ParallelRunner):
             raise InputError(
-                "--runner=ParallelRunner: each node shares out its own work; type kedro run "
+                "--runner=ParallelRunner: each node starts its own processes; type kedro run "
                 "without it, and --params=execution.workers=N for N processes"
             )
         if getattr(runner, "_is_async", False):
             raise InputError(
-                "--async: results are saved one by one as they are made, which Kedro cannot do in "
+                "--async: each result is saved as soon as it is computed, which Kedro cannot do in "
                 "the background; type kedro run without it"
             )
         project = self._project_path
@@ -142,19 +141,17 @@ class Session(KedroSession):
 
                 options["runner"] = ChangedNodesRunner(project / "data" / "ended_nodes.json")
             try:
-                with interrupts.heard():
+                with interrupts.watch():
                     return super().run(*arguments, **options)
             except KeyboardInterrupt:
-                logger.error(
-                    "interrupted: what is finished is stored, and the same command goes on"
-                )
+                logger.error("interrupted: finished work is stored; the same command continues")
                 raise
             finally:
                 self._hook_manager.unregister(interrupts)
 
     @contextmanager
     def _in_project(self) -> Iterator[None]:
-        """Paths and log settings are those of the project, wherever the command was typed."""
+        """Use the paths and the log settings of the project, whatever the current folder is."""
         if Path.cwd() != self._project_path and "KEDRO_LOGGING_CONFIG" not in os.environ:
             import yaml  # noqa: PLC0415
             from kedro.framework.project import configure_logging  # noqa: PLC0415
@@ -165,7 +162,7 @@ class Session(KedroSession):
             yield
 
 
-def _explained(error: "ValidationError") -> str:
+def _explanation(error: "ValidationError") -> str:
     from gyro_pipeline.parameters import ReaderOptions  # noqa: PLC0415
 
     lines = []
@@ -173,8 +170,8 @@ def _explained(error: "ValidationError") -> str:
         where = ".".join(str(part) for part in problem["loc"]) or "parameters"
         message = problem["msg"].removeprefix("Value error, ")
         if problem["type"] == "extra_forbidden":
-            message = "unknown key; see conf/base for the keys there are"
+            message = "unknown key; see conf/base for all keys"
             if problem["loc"][0] == "reader":
-                message = f"unknown key; there are {', '.join(ReaderOptions.model_fields)}"
+                message = f"unknown key; expected one of {', '.join(ReaderOptions.model_fields)}"
         lines.append(f"{where}: {message}" if problem["loc"] else message)
     return "parameters: " + "\n  ".join(lines)

@@ -1,7 +1,7 @@
-"""See what the run store holds, and tell it where its artifacts are after a move.
+"""List the contents of the run store, and update the paths of its artifacts after a move.
 
-``python -m gyro_pipeline.store`` in the folder of ``mlflow.db``. MLflow writes down for every run
-where its artifacts are, as an absolute path, and has no command that changes it.
+Type ``python -m gyro_pipeline.store`` in the folder of ``mlflow.db``. MLflow stores an absolute
+path to the artifacts of every run, and has no command that changes it.
 """
 
 import argparse
@@ -28,14 +28,14 @@ _MB = 1e6
 
 
 def describe(store: Path) -> pd.DataFrame:
-    """What there is of each study.
+    """Count the runs and the artifacts of each study.
 
     Args:
         store: SQLite file.
 
     Returns:
-        A row per study: its runs, those that only MLflow's ``gc`` still has to remove, and the size
-        of its artifacts in MB, NaN where they are not in a folder of this machine.
+        A row per study: its runs, its deleted runs, which MLflow's ``gc`` removes for good, and the
+        size of its artifacts in MB, NaN where they are not on this machine.
     """
     rows = []
     with closing(sqlite3.connect(f"{store.resolve().as_uri()}?mode=ro", uri=True)) as db:
@@ -55,22 +55,22 @@ def describe(store: Path) -> pd.DataFrame:
 
 
 def relocate(store: Path, location: str) -> int:
-    """Tell the store that the folder of all artifacts now is another one.
+    """Update the store after the folder of all artifacts was moved.
 
     Args:
         store: SQLite file.
-        location: A folder, or an address such as ``mlflow-artifacts:``; it has a folder for each
-            study, named as before.
+        location: The new folder, or an address such as ``mlflow-artifacts:``. It has a folder for
+            each study, with the same name as before.
 
     Returns:
-        How many runs were told.
+        Number of updated runs.
 
     Raises:
-        InputError: Artifacts are not there.
+        InputError: The artifacts of a study are not in the folder.
     """
     base = location.rstrip("/") if _is_address(location) else Path(location).absolute().as_uri()
     with closing(sqlite3.connect(f"{store.resolve().as_uri()}?mode=rw", uri=True)) as db, db:
-        told = 0
+        updated = 0
         for number, name, _, old in db.execute(_STUDIES).fetchall():
             new = f"{base}/{old.rpartition('/')[2]}"
             runs = db.execute(_MOVE_RUNS, [new, len(old) + 1, number]).rowcount
@@ -79,30 +79,31 @@ def relocate(store: Path, location: str) -> int:
                 raise InputError(f"{folder}: artifacts of {name} are not there; move them first")
             db.execute(_MOVE_MODELS, [new, len(old) + 1, number])
             db.execute(_MOVE_STUDY, [new, number])
-            told += runs
-    return told
+            updated += runs
+    return updated
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print what the store holds, after a relocation if that is asked for."""
+    """Relocate the artifacts if ``--artifacts-in`` is given, then list the store."""
     parser = argparse.ArgumentParser("python -m gyro_pipeline.store", description=__doc__)
     parser.add_argument("--store", type=Path, default=Path("mlflow.db"), help="SQLite file")
     parser.add_argument(
         "--artifacts-in",
         metavar="FOLDER",
-        help="where they are now, e.g. mlruns or mlflow-artifacts:",
+        help="new folder of the artifacts, e.g. mlruns or mlflow-artifacts:",
     )
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
+    store: Path = options.store
     try:
-        if not given.store.is_file():
-            raise InputError(f"{given.store}: there is no store")
-        if given.artifacts_in:
-            relocate(given.store, given.artifacts_in)
-        table = describe(given.store)
+        if not store.is_file():
+            raise InputError(f"{store}: no such file; type --store FILE, or change to its folder")
+        if options.artifacts_in:
+            relocate(store, options.artifacts_in)
+        table = describe(store)
     except InputError as error:
         sys.exit(f"error: {error}")
     sys.stdout.write(f"{table.to_string(index=False, na_rep='not here')}\n")
-    sys.stdout.write(f"{given.store}: {given.store.stat().st_size / _MB:.1f} MB\n")
+    sys.stdout.write(f"{store}: {store.stat().st_size / _MB:.1f} MB\n")
 
 
 def _is_address(location: str) -> bool:
@@ -110,7 +111,7 @@ def _is_address(location: str) -> bool:
 
 
 def _folder(location: str) -> Path | None:
-    """The folder that a location names; None if it is elsewhere."""
+    """The folder at a location; None if it is not on this machine."""
     parts = urlparse(location)
     return Path(unquote(parts.path)) if parts.scheme in ("", "file") else None
 

@@ -1,4 +1,4 @@
-"""Which runs the studies ask for: one :class:`RunSpec` each."""
+"""The runs that the studies need, as :class:`RunSpec` objects."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,24 +15,23 @@ from gyro_pipeline.parameters import Only, Parameters, Splits, Study, Training, 
 CNN, CNN_SHUFFLED, MEAN, CONSTANT = "cnn", "cnn_shuffled", "mean", "training_mean"
 
 RESIDUAL_NETWORK = "residual_network"
-"""The recommended estimator that stands beside the paper's network."""
+"""The recommended estimator, which the report compares with the paper's network."""
 
 DEFAULT = "__default__"
-"""The pipeline without a name."""
+"""The pipeline that runs when no name is given."""
 
 LEAKAGE = "leakage"
-"""The leak study, which has a report of its own."""
-
+"""The leak study, which has a separate report."""
 
 LEFT_OUT = "left_out"
-"""Column of a plan: why a run cannot be made; empty where it can."""
+"""Column of a plan: the reason why a run is impossible; empty for possible runs."""
 
 
 @dataclass(frozen=True)
 class RunSpec:
-    """One estimator on one sensor and window, and what it learns from: one MLflow run.
+    """An estimator, its sensor, window and training set: one MLflow run.
 
-    The fields are parameters of the run, by these names.
+    The fields are stored as parameters of the run, under the same names.
     """
 
     study: str
@@ -54,7 +53,7 @@ class RunSpec:
 
     @property
     def virtual_imus(self) -> int:
-        """Virtual IMUs in training; the first ones, so that smaller sets are parts of larger."""
+        """Virtual IMUs in training; always the first, so that larger sets contain smaller ones."""
         return self.virtual_gyros // len(AXES)
 
     @classmethod
@@ -63,7 +62,7 @@ class RunSpec:
         return [field.name for field in fields(cls)]
 
 
-def study_rows(  # noqa: PLR0917 - what a grid is made of
+def study_rows(  # noqa: PLR0917 - the axes of a grid
     study: Study,
     sensor: str,
     source: str,
@@ -71,11 +70,11 @@ def study_rows(  # noqa: PLR0917 - what a grid is made of
     seeds: Sequence[int],
     only: Only,
 ) -> list[RunSpec]:
-    """Rows of a study on a sensor, the running mean of each window first.
+    """Rows of a study on a sensor, narrowed by ``only``, the running means first.
 
-    ``only`` narrows them. A running mean stays wherever another estimator of its window does.
+    A running mean is kept for each window for which another estimator remains.
     """
-    grid, wanted = study.grid_of(sensor), only.model_dump(exclude_none=True)
+    grid, filters = study.grid_of(sensor), only.model_dump(exclude_none=True)
     rows = [
         RunSpec(
             *(study.experiment, sensor, source, protocol, estimator),
@@ -89,10 +88,10 @@ def study_rows(  # noqa: PLR0917 - what a grid is made of
         for window_s, stride_s in product(study.windows_s or windows_s, study.strides_s or [0])
         for protocol, estimators in study.estimators_of.items()
         for estimator, real, virtual, seed in product(
-            swept(estimators, study.sweep), grid.real_gyros, grid.virtual_gyros, seeds
+            sweep_names(estimators, study.sweep), grid.real_gyros, grid.virtual_gyros, seeds
         )
     ]
-    rows = [row for row in rows if all(getattr(row, key) == v for key, v in wanted.items())]
+    rows = [row for row in rows if all(getattr(row, key) == v for key, v in filters.items())]
     means = [
         replace(
             row,
@@ -107,11 +106,11 @@ def study_rows(  # noqa: PLR0917 - what a grid is made of
     return [*dict.fromkeys(means), *(row for row in rows if row.estimator != MEAN)]
 
 
-def swept(estimators: Iterable[str], grid: Mapping[str, Sequence[Any]]) -> list[str]:
-    """Estimators with each seeded one once for every combination of some settings.
+def sweep_names(estimators: Iterable[str], grid: Mapping[str, Sequence[Any]]) -> list[str]:
+    """Names of estimators; a seeded estimator has one for each combination of settings.
 
     Args:
-        estimators: Their names.
+        estimators: Names without settings.
         grid: Values of each setting.
     """
     if not any(grid.values()):
@@ -128,25 +127,25 @@ def swept(estimators: Iterable[str], grid: Mapping[str, Sequence[Any]]) -> list[
 
 
 def _text(value: Any) -> str:
-    """As the name of an estimator has it: words without quotes."""
+    """A setting as the name of an estimator spells it: words without quotes."""
     return value if isinstance(value, str) else json.dumps(value)
 
 
 def run_specs(rows: Iterable[RunSpec], unseen_devices: bool) -> list[RunSpec]:
-    """Runs that make some rows: rows whose estimator uses the same training set are one run."""
+    """Runs that rows need: rows whose estimator uses the same training set share a run."""
     return list(dict.fromkeys(run_spec(row, unseen_devices) for row in rows))
 
 
 def run_spec(row: RunSpec, unseen_devices: bool) -> RunSpec:
-    """A row reduced to what its estimator uses of the training set that it names.
+    """Reduce a row to the part of its training set that its estimator uses.
 
     Args:
-        row: It.
-        unseen_devices: Whether the tested devices are unseen ones, of which there are no own
-            recordings: all real ones are used in their place.
+        row: A row of a study.
+        unseen_devices: Whether the tested devices are unseen in training. They have no recordings
+            there, so an estimator that would use them uses all real recordings.
 
     Returns:
-        The row without the gyroscopes, the seed and the method that change nothing.
+        The row without the gyroscopes, the seed and the method that do not affect its result.
     """
     estimator = estimator_class(row.estimator)
     uses = REAL if estimator.uses == OWN and unseen_devices else estimator.uses
@@ -155,24 +154,24 @@ def run_spec(row: RunSpec, unseen_devices: bool) -> RunSpec:
     side_by_side = estimator.side_by_side and real > len(AXES)
     return replace(
         row,
-        method=row.method if side_by_side else 2,  # one IMU is the same in both methods
+        method=row.method if side_by_side else 2,  # for one IMU both methods are the same
         real_gyros=real,
         virtual_gyros=virtual,
         seed=row.seed if estimator.seeded else 0,
     )
 
 
-def planned(plan: pd.DataFrame) -> dict[str, RunSpec]:
-    """The runs of a plan that can be made, by fingerprint."""
-    made = plan[plan[LEFT_OUT].isna() | (plan[LEFT_OUT] == "")]
+def possible_runs(plan: pd.DataFrame) -> dict[str, RunSpec]:
+    """The possible runs of a plan, by fingerprint."""
+    possible = plan[plan[LEFT_OUT].isna() | (plan[LEFT_OUT] == "")]
     return {
         row["fingerprint"]: RunSpec(**{name: row[name] for name in RunSpec.names()})
-        for row in made.to_dict("records")
+        for row in possible.to_dict("records")
     }
 
 
 def used_sensors(parameters: Parameters) -> dict[str, list[str]]:
-    """For each study the sensors on which ``only`` leaves it at least one row."""
+    """The sensors of each study on which ``only`` leaves at least one row."""
     p = parameters
     return {
         name: [
@@ -185,25 +184,24 @@ def used_sensors(parameters: Parameters) -> dict[str, list[str]]:
 
 
 def studies_to_run(parameters: Parameters, pipelines: Sequence[str]) -> dict[str, list[str]]:
-    """Sensors of each study that some pipelines run, as ``only`` leaves them."""
-    whole = bool({DEFAULT, "reporting"} & set(pipelines))
+    """The studies that pipelines run, with the sensors that ``only`` leaves of each."""
+    all_defaults = bool({DEFAULT, "reporting"} & set(pipelines))
     return {
         study: sensors
         for study, sensors in used_sensors(parameters).items()
-        if study in pipelines or (parameters.studies[study].default and whole)
+        if study in pipelines or (parameters.studies[study].default and all_defaults)
     }
 
 
 def check_possible(parameters: Parameters, pipelines: Sequence[str]) -> None:
-    """Refuse what these pipelines ask of sensors that cannot give it.
+    """Refuse studies that need more than their sensors have.
 
-    Nobody has to mend a study that does not run, so no other is looked at. Where a sensor's entry
-    does not say how many IMUs there are, or how long recordings are, its files decide: the plan of
-    the runs compares with them.
+    Only the studies that will run are checked. Where a sensor's entry states neither the number of
+    IMUs nor the length of recordings, the plan of the runs checks them against the files.
 
     Args:
-        parameters: All of them.
-        pipelines: Names of those to run.
+        parameters: All parameters.
+        pipelines: Names of the pipelines to run.
 
     Raises:
         InputError: ``only`` leaves nothing of the studies, a sensor or estimator is unknown, or a
@@ -213,8 +211,8 @@ def check_possible(parameters: Parameters, pipelines: Sequence[str]) -> None:
     if studies and not any(studies.values()):
         only = parameters.only.model_dump(exclude_none=True)
         raise InputError(
-            f"only={only} matches nothing in {', '.join(studies)}; for what there is, and to "
-            "name a new sensor, see studies.yml in conf/base/parameters"
+            f"only={only} matches nothing in {', '.join(studies)}; for their rows, and to add a "
+            "sensor, see conf/base/parameters/studies.yml"
         )
     for study, sensors in studies.items():
         for sensor in sensors:
@@ -224,29 +222,33 @@ def check_possible(parameters: Parameters, pipelines: Sequence[str]) -> None:
 
 def _check_rows(p: Parameters, study: str, name: str) -> None:
     """Compare the rows of a study on a sensor with what the sensor's entry says."""
-    asked_study = p.studies[study]
-    rows = study_rows(asked_study, name, p.source, p.windows_s, p.seeds, p.only)
+    settings = p.studies[study]
+    rows = study_rows(settings, name, p.source, p.windows_s, p.seeds, p.only)
     for estimator in dict.fromkeys(row.estimator for row in rows):
-        if estimator not in ESTIMATORS:  # those can be made; to look at all takes PyTorch
-            settings_of(estimator, asked_study.training_of(p.training))
-        if asked_study.unseen_devices and estimator_class(estimator).seeded:
+        if estimator not in ESTIMATORS:  # the built-in ones are valid; checking them loads PyTorch
+            settings_of(estimator, settings.training_of(p.training))
+        if settings.unseen_devices and estimator_class(estimator).seeded:
             raise InputError(
                 f"studies.{study}.estimators: {estimator} cannot be judged on unseen devices; "
                 "leave it out of a study with protocol leave_one_device_out"
             )
     imus, length_s = p.sensors[name].imus, p.sensors[name].recording_s
-    has, makes = len(AXES) * (imus or 0), len(AXES) * p.virtual_gyros.imus
-    for asked, limit, words in (
-        ("real_gyros", has or None, f"real gyroscopes asked, {name} has {has} (its imus: {imus})"),
-        ("virtual_gyros", makes, f"virtual gyroscopes asked, virtual_gyros.imus makes {makes}"),
+    real, virtual = len(AXES) * (imus or 0), len(AXES) * p.virtual_gyros.imus
+    for field, limit, words in (
+        ("real_gyros", real or None, f"real gyroscopes needed, {name} has {real} (imus: {imus})"),
+        (
+            "virtual_gyros",
+            virtual,
+            f"virtual gyroscopes needed, virtual_gyros.imus makes {virtual}",
+        ),
         (
             "window_s",
             length_s,
-            f"s windows asked, longer than a recording of {name}, {length_s or 0:g} s "
+            f"s windows needed, longer than a recording of {name}, {length_s or 0:g} s "
             "(windows_s of the studies; recording_s of the sensor)",
         ),
     ):
-        most = max(getattr(row, asked) for row in rows)
+        most = max(getattr(row, field) for row in rows)
         if limit is not None and most > limit:
             raise InputError(f"studies.{study}.{name}: {most:g} {words}")
 
@@ -254,19 +256,18 @@ def _check_rows(p: Parameters, study: str, name: str) -> None:
 def run_params(
     spec: RunSpec, study: Study, training: Training, splits: Splits, virtual_gyros: VirtualGyros
 ) -> dict[str, Any]:
-    """Parameters that a run carries: its identity, and the settings that it depends on.
+    """Parameters that a run is logged with: its identity and the settings that it depends on.
 
     Args:
-        spec: Which run.
+        spec: The run.
         study: Its study, which may change some settings.
-        training: Hyper-parameters, of estimators that have some.
+        training: Hyper-parameters of seeded estimators.
         splits: How recordings are split, and which windows train.
-        virtual_gyros: How they were drawn, where the run has some.
+        virtual_gyros: How virtual gyroscopes are drawn, for runs that use them.
     """
-    split = study.splits(splits).model_dump(exclude={"folds"})  # a run carries how many it has
+    split = study.splits(splits).model_dump(exclude={"folds"})  # logged as the actual number
     params: dict[str, Any] = asdict(spec) | split
     if spec.virtual_gyros:
-        drawn = virtual_gyros.model_dump()
-        params |= {f"virtual_{name}": value for name, value in drawn.items()}
-    made_with = settings_of(spec.estimator, study.training_of(training))
-    return params | {name: value for name, value in made_with.items() if value is not None}
+        params |= {f"virtual_{name}": value for name, value in virtual_gyros.model_dump().items()}
+    settings = settings_of(spec.estimator, study.training_of(training))
+    return params | {name: value for name, value in settings.items() if value is not None}

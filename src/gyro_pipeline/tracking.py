@@ -1,8 +1,8 @@
-"""What a tracked run is: the contract between the stages and the run store.
+"""Tracked runs: the contract between the stages and the run store.
 
-One row of a study is one run. Parameter names are the fields of its run spec and the
-hyper-parameters; metric names are those of :class:`EvaluatedRun`. Users query them: changing one
-breaks notebooks.
+Each row of a study is a run. The parameters of a run are the fields of its run spec and the
+hyper-parameters; its metrics are listed in :class:`EvaluatedRun`. Users query these names, so
+changing one breaks their notebooks.
 """
 
 from collections.abc import Callable, Mapping
@@ -15,15 +15,16 @@ if TYPE_CHECKING:
     from gyro_pipeline.estimators.base import Estimator
 
 LAYOUT = "3"
-"""Layout of runs. Earlier ones carry no such tag and are never read: their metrics meant else."""
+"""Layout of runs. Older runs lack the tag and are never read: their metrics mean something else."""
 
 LAYOUT_TAG = "layout"
 
 FINGERPRINT = "fingerprint"
-"""Tag: hash of all that the fits depend on. Equal fingerprints need one run."""
+"""Tag: hash of everything that the fits depend on. Rows with equal fingerprints share a run."""
 
 EVALUATED_WITH = "evaluated_with"
-"""Tag: hash of how the run was evaluated. Another hash evaluates again, without training."""
+"""Tag: hash of everything that the evaluation depends on. If it changes, the run is evaluated again
+without training."""
 
 HISTORY, SCORES, ERRORS = "history.csv", "scores.csv", "errors.parquet"
 CURVE = "running_mean_curve.parquet"
@@ -38,16 +39,16 @@ MODEL = "model"
 
 @dataclass(frozen=True)
 class RunIdentity:
-    """The run that a fit belongs to.
+    """Identity and description of a run.
 
     Attributes:
         study: Name of the MLflow experiment.
-        fingerprint: Hash of all that the fits depend on.
-        params: What the row of the study asks for.
-        tags: More marks, to filter by.
-        folds: Folds of the protocol; the run is trained when each has its fit.
-        name: What a list of runs shows.
-        note: Two sentences on what was trained on what.
+        fingerprint: Hash of everything that the fits depend on.
+        params: Parameters of the row of the study.
+        tags: Further tags to filter by.
+        folds: Folds of the protocol; a run is trained when each has its fit.
+        name: Name in lists of runs.
+        note: Two sentences that describe the estimator and its training set.
     """
 
     study: str
@@ -61,17 +62,17 @@ class RunIdentity:
 
 @dataclass(frozen=True)
 class FittedRun:
-    """One fit of a run: saved as it ends, so that a kill loses only what was running.
+    """A fit of a run, saved as soon as it ends, so that a kill loses only unfinished fits.
 
     Attributes:
-        run: The run that the fit belongs to.
-        fold: One of the folds of the run.
+        run: The run.
+        fold: The fold of the run.
         estimator: The fitted estimator.
-        started_ms: When fitting began, milliseconds since 1970.
-        ended_ms: When it ended.
+        started_ms: Start of fitting, milliseconds since 1970.
+        ended_ms: End of fitting, milliseconds since 1970.
         is_model: Whether this fit is the one that users of the run load.
-        example: A few windows (n, gyroscopes, samples), deg/s, to try the model with.
-        dataset: ``name``, ``digest`` and ``source`` of the recordings, and more to show.
+        example: A few example windows (n, gyroscopes, samples), deg/s.
+        dataset: ``name``, ``digest`` and ``source`` of the recordings, and further information.
     """
 
     run: RunIdentity
@@ -86,17 +87,17 @@ class FittedRun:
 
 @dataclass(frozen=True)
 class EvaluatedRun:
-    """What an evaluation adds to its run, which then is FINISHED.
+    """The results of an evaluation, which make its run FINISHED.
 
     Attributes:
-        run_id: The run.
+        run_id: MLflow's id of the run.
         metrics: ``rmse_mdps``, ``mean_rmse_mdps``, ``ceiling_rmse_mdps``, ``accuracy_gain_pct``
             with ``_lo`` and ``_hi``, ``time_saving_pct``, ``equivalent_time_s``,
             ``coverage_95_pct``, ``train_loss``, ``val_loss``: over all windows, with the weights
             of the last epoch; ``accuracy_gain_pct_first`` and ``time_saving_pct_first``: over the
             first window of each recording, the paper's way.
-        tags: Among them EVALUATED_WITH.
-        artifacts: By file name: SCORES, ERRORS.
+        tags: Tags, including EVALUATED_WITH.
+        artifacts: Artifacts by file name: SCORES, ERRORS.
     """
 
     run_id: str
@@ -107,14 +108,14 @@ class EvaluatedRun:
 
 @dataclass(frozen=True)
 class StoredRun:
-    """A run as the store has it.
+    """A run in the store.
 
     Attributes:
         finished: Whether it was evaluated.
-        trained: Whether it has the fits of all its folds; an untrained run can be continued.
+        trained: Whether the fits of all its folds are stored; otherwise it can be continued.
         fits: The folds whose fits are stored.
-        load: Fetches an artifact by its name.
-        load_fit: Fetches the fitted estimator of a fold.
+        load: Loads an artifact by its name.
+        load_fit: Loads the fitted estimator of a fold.
     """
 
     run_id: str
@@ -132,5 +133,5 @@ class StoredRun:
 
     @property
     def fingerprint(self) -> str:
-        """Hash of all that the fits depend on."""
+        """Hash of everything that the fits depend on."""
         return self.tags[FINGERPRINT]

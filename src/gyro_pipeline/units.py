@@ -1,7 +1,7 @@
-"""Units as headers and options spell them, read by pint from a small registry of its own.
+"""Units as headers and options spell them, read by pint with a small registry.
 
-In pint's registry a radian is a number, so that 1/s would be an angular rate. Here an angle is a
-quantity of its own, a count of an AD converter is another, and g is the earth's acceleration.
+In pint's default registry a radian is dimensionless, so that 1/s would be an angular rate. Here
+angles and the counts of an AD converter have dimensions, and g is the acceleration of gravity.
 """
 
 import re
@@ -42,22 +42,22 @@ _REFERENCES = {
     "temperature": "celsius",
     "count": "count",
 }
-"""What is told apart, and the unit in which each is used here."""
+"""The quantities, and the unit in which each is used here."""
 
 _SPELLINGS = {"º": "°", "˚": "°", "℃": "°C", "℉": "°F", "°": "deg"}
 _SPELLINGS |= {"·": "*", "⋅": "*", "⁻¹": "^-1", "⁻²": "^-2", "²": "^2"}
 _TERM = r"[^\W\d_][^\W\d]*(?:\^?-?[1-3])?"
-# words, products and quotients, but neither numbers nor roots; pint would evaluate 9**9**9
+# words, products and quotients, but neither numbers nor powers: pint would evaluate 9**9**9
 _EXPRESSION = re.compile(rf"(?=.{{1,40}}$)\(?{_TERM}(?:[/* ()]{{1,3}}{_TERM})*\)?")
 
 
 class Unit(NamedTuple):
-    """A unit: a value in it, times ``factor`` plus ``offset``, is in deg/s, deg, s, g, °C, counts.
+    """A unit: ``factor * value + offset`` is in deg/s, deg, s, g, °C or counts.
 
     Attributes:
         quantity: ``rate``, ``angle``, ``time``, ``acceleration``, ``temperature`` or ``count``.
         factor: As above.
-        offset: As above; of temperatures only.
+        offset: As above; not 0 for temperatures only.
     """
 
     quantity: str
@@ -67,7 +67,7 @@ class Unit(NamedTuple):
 
 @lru_cache(1)
 def _registry() -> tuple[Any, dict[Any, str]]:
-    """The registry, and what quantity each dimensionality is of."""
+    """The registry, and the quantity of each dimensionality."""
     import pint  # noqa: PLC0415  # it starts slowly, and few commands need it
 
     units: Any = pint.UnitRegistry(None)
@@ -81,7 +81,7 @@ def read_unit(text: str) -> Unit | None:
     """Read a unit such as ``deg/s``, ``rad s^-1``, ``°/sec``, ``mdps``, ``m/s²`` or ``degC``.
 
     Returns:
-        What it measures; None where it is none of these, or is not known.
+        The unit; None if it is unknown or of no supported quantity.
     """
     text = text.strip()
     for spelling, of_pint in _SPELLINGS.items():

@@ -1,8 +1,7 @@
-"""Windows: what an estimator sees of a recording.
+"""Windows, the stretches of a recording that an estimator sees.
 
-This is where masked samples, those that hold no measurement, are dealt with: a window that lost
-more than a share of its samples is dropped; in the others they become the window's own mean. So
-nothing that sees windows meets NaN.
+Masked samples, which hold no measurement, end here: a window with too many of them is dropped; in
+other windows they are replaced by the mean of the window. So no user of windows meets NaN.
 """
 
 from collections.abc import Sequence
@@ -14,20 +13,20 @@ from gyro_pipeline.conventions import InputError
 from gyro_pipeline.physics.bias import windows_at
 
 LARGEST_MASKED_SHARE = 0.1
-"""Of a window's samples: where more are masked, the window is left out."""
+"""Largest share of masked samples in a window; windows with more are left out."""
 
 
 def window_size(window_s: float, rate_hz: float, recording_samples: int, where: str) -> int:
-    """Samples of a window.
+    """Number of samples of a window.
 
     Args:
         window_s: Calibration time T0, seconds.
         rate_hz: Sample rate, Hz.
         recording_samples: Samples of a whole recording.
-        where: What an error message calls the recordings, e.g. the sensor.
+        where: Name of the recordings for the error message, e.g. the sensor.
 
     Raises:
-        InputError: If the window is longer than the recording.
+        InputError: The window is longer than the recording, or shorter than a sample.
     """
     size = round(window_s * rate_hz)
     if not 1 <= size <= recording_samples:
@@ -45,13 +44,13 @@ def usable_starts(
     starts: np.ndarray | None = None,
     largest_masked_share: float = LARGEST_MASKED_SHARE,
 ) -> np.ndarray:
-    """First samples of the windows that are not dropped.
+    """First samples of the windows that have enough measurements.
 
     Args:
-        masked: Whether a sample of the recording holds no measurement, shape (n,).
+        masked: Whether each sample of the recording is masked, shape (n,).
         size: Samples per window.
-        starts: First samples of the windows; None for all non-overlapping ones from the start on.
-        largest_masked_share: Of a window's samples that may be masked.
+        starts: First samples of all windows; None for all non-overlapping ones from the start on.
+        largest_masked_share: Largest share of masked samples in a usable window.
     """
     if starts is None:
         starts = np.arange(0, len(masked) - size + 1, size)
@@ -62,17 +61,17 @@ def usable_starts(
 
 
 def cut_windows(samples: np.ndarray, size: int, starts: np.ndarray | None = None) -> np.ndarray:
-    """Windows of a recording; all non-overlapping ones from its start unless others are named.
+    """Cut the windows out of a recording.
 
     Args:
         samples: Shape (..., n); NaN where masked.
         size: Samples per window.
-        starts: First samples of the windows, which may overlap.
+        starts: First samples of the windows, which may overlap; None for all non-overlapping
+            windows from the start on.
 
     Returns:
         Shape (..., windows, size), without the windows that :func:`usable_starts` drops, and
-        without NaN. Where none is masked and ``starts`` are None a view, n // size windows, where
-        the last n % size samples are in none; else a copy.
+        without NaN. This is a view if no sample is masked and ``starts`` is None, else a copy.
     """
     masked = np.isnan(samples).reshape(-1, samples.shape[-1]).any(axis=0)
     if masked.any():
@@ -84,35 +83,35 @@ def cut_windows(samples: np.ndarray, size: int, starts: np.ndarray | None = None
 
 
 def usable_windows(contents: pd.DataFrame, samples: int, size: int, stride: int) -> pd.DataFrame:
-    """Windows of all recordings that are not dropped.
+    """Usable windows of all recordings.
 
     Args:
-        contents: A row per recording: ``imu, recording``, and ``masked``, the numbers of its
+        contents: A row per recording: ``imu, recording``, and ``masked``, the indices of its
             masked samples.
-        samples: Of every recording.
+        samples: Samples of every recording.
         size: Samples per window.
-        stride: Samples from the start of one window to that of the next.
+        stride: Samples from the start of a window to the start of the next.
 
     Returns:
         A row per window: ``imu, recording`` and ``start``, its first sample.
     """
-    starts = np.arange(0, samples - size + 1, stride)
-    own = []
-    for masked in contents.masked:
-        lost = np.zeros(samples, bool)
-        lost[masked] = True
-        own.append(usable_starts(lost, size, starts))
-    counts = [len(part) for part in own]
-    places = {name: np.repeat(contents[name].to_numpy(), counts) for name in ("imu", "recording")}
-    return pd.DataFrame(places | {"start": np.concatenate([[], *own]).astype(np.int64)})
+    all_starts = np.arange(0, samples - size + 1, stride)
+    starts = []
+    for indices in contents.masked:
+        masked = np.zeros(samples, bool)
+        masked[indices] = True
+        starts.append(usable_starts(masked, size, all_starts))
+    counts = [len(part) for part in starts]
+    columns = {name: np.repeat(contents[name].to_numpy(), counts) for name in ("imu", "recording")}
+    return pd.DataFrame(columns | {"start": np.concatenate([[], *starts]).astype(np.int64)})
 
 
 def describe_losses(contents: pd.DataFrame, samples: int, size: int) -> str:
-    """Which non-overlapping windows are dropped, in words; empty where none is.
+    """Describe the non-overlapping windows that are dropped; empty if none is.
 
     Args:
-        contents: A row per recording, as :func:`usable_windows` takes it.
-        samples: Of every recording.
+        contents: A row per recording, as for :func:`usable_windows`.
+        samples: Samples of every recording.
         size: Samples per window.
     """
     windows = usable_windows(contents, samples, size, size)
@@ -120,28 +119,23 @@ def describe_losses(contents: pd.DataFrame, samples: int, size: int) -> str:
     if len(windows) == total:
         return ""
     firsts = windows.groupby(["imu", "recording"]).start.min()
-    late, lost = (
-        firsts[firsts > 0],
-        [
-            place
-            for place in zip(contents.imu, contents.recording, strict=True)
-            if place not in firsts.index
-        ],
-    )
+    late = firsts[firsts > 0]
+    recordings = zip(contents.imu, contents.recording, strict=True)
+    lost = [recording for recording in recordings if recording not in firsts.index]
     parts = [
         f"{total - len(windows)} of {total} lost more than {LARGEST_MASKED_SHARE:.0%} of their "
         "samples and are left out"
     ]
     if len(late):
         first = late.iloc[0] // size + 1
-        parts.append(f"the first one used of {_named([*late.index])} is window {first}")
+        parts.append(f"the first one used of {_in_words([*late.index])} is window {first}")
     if lost:
-        parts.append(f"none is left of {_named(lost)}, so it trains no network and tests none")
+        parts.append(f"none is left of {_in_words(lost)}, so it trains no network and tests none")
     return "; ".join(parts)
 
 
-def _named(places: Sequence[tuple[int, int]]) -> str:
-    """The first place, and how many more there are."""
-    imu, number = places[0]
-    more = f" (and of {len(places) - 1} more)" if len(places) > 1 else ""
-    return f"IMU {imu} recording {number}{more}"
+def _in_words(recordings: Sequence[tuple[int, int]]) -> str:
+    """The first of some recordings, and the number of the others."""
+    imu, number = recordings[0]
+    others = f" (and of {len(recordings) - 1} more)" if len(recordings) > 1 else ""
+    return f"IMU {imu} recording {number}{others}"

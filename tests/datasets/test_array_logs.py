@@ -53,7 +53,7 @@ def test_a_recording_says_where_it_is_and_can_be_read_by_another_process(tmp_pat
     array = np.asfortranarray(np.arange(5 * 6 * 200, dtype=np.int16).reshape(5, 6, 200))
     np.save(tmp_path / "all.npy", array)
     logs = array_logs(tmp_path).load()
-    told = (logs.sensor, logs.source, logs.simulated, logs.rate_hz, logs.drawn)
+    told = (logs.sensor, logs.source, logs.simulated, logs.rate_hz, logs.truth)
     assert told == ("memsense", "array", False, 250, None)
     entry = pickle.loads(pickle.dumps(logs.entries[7]))
     assert (entry.imu, entry.recording, entry.split) == (2, 3, None)
@@ -133,19 +133,17 @@ def test_damaged_files_and_pickles_are_refused_by_name_and_nothing_is_unpickled(
         file.write_bytes(content)
         message = refusal(array_logs(tmp_path))
         assert message.startswith("memsense all.npy: expected a plain numeric .npy file")
-        assert message.endswith(
-            f"pickled objects, which are never loaded; replace or delete {file}"
-        )
+        assert message.endswith(f"which are never loaded; replace or delete {file}")
     assert not (tmp_path / "sprung").exists()
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"sensor": "memsens"}, "unknown sensor 'memsens'; conf/base/globals.yml knows memsense"),
+        ({"sensor": "memsens"}, "unknown sensor 'memsens'; expected one of memsense"),
         ({"sensors": {"memsense": SENSORS["memsense"] | {"imus": 0}}}, "imus"),
-        ({"files": {"train": "a.npy"}}, "expected a train and a test file"),
-        ({"files": {"train": "a.npy", "test": "a.npy"}}, "which are not the same one"),
+        ({"files": {"train": "a.npy"}}, "expected train and test, two different files"),
+        ({"files": {"train": "a.npy", "test": "a.npy"}}, "two different files"),
         ({"axes_order": ["recording", "sample"]}, "expected recording, gyroscope, sample"),
     ],
 )

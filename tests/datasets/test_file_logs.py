@@ -102,7 +102,7 @@ def test_a_file_may_hold_several_imus(tmp_path):
         expected = [1, 2, 3] if entry.imu == 1 else [9, 5, 6]
         np.testing.assert_array_equal(entry.read().samples[-1], expected)
     assert len({entry.key for entry in entries}) == 4
-    with pytest.raises(InputError, match="leave one of the two out"):
+    with pytest.raises(InputError, match="remove one of the two"):
         file_logs(tmp_path, "{imu}.csv", reader=reader)
 
 

@@ -229,7 +229,7 @@ def test_a_later_run_goes_on_where_an_earlier_one_gave_up(server, path, monkeypa
     server.faults = [server.silent, server.hang] + [server.silent] * 3
     message = refusal(server, path)
     assert "timed out" in message
-    assert f"{HALF} bytes are kept, and the next run goes on from there" in message
+    assert f"{HALF} bytes are kept, and the next run continues from there" in message
     assert left(path) == [".made.npy.part"]
     server.asked.clear()
     fetched(server, path)
@@ -287,7 +287,7 @@ def test_a_part_that_leaves_nothing_to_fetch_is_begun_anew(server, path, part):
 def test_a_part_of_another_file_is_found_out(server, path):
     path.parent.mkdir()
     path.with_name(".made.npy.part").write_bytes(b"another file")
-    assert "Run again" in refusal(server, path)
+    assert "Type the same command again" in refusal(server, path)
     assert left(path) == []
     fetched(server, path)
 

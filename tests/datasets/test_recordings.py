@@ -100,7 +100,7 @@ def reading(tmp_path):
 
 
 def listing(*recordings):
-    return Listing({one.place: one.key for one in recordings})
+    return Listing({one.labels: one.key for one in recordings})
 
 
 def described(one):

@@ -32,10 +32,10 @@ def recordings(source):
     """What was drawn, and all samples, of which no IMU lacks any."""
     logs = source.load()
     rates = np.array([entry.read().samples.T for entry in logs.entries], dtype=np.float32)
-    shape = (logs.drawn.sizes["imu"], logs.drawn.sizes["recording"], *rates.shape[1:])
+    shape = (logs.truth.sizes["imu"], logs.truth.sizes["recording"], *rates.shape[1:])
     labelled = (("imu", "recording", "axis", "sample"), rates.reshape(shape))
     splits = "recording", [entry.split for entry in logs.entries[: shape[1]]]
-    drawn = logs.drawn.assign_coords(split=splits).assign_attrs(rate_hz=logs.rate_hz)
+    drawn = logs.truth.assign_coords(split=splits).assign_attrs(rate_hz=logs.rate_hz)
     return drawn.assign(angular_rate=labelled)
 
 
@@ -143,7 +143,7 @@ def test_random_walk_and_warm_up_are_added_and_what_was_drawn_is_kept(tmp_path):
     ends = walk.isel(sample=[99, 399]).std(("imu", "recording", "axis"))
     np.testing.assert_allclose(ends, [10e-3, 20e-3], rtol=0.15)
     constant = simulated(tmp_path, model={"warm_up": WARM_UP | {"time_constant_s": 1.5}})
-    assert set(np.ravel(constant.load().drawn.true_time_constant)) == {1.5}
+    assert set(np.ravel(constant.load().truth.true_time_constant)) == {1.5}
 
 
 def test_what_was_drawn_stays_with_the_recordings_that_are_kept(tmp_path, parameters, read_logs):
@@ -152,7 +152,7 @@ def test_what_was_drawn_stays_with_the_recordings_that_are_kept(tmp_path, parame
     source = simulated(tmp_path, model={"warm_up": warm_up}, **sizes)
     kept, _ = read_logs(source.load(), parameters("base").quality, tmp_path)
     assert set(kept.dims) == set(DIMENSIONS)
-    np.testing.assert_array_equal(kept.true_amplitude, source.load().drawn.true_amplitude)
+    np.testing.assert_array_equal(kept.true_amplitude, source.load().truth.true_amplitude)
     assert float(kept.true_amplitude_spread) == pytest.approx(5e-3)
 
 
@@ -167,7 +167,7 @@ def test_the_seed_and_the_sensor_alone_decide_the_draws_and_a_second_load_only_r
         xr.testing.assert_identical(recordings(simulated(tmp_path / folder)), first)
     assert stamps() == before
     for other in (simulated(tmp_path / "c", seed=2), simulated(tmp_path / "d", sensor="ng")):
-        assert (other.load().drawn.true_unit_bias != first.true_unit_bias).all()
+        assert (other.load().truth.true_unit_bias != first.true_unit_bias).all()
 
 
 @pytest.mark.parametrize("changes", [{"seed": 2}, {"train_recordings": 20}, {"recording_s": 8}])
@@ -178,7 +178,7 @@ def test_other_settings_are_written_anew_and_said(tmp_path, caplog, changes):
     new = recordings(simulated(tmp_path, **changes))
     assert not new.identical(old)
     assert len(caplog.records) == 1
-    assert "writing simulated dot logs anew, since their settings have changed" in caplog.text
+    assert "writing simulated dot logs again, since their settings have changed" in caplog.text
     xr.testing.assert_identical(new, recordings(simulated(tmp_path / "fresh", **changes)))
 
 

@@ -26,7 +26,7 @@ def stored(request, tmp_path):
     """A file of each kind, as saved."""
     kind, data = KINDS[request.param]
     dataset = kind(str(tmp_path / "new" / request.param))
-    with pytest.raises(DatasetError, match="is not there; first run what makes it"):
+    with pytest.raises(DatasetError, match="no such file; type kedro run"):
         dataset.load()
     assert dataset.state() is None
     dataset.save(data)

@@ -649,7 +649,7 @@ def test_a_damaged_artifact_sets_its_run_back_and_no_other(store, name, damage, 
     assert there.finished
     (broken,) = (run for run in tracked(store).load() if run.run_id == run_id)
     again = "trained" if name in ("history.csv", "estimator.pkl") else "evaluated"
-    assert f"run {run_id}: damaged or not there: " in caplog.text
+    assert f"run {run_id}: damaged or missing: " in caplog.text
     assert f"it is {again} again" in caplog.text
     assert not broken.finished
     assert "evaluated_with" not in broken.tags

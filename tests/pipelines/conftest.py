@@ -25,7 +25,7 @@ from gyro_pipeline.pipelines.ground_truth.nodes import measure_allan_variance, m
 from gyro_pipeline.pipelines.training.nodes import plan_runs, train
 from gyro_pipeline.pipelines.virtual_gyros.nodes import synthesise
 from gyro_pipeline.pipelines.windowed_splits.nodes import cut_to_common_length, split_windows
-from gyro_pipeline.studies import RunSpec, planned
+from gyro_pipeline.studies import RunSpec, possible_runs
 from gyro_pipeline.tracking import FINGERPRINT, EvaluatedRun, FittedRun, StoredRun
 
 NOISE, SPREAD = 0.003, 0.002
@@ -82,7 +82,7 @@ class World:
     @property
     def specs(self) -> dict[str, RunSpec]:
         """The runs that can be made, by fingerprint."""
-        return planned(self.plan)
+        return possible_runs(self.plan)
 
     @property
     def fingerprints(self) -> dict[tuple[Any, ...], str]:

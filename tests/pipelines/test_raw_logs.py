@@ -224,7 +224,7 @@ def test_splits_and_what_was_drawn_go_with_the_recordings(inspected, make_record
     drawn = drawn.rename(angular_rate="true_bias").isel(sample=0)
     logs = {(imu, n): Log(noise(10 * imu + n)) for imu in (1, 2) for n in (1, 2, 3, 4)}
     logs[1, 1] = logs[2, 1] = DEAD
-    files = listed(logs, simulated=True, drawn=drawn)
+    files = listed(logs, simulated=True, truth=drawn)
     of_source = {1: "train", 2: "test", 3: "train", 4: "test"}
     entries = [replace(one, split=of_source[one.recording]) for one in files.entries]
     recordings, _ = inspected(replace(files, entries=entries))

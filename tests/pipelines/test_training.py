@@ -362,8 +362,8 @@ def test_a_plan_comes_back_from_its_file_as_it_was(few, tmp_path):
     plan = world.plan.assign(**{FINGERPRINT: ["0123456789012345", "12e4567890123456", "1"]})
     table = Table(str(tmp_path / "plan.csv"))
     table.save(plan)
-    assert nodes.planned(table.load()) == nodes.planned(plan)
-    assert len(nodes.planned(plan)) == 2
+    assert nodes.possible_runs(table.load()) == nodes.possible_runs(plan)
+    assert len(nodes.possible_runs(plan)) == 2
 
 
 def test_more_gyroscopes_than_the_recordings_hold_are_refused(world, make_study):

@@ -62,7 +62,7 @@ def test_rates_are_told_by_name_and_unit_or_by_the_users_word(header, columns, o
         (axes("g#"), {"columns": ("gx", "gy", "wz")}, "one column 'wz', got 0.* in 4 columns"),
         (axes("g#"), {"columns": (1, 2, 9)}, "expected one column 9, got 0"),
         (f"{T}gx,gx,gy", {"columns": ("gx", "gy", "gz")}, r"one column 'gx', got 2.*\[1, 2\]"),
-        (axes("g#"), {"columns": {1: (1, 2, 3)}, "imu": 2}, "of IMUs 1, not of IMU 2"),
+        (axes("g#"), {"columns": {1: (1, 2, 3)}, "imu": 2}, "expected IMU 2, got those of IMUs 1"),
         (axes("g# (rad/s)"), {"preamble": "in deg/s"}, "header says rad/s, but lines above.*deg/s"),
         (f"{T}gx (deg/s),gy (rad/s),gz (deg/s)", {}, "header says deg/s, but the header says rad"),
         ("k,dx (rad),dy (rad),dz (rad)", {"increments": True}, "the step .* is not known; give ti"),
@@ -139,11 +139,11 @@ def test_ranges_and_scales_of_other_sensors_are_none_of_the_rates(line, read):
 
 
 @pytest.mark.parametrize(
-    ("dps", "taken"), [(0.00106423, "deg/s a count"), (0.0609759, "rad/s a count")]
+    ("dps", "taken"), [(0.00106423, "deg/s per count"), (0.0609759, "rad/s per count")]
 )
 def test_of_a_scale_with_two_readings_the_one_taken_is_said(dps, taken, read, details):
     above = {"preamble": "tscale,0.001\ngscale,0.00106423", "time_units": 1e-3}
-    with pytest.raises(InputError, match="0.00106423 if it is deg/s.*0.0609759 if it is rad/s a"):
+    with pytest.raises(InputError, match="0.00106423 if it is deg/s.*0.0609759 if it is rad/s per"):
         read("t,gx,gy,gz", S * 1e3, X, **above, **DEG)
     log = read("t,gx,gy,gz", S * 1e3, X, units="raw", scale_dps=dps, **above)
     assert taken in details(log, "scale")[0]
@@ -159,12 +159,14 @@ def test_names_of_two_sensors_are_not_mixed_and_each_imu_has_its_own(read):
 
 @pytest.mark.parametrize("name", ["calibrated_gyro_# (dps)", "uncalibrated_gyro_# (dps)"])
 def test_rates_that_are_free_of_their_bias_are_said(name, read):
-    assert ("left of a bias" in str(read(axes(name), S, X).findings)) == name.startswith("cal")
+    assert ("a bias was subtracted" in str(read(axes(name), S, X).findings)) == name.startswith(
+        "cal"
+    )
 
 
 @pytest.mark.parametrize("name", ["tilt_#", "jerk_#", "field_#", "#"])
 def test_rates_by_units_alone_are_said_and_never_a_quaternion(name, read, details):
-    assert "nothing but units" in details(read(axes(name), S, X, **DEG), "rates")[0]
+    assert "only the option units says" in details(read(axes(name), S, X, **DEG), "rates")[0]
     assert not read(axes(name), S, X, **BY_NUMBER).findings
     header = axes(name, "xyzw")
     with pytest.raises(InputError, match="are by name of a quaternion; give columns"):
@@ -181,7 +183,7 @@ def test_rates_by_units_alone_are_said_and_never_a_quaternion(name, read, detail
         ("T_temp [K]", {}, -248.15, ""),
         ("imu_degC", {}, 25, ""),
         ("T(℃)", {}, 25, ""),
-        ("temp_c", {}, 25, "'temp_c' has no unit and is taken for degrees Celsius"),
+        ("temp_c", {}, 25, "'temp_c' has no unit; degrees Celsius are assumed"),
         ("temp_gyro", {}, 25, "has no unit"),
         ("temp_gyro,temp_board", {}, None, "none of 'temp_gyro', 'temp_board' is kept"),
         ("temp_gyro,temp_board", {"temperature_column": "temp_gyro"}, 25, ""),
@@ -215,7 +217,7 @@ def test_accelerations_are_kept_in_g(unit, factor, read, details):
         ({"units": "deg/s", "increments": True}, "expected a unit of an angle"),
         ({"units": "raw"}, "units: raw and scale_dps go together"),
         ({"scale_dps": 0.1}, "units: raw and scale_dps go together"),
-        ({"offset": 3}, "offset: is of raw counts"),
+        ({"offset": 3}, "offset: applies to raw counts"),
         ({"time_units": "deg"}, "expected a unit of time"),
         ({"time_units": -1}, "greater than 0"),
         ({"acceleration_units": "s"}, "expected a unit of acceleration"),

@@ -43,7 +43,7 @@ def test_the_expression_of_a_refusal_reads_the_lines_when_pasted(name, table):
     np.testing.assert_array_equal(read, VALUES)
     (skipped,) = log.findings
     assert skipped.detail.startswith("4 of 44 lines do not match `row` and were skipped, the first")
-    assert log.place(20) == "row 20 (line 26)"
+    assert log.position(20) == "row 20 (line 26)"
     assert log.preamble == "\n".join(BOOT)
 
 
@@ -65,7 +65,10 @@ def test_groups_may_be_missing_and_unreadable(table):
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ("(", "`row:` in `reader:` of the catalog entry in catalog.yml is no expression"),
+        (
+            "(",
+            "`row:` in `reader:` of the catalog entry in catalog.yml is not a regular expression",
+        ),
         (r"(\d), (\d)", "expected named groups.*got 0 groups.*row: '.gyro="),
         (r"acc=(?P<x>\d)", "got 1 groups and 0 of 9 lines.*row: '.gyro="),
     ],

@@ -26,7 +26,7 @@ def read_beside(read):
 @pytest.mark.parametrize("name", ["gyro", "device_id", "IMU.Channel"])
 @pytest.mark.parametrize("numbers", [ROWS % 4, ROWS // 3000, RNG.integers(0, 3, N)])
 def test_devices_that_take_turns_are_refused_and_picked(name, numbers, details, read_beside):
-    words = f"{name}' takes turns among . .* rows.*by its name devices.*rows: {{{name}: "
+    words = f"{name}' alternates among . .* rows.*by its name devices.*rows: {{{name}: "
     with pytest.raises(InputError, match=words):
         read_beside(name, numbers, WHITE)
     log = read_beside(name, numbers, WHITE, rows={name: 1})
@@ -110,4 +110,4 @@ def test_repeated_rows_are_left_out_where_the_options_say_so(details, read_besid
     assert len(read_beside("k", ROWS, rates).samples) == N
     log = read_beside("k", ROWS, rates, repeats="drop")
     np.testing.assert_array_equal(log.samples, WHITE[: N // 10])
-    assert "5400 of 6000 rows repeat the one before" in details(log, "rows")[0]
+    assert "5400 of 6000 rows repeat the previous row" in details(log, "rows")[0]

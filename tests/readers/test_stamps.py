@@ -46,7 +46,7 @@ def test_the_first_column_that_holds_times_gives_the_rate(header, columns, optio
 @pytest.mark.parametrize(
     ("header", "column", "words"),
     [
-        ("k", S * 0, "no column of times: rate and gaps are unseen; give time_column"),
+        ("k", S * 0, "no column of times: rate and gaps are not measured; give time_column"),
         ("Time", ["no times"] * N, "no column of times"),
         ("time (s)", S * np.nan, "no column of times"),
         ("exposure (ms)", S, "no column of times"),
@@ -65,8 +65,13 @@ def test_what_is_not_known_of_the_time_is_one_short_finding(header, column, word
 @pytest.mark.parametrize(
     ("header", "column", "options", "words"),
     [
-        ("t (ms)", S, {"time_units": "s"}, "has a unit of 0.001 s, but it is read in 1 s.*trust"),
-        ("t", S, {"time_units": "s", "preamble": "tscale,0.001"}, "line above.* 0.001 s.*in 1 s"),
+        ("t (ms)", S, {"time_units": "s"}, "has a unit of 0.001 s, but 1 s is used.*trust"),
+        (
+            "t",
+            S,
+            {"time_units": "s", "preamble": "tscale,0.001"},
+            "line above.* 0.001 s.*but 1 s is used",
+        ),
         ("t (ms)", S, {}, "makes 100000 Hz,.*give time_units: s, which makes 100 Hz;.*trust"),
         ("t (s)", S * 1e6, {}, "makes 0.0001 Hz.*time_units: us, which makes 100 Hz;.*trust"),
         ("t (s)", S, {"preamble": "OutputRate:,120Hz"}, "state 120 Hz, 100 Hz is measured.*trust"),

@@ -106,7 +106,7 @@ def test_damage_of_a_few_rows_is_nan_and_said(case, good, rates, table):
 
 REFUSED = {
     "empty": ("angles", lambda t: "", "got an empty file"),
-    "blank": ("angles", lambda t: "\n\n \n", "expected two rows or more"),
+    "blank": ("angles", lambda t: "\n\n \n", "expected at least two rows"),
     "one row": ("angles", lines(lambda t: t[:2]), "none in the first 2 lines; line 1 begins 'Time"),
     "binary zeros": ("angles", lambda t: bytes(range(4)) * 99, "got binary data"),
     "UTF-16 without mark": ("angles", lambda t: t.encode("utf-16-le"), "`encoding: utf-16-le`"),

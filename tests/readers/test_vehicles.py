@@ -131,7 +131,7 @@ def test_px4_s_own_gyroscope_is_preferred_to_corrected_rates(tmp_path):
     assert not table.findings
     table, columns, rates = read(path, topic="sensor_combined")
     np.testing.assert_allclose(rates, RATES + 1, rtol=1e-6)
-    assert "freed of the autopilot's bias" in table.findings[0].detail
+    assert "minus the autopilot's bias" in table.findings[0].detail
     assert columns["accel.z [m/s^2]"][0] == pytest.approx(-9.8)
 
 

@@ -99,7 +99,9 @@ def test_error_table_by_hand():
     one = of(samples, rate_hz=2.0, true_bias=np.array([1.0, 1, 1]), tested=(0, 3))
     estimates, sigma = np.array([[2.0, 0, 2], [6, 1, 3]]), np.arange(6.0).reshape(2, 3)
     known = one.truths(one.tested, 2).items()
-    table = truths.stacked([truths.error_columns(one, *each, estimates, sigma) for each in known])
+    table = truths.stack_columns(
+        [truths.error_columns(one, *each, estimates, sigma) for each in known]
+    )
     assert (set(table.imu), set(table.recording)) == ({1}, {4})
     assert len(table) == 3 * 2 * 3
     shown = table.set_index(["truth", "window", "axis"]).sort_index()

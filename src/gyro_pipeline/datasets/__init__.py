@@ -1,11 +1,11 @@
-"""All reading and writing of files, as Kedro datasets; nothing here knows of models.
+"""Kedro datasets that read and write all files of the pipelines.
 
-Where logs come from is a catalog entry: :class:`~.file_logs.FileLogs` lists a folder of a logger's
-files, :class:`~.array_logs.ArrayLogs` files in the published authors' array layout;
-:class:`~.published_logs.PublishedLogs` first fetches such files and
-:class:`~.simulated_logs.SimulatedLogs` first writes them. What is kept of them, labelled as
-:mod:`gyro_pipeline.conventions` says, :mod:`~.recordings` stores as netCDF one by one.
-:class:`~.tables.Table` keeps tables as CSV, :mod:`~.reports` writes what people read. Every file
-is written under a temporary name and renamed when complete, so that an interrupted run leaves the
-old file or the new one, never half of one.
+A catalog entry names the source of the logs: :class:`~.file_logs.FileLogs` for a folder of a
+logger's files, :class:`~.array_logs.ArrayLogs` for files in the authors' array layout,
+:class:`~.published_logs.PublishedLogs`, which downloads such files first, or
+:class:`~.simulated_logs.SimulatedLogs`, which simulates them first. :mod:`~.recordings` stores the
+usable recordings, labelled as in :mod:`gyro_pipeline.conventions`, as netCDF, one by one.
+:class:`~.tables.Table` stores tables, :mod:`~.reports` writes tables, figures and pages for
+readers. Every file is written under a temporary name and renamed when complete, so that an
+interrupted run leaves the old file or the new file, never a partial one.
 """

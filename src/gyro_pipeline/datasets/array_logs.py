@@ -1,4 +1,4 @@
-"""Logs in the array layout of the published authors' files."""
+"""Logs in the array layout of the files that the paper's authors publish."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -15,29 +15,29 @@ from gyro_pipeline.fingerprints import fingerprint
 from gyro_pipeline.logs import Log, LogEntry, Logs
 
 LAYOUT = ("recording", "gyroscope", "sample")
-"""What the three axes of a file are, in the order in which the published files have them."""
+"""The three axes of a file, in the order of the published files."""
 
 _WHOLE = "all"
-"""The key of a file whose recordings are not split into train and test."""
+"""Key of a file whose recordings are not split into train and test."""
 
 Order = tuple[str, ...]
 Shape = tuple[int, ...]
 
 
 class ArrayLogs(LogSource):
-    """Lists what 3-D ``.npy`` files hold: recordings, gyroscopes, samples, in any order, deg/s.
+    """Lists the recordings of 3-D ``.npy`` files, in deg/s, with axes in any order.
 
-    Gyroscopes come three to an IMU, IMU by IMU, in the order x, y, z. Counts are read from the
-    files, never required. Samples are judged by the quality control, where they are read.
+    The gyroscopes of each IMU follow each other in the order x, y, z. The files determine the
+    numbers of recordings, gyroscopes and samples.
 
     Args:
-        sensor, sensors, source, path, metadata: As :class:`~.log_source.LogSource` takes them.
+        sensor, sensors, source, path, metadata: As for :class:`~.log_source.LogSource`.
         files: Names of the files: ``{"train": name, "test": name}``, or ``{"all": name}``.
-        axes_order: ``recording``, ``gyroscope`` and ``sample`` in the order of the files'
-            axes; needed only where their shapes leave it open.
+        axes_order: ``recording``, ``gyroscope`` and ``sample`` in the order of the files' axes;
+            needed only if their shapes are ambiguous.
 
     Raises:
-        InputError: An unknown sensor, or an entry that is not as described here.
+        InputError: The sensor is unknown, or an argument is not as described here.
     """
 
     def __init__(
@@ -53,8 +53,8 @@ class ArrayLogs(LogSource):
         super().__init__(sensor, sensors, source, path, metadata)
         if set(files) not in ({"train", "test"}, {_WHOLE}) or len(set(files.values())) < len(files):
             raise InputError(
-                f"{sensor}: files: expected a train and a test file, which are not the same one, "
-                f"or all, one file to be split, got {dict(files)}"
+                f"{sensor}: files: expected train and test, two different files, or all, one file "
+                f"to be split, got {dict(files)}"
             )
         if axes_order is not None and sorted(axes_order) != sorted(LAYOUT):
             raise InputError(
@@ -68,10 +68,10 @@ class ArrayLogs(LogSource):
         """List the recordings of all files; their samples are read later, one at a time.
 
         Returns:
-            Recordings of the train file come first and those of the test file are numbered on.
+            The recordings; those of the test file have the numbers after those of the train file.
 
         Raises:
-            InputError: As the cause of Kedro's ``DatasetError``, a file that cannot be used.
+            InputError: A file cannot be used; as the cause of Kedro's ``DatasetError``.
         """
         shapes = {name: self._open(name).shape for name in self._files.values()}
         order, entries, first = self._order(shapes), list[LogEntry](), 1
@@ -101,7 +101,7 @@ class ArrayLogs(LogSource):
         return super()._describe() | {"files": self._files, "axes_order": self._axes_order}
 
     def _open(self, name: str) -> NDArray[Any]:
-        """Map one file, refusing what is not three axes of real numbers."""
+        """Map a file to memory; refuse anything but three axes of real numbers."""
         where, path = f"{self._sensor} {name}", self._path / name
         if not path.is_file():
             raise InputError(
@@ -113,8 +113,8 @@ class ArrayLogs(LogSource):
         except Exception as error:  # a damaged header fails in many ways
             raise InputError(
                 f"{where}: expected a plain numeric .npy file as numpy.save writes it, but: "
-                f"{error}. It is truncated, of another format, or holds pickled objects, which are "
-                f"never loaded; replace or delete {path}"
+                f"{error}. It is truncated, has another format, or contains pickled objects, which "
+                f"are never loaded; replace or delete {path}"
             ) from error
         if array.dtype.kind not in "iuf" or array.ndim != len(LAYOUT) or array.size == 0:
             raise InputError(
@@ -124,39 +124,39 @@ class ArrayLogs(LogSource):
         return array
 
     def _order(self, shapes: Mapping[str, Shape]) -> Order:
-        """Tell which axis is which, by the shapes where they allow only one answer."""
-        given = self._axes_order
+        """Determine the order of the axes, by the shapes if these are unambiguous."""
+        option = self._axes_order
         plausible = [
             order
             for order in permutations(LAYOUT)
             if all(_is_plausible(order, shape) for shape in shapes.values())
         ]
-        if len(plausible) == 1 and given in (None, plausible[0]):
+        if len(plausible) == 1 and option in (None, plausible[0]):
             return plausible[0]
-        if given and len(plausible) != 1 and all(_in_threes(given, s) for s in shapes.values()):
-            return given
-        listed = [f"[{', '.join(order)}]" for order in plausible]
+        if option and len(plausible) != 1 and all(_has_triples(option, s) for s in shapes.values()):
+            return option
+        orders = [f"[{', '.join(order)}]" for order in plausible]
         raise InputError(
             f"{self._sensor} {', '.join(f'{name} of shape {s}' for name, s in shapes.items())}: "
             "axes_order in the catalog entry in catalog.yml: expected "
-            f"[{', '.join(LAYOUT)}] in the order of the file's axes, got {list(given or [])}. By "
+            f"[{', '.join(LAYOUT)}] in the order of the file's axes, got {list(option or [])}. By "
             "their lengths, gyroscopes in threes and far more samples than recordings or "
-            f"gyroscopes, they can be {' or '.join(listed) or 'none'}"
+            f"gyroscopes, they can be {' or '.join(orders) or 'none'}"
         )
 
 
 def _is_plausible(order: Order, shape: Shape, least_ratio: int = 4) -> bool:
-    """Whether there are so many times more samples than recordings or gyroscopes."""
+    """Whether samples outnumber recordings and gyroscopes by at least a ratio."""
     samples = shape[order.index("sample")]
-    return _in_threes(order, shape) and samples >= least_ratio * sorted(shape)[1]
+    return _has_triples(order, shape) and samples >= least_ratio * sorted(shape)[1]
 
 
-def _in_threes(order: Order, shape: Shape) -> bool:
+def _has_triples(order: Order, shape: Shape) -> bool:
     return shape[order.index("gyroscope")] % len(AXES) == 0
 
 
 def _read(path: Path, order: Order, imu: int, recording: int) -> Log:
-    """One recording of one IMU, out of a file that was found to be in order."""
+    """Read a recording of an IMU from a file that was checked before."""
     array = np.lib.format.open_memmap(path, mode="r")
     recordings_first = array.transpose([order.index(name) for name in LAYOUT])
     gyroscopes = slice(len(AXES) * imu, len(AXES) * (imu + 1))

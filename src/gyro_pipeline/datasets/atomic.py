@@ -1,4 +1,4 @@
-"""Files that appear complete or not at all."""
+"""Writes files completely or not at all."""
 
 import errno
 import os
@@ -12,7 +12,7 @@ from gyro_pipeline.conventions import InputError
 
 _TEMPORARY = re.compile(r"\..+\.\d+(\.\w+)?")
 _SPARE_BYTES = 1 << 16
-"""Of tables, labels and what the file system itself writes, beside the samples of a file."""
+"""Room for a file's tables and labels, and for the file system, besides the samples."""
 
 
 @contextmanager
@@ -20,13 +20,13 @@ def replacing(path: Path) -> Iterator[Path]:
     """Write a file beside its final name and rename it when the block ends without an error.
 
     Args:
-        path: The final name. Folders above it are made.
+        path: The final name. Its parent folders are created.
 
     Yields:
         An empty file in the same folder, with the same suffix, that no other process uses.
 
     Raises:
-        InputError: A file is where a folder is needed or the other way round.
+        InputError: A file exists where a folder is needed, or a folder where a file is.
         OSError: The folder cannot be written to.
     """
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
@@ -36,32 +36,32 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.touch()
         yield temporary
         os.replace(temporary, path)
-    except BaseException:  # an interrupt from the keyboard as well
+    except BaseException:  # including KeyboardInterrupt
         temporary.unlink(missing_ok=True)
         raise
 
 
 def remove_leftovers(folder: Path) -> int:
-    """Remove what killed processes left of :func:`replacing` in a folder that nobody writes to.
+    """Remove temporary files of killed processes from a folder that nobody writes to.
 
     Returns:
-        How many files there were.
+        Number of removed files.
     """
-    left = [path for path in folder.glob(".*") if _TEMPORARY.fullmatch(path.name)]
-    for path in left:
+    leftovers = [path for path in folder.glob(".*") if _TEMPORARY.fullmatch(path.name)]
+    for path in leftovers:
         path.unlink()
-    return len(left)
+    return len(leftovers)
 
 
 def require_room(path: Path, size: int) -> None:
-    """Refuse to write a file that there is no room for: libraries that map files crash on it.
+    """Refuse to write a file for which the disk has no room; libraries that map files would crash.
 
     Args:
-        path: In a folder that is there.
+        path: A file in an existing folder.
         size: Bytes.
 
     Raises:
-        OSError: Its error number is ENOSPC.
+        OSError: The disk has less room; the error number is ENOSPC.
     """
     if shutil.disk_usage(path.parent).free < size + _SPARE_BYTES:
         reason = f"no space left, where {size / 1e6:.1f} MB are needed"
@@ -69,10 +69,10 @@ def require_room(path: Path, size: int) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Refuse before a long run what :func:`replacing` would refuse at its end; makes nothing.
+    """Check, without writing anything, that :func:`replacing` will succeed.
 
     Raises:
-        InputError: A file is where a folder is needed or the other way round.
+        InputError: A file exists where a folder is needed, or a folder where a file is.
         OSError: The folder cannot be written to.
     """
     nearest = next(folder for folder in path.parents if folder.exists())

@@ -1,4 +1,4 @@
-"""Logs as loggers write them: a folder of files, one a recording."""
+"""Logs in a folder of a logger's files, one file per recording."""
 
 import logging
 import os
@@ -21,7 +21,7 @@ from gyro_pipeline.parameters import ReaderOptions
 
 _LOG = logging.getLogger(__name__)
 
-_HIDDEN = re.compile(r"(^|/)(\.|~\$)")  # the latter while Excel has a file open
+_HIDDEN = re.compile(r"(^|/)(\.|~\$)")  # Excel writes ~$ files while it has a file open
 _PARTS = {
     "{imu}": "0*(?P<imu>[0-9]{1,18})",
     "{recording}": "0*(?P<recording>[0-9]{1,18})",
@@ -29,30 +29,31 @@ _PARTS = {
     "{recording:name}": "(?P<recording>[^/]+?)",
     "*": "[^/]*",
 }
-"""What a pattern is made of, as regular expressions."""
-_UNCLEAR = re.compile(r"[}*][{*]|\{(imu|recording)\}[0-9]")  # where does the first part end?
+"""Parts of a pattern and their regular expressions."""
+_AMBIGUOUS = re.compile(r"[}*][{*]|\{(imu|recording)\}[0-9]")
+"""Adjacent parts of a pattern, which do not determine where the first one ends."""
 
 Matches = Mapping[str, re.Match[str]]
 """The pattern's match of each file, by its path in the folder."""
 
 
 class FileLogs(LogSource):
-    """Lists the files of a folder that match a pattern, each one recording of one IMU.
+    """Lists the files of a folder that match a pattern, each a recording of an IMU.
 
-    Where ``columns`` of the reader are given for several IMUs, each file is one of each of them.
+    If the reader's option ``columns`` names several IMUs, each file has a recording of each IMU.
 
     Args:
-        sensor, source, path, sensors, metadata: As :class:`~.log_source.LogSource` takes them.
-        pattern: Of the files' paths in the folder; by default all files in it. ``{imu}`` and
-            ``{recording}`` stand for their numbers; ``{imu:name}`` and ``{recording:name}`` for
-            names, which are numbered in their order; ``*`` for anything but a slash. Without an
-            IMU all files are of IMU 1; without a recording the files of an IMU are numbered in
+        sensor, source, path, sensors, metadata: As for :class:`~.log_source.LogSource`.
+        pattern: Pattern of the files' paths in the folder; by default all files in it. ``{imu}``
+            and ``{recording}`` stand for numbers; ``{imu:name}`` and ``{recording:name}`` for
+            names, which are numbered in their order; ``*`` for any text without a slash. Without an
+            IMU all files belong to IMU 1; without a recording the files of an IMU are numbered in
             their order.
         reader: How the files are read (:class:`gyro_pipeline.parameters.ReaderOptions`).
-        cache: No longer needed; said once, and ignored.
+        cache: Obsolete; a message says so, and the value is ignored.
 
     Raises:
-        InputError: An unknown sensor; a pattern or reader options that are not usable.
+        InputError: The sensor is unknown, or the pattern or the reader options are invalid.
     """
 
     def __init__(
@@ -68,7 +69,7 @@ class FileLogs(LogSource):
     ) -> None:
         super().__init__(sensor, sensors, source, path, metadata)
         self._pattern = str(pattern)
-        self._regex = _compiled(f"{sensor}: pattern in the catalog entry", self._pattern)
+        self._regex = _compile(f"{sensor}: pattern in the catalog entry", self._pattern)
         where = f"{sensor}: reader in the catalog entry"
         try:
             self._options = ReaderOptions.model_validate(reader or {})
@@ -78,32 +79,31 @@ class FileLogs(LogSource):
         self._side_by_side = list(columns) if isinstance(columns, Mapping) else []
         if self._side_by_side and "imu" in self._regex.groupindex:
             raise InputError(
-                f"{where}: columns name several IMUs in each file, and {{imu}} in the pattern "
-                f"{pattern} says that a file is of one; leave one of the two out"
+                f"{where}: columns name several IMUs in each file, but {{imu}} in the pattern "
+                f"{pattern} says that a file has a single IMU; remove one of the two"
             )
         self._messages: set[str] = set()
         if cache is not None:
-            self._say("cache in the catalog entry is no longer needed; remove it")
+            self._log_once("cache in the catalog entry is no longer needed; remove it")
 
     def load(self) -> Logs:
         """List the recordings; their files are read later, one at a time.
 
         Raises:
-            InputError: As the cause of Kedro's ``DatasetError``, no such folder, no file that
-                matches, or two files of one recording.
+            InputError: The folder does not exist, no file matches, or two files are the same
+                recording; as the cause of Kedro's ``DatasetError``.
         """
         rate_hz, reader = self.entry.rate_hz, code_hash("gyro_pipeline.readers")
         settings = [self._options.model_dump(mode="json"), rate_hz, reader]
-        places = self._places(self._matching())
         entries = [
             self._entry(name, imu, recording, settings)
-            for (own, recording), name in places.items()
-            for imu in self._side_by_side or [own]
+            for (file_imu, recording), name in self._files_by_recording(self._matching()).items()
+            for imu in self._side_by_side or [file_imu]
         ]
         imus = len({entry.imu for entry in entries})
         if self.entry.imus not in (None, imus):
             stated = f"globals.yml says imus: {self.entry.imus}"
-            self._say(f"files of {imus} IMUs, where {stated}", logging.WARNING)
+            self._log_once(f"files of {imus} IMUs, where {stated}", logging.WARNING)
         entries.sort(key=lambda entry: (entry.imu, entry.recording))
         return Logs(self._sensor, self._source, False, rate_hz, entries)
 
@@ -114,16 +114,16 @@ class FileLogs(LogSource):
         reader = self._options.model_dump(exclude_defaults=True)
         return super()._describe() | {"pattern": self._pattern, "reader": reader}
 
-    def _say(self, message: str, level: int = logging.INFO) -> None:
+    def _log_once(self, message: str, level: int = logging.INFO) -> None:
         """Log a message once, although several nodes load the source."""
         if message not in self._messages:
             self._messages.add(message)
             _LOG.log(level, "%s %s: %s", self._sensor, self._path, message)
 
     def _entry(self, name: str, imu: int, recording: int, settings: list[Any]) -> LogEntry:
-        """One IMU of one file."""
+        """The entry of an IMU of a file."""
         path = self._path / name
-        state = path.stat() if path.exists() else path.lstat()  # a broken link is rejected as read
+        state = path.stat() if path.exists() else path.lstat()  # reading rejects a broken link
         columns_of = {"imu": imu} if self._side_by_side else {}
         return LogEntry(
             *(imu, recording, printable(name)),
@@ -133,7 +133,7 @@ class FileLogs(LogSource):
         )
 
     def _matching(self) -> Matches:
-        """Paths in the folder that the pattern describes, 2 before 10."""
+        """Paths in the folder that match the pattern, 2 before 10."""
         where = f"{self._sensor} {self._path}"
         if not self._path.is_dir():
             raise InputError(
@@ -149,39 +149,39 @@ class FileLogs(LogSource):
                 "correct the pattern in the catalog, or the files' names"
             )
         if others:
-            self._say(f"{len(others)} files are not like {self._pattern}: {_first(others)}")
+            self._log_once(f"{len(others)} files are not like {self._pattern}: {_first(others)}")
         return matches
 
-    def _places(self, matches: Matches) -> dict[tuple[int, int], str]:
+    def _files_by_recording(self, matches: Matches) -> dict[tuple[int, int], str]:
         """The file of each IMU and recording."""
         imus, recordings = (self._numbers(part, matches) for part in ("imu", "recording"))
         if "recording" not in self._regex.groupindex and "*" in self._pattern:
-            following = defaultdict[int, Iterator[int]](partial(count, 1))
-            recordings = [next(following[imu]) for imu in imus]
-            self._say(
+            counters = defaultdict[int, Iterator[int]](partial(count, 1))
+            recordings = [next(counters[imu]) for imu in imus]
+            self._log_once(
                 "recordings of each IMU are numbered in the order of the files' names: "
                 + _first([f"{name} is {n}" for name, n in zip(matches, recordings, strict=True)])
             )
-        places = dict[tuple[int, int], str]()
-        for name, *place in zip(matches, imus, recordings, strict=True):
-            other = places.setdefault((place[0], place[1]), name)
+        files = dict[tuple[int, int], str]()
+        for name, imu, recording in zip(matches, imus, recordings, strict=True):
+            other = files.setdefault((imu, recording), name)
             if other != name:
                 raise InputError(
                     f"{self._sensor}: {printable(f'{other} and {name}')} are both recording "
-                    f"{place[1]} of IMU {place[0]} by the pattern {self._pattern}; remove one of "
+                    f"{recording} of IMU {imu} by the pattern {self._pattern}; remove one of "
                     "them, or correct the pattern in the catalog"
                 )
-        return places
+        return files
 
     def _numbers(self, part: str, matches: Matches) -> list[int]:
-        """The number that one part of each path says, or that its name gets; 1 without the part."""
+        """The number in a part of each path, or the number of its name; 1 without the part."""
         if part not in self._regex.groupindex:
             return [1] * len(matches)
-        texts = [match[part] for match in matches.values()]  # of numbers without leading zeros
+        texts = [match[part] for match in matches.values()]  # numbers lack leading zeros
         if f"{{{part}:name}}" in self._pattern:
             numbers = {text: number for number, text in enumerate(dict.fromkeys(texts), 1)}
             order = _first([f"{text} is {number}" for text, number in numbers.items()])
-            self._say(f"{len(numbers)} {part}s by name: {order}")
+            self._log_once(f"{len(numbers)} {part}s by name: {order}")
             return [numbers[text] for text in texts]
         if "0" in texts:
             raise InputError(
@@ -192,21 +192,21 @@ class FileLogs(LogSource):
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    """All files in a folder and in those below it, also behind links, but not in circles."""
-    for here, inner, names in os.walk(folder, followlinks=True):
-        above = {os.path.realpath(path) for path in (Path(here), *Path(here).parents)}
-        inner[:] = [name for name in inner if os.path.realpath(Path(here, name)) not in above]
-        yield from (Path(here, name) for name in names)
+    """All files in a folder and its subfolders, following links unless these lead in circles."""
+    for root, folders, names in os.walk(folder, followlinks=True):
+        parents = {os.path.realpath(path) for path in (Path(root), *Path(root).parents)}
+        folders[:] = [name for name in folders if os.path.realpath(Path(root, name)) not in parents]
+        yield from (Path(root, name) for name in names)
 
 
-def _compiled(where: str, pattern: str) -> re.Pattern[str]:
-    """The pattern as a regular expression."""
+def _compile(where: str, pattern: str) -> re.Pattern[str]:
+    """Translate a pattern to a regular expression."""
     pieces = re.split("({})".format("|".join(map(re.escape, _PARTS))), pattern)
-    twice = any(pattern.count(f"{{{part}") > 1 for part in ("imu", "recording"))
-    if twice or re.search("[{}]", "".join(pieces[::2])) or _UNCLEAR.search(pattern):
+    duplicates = any(pattern.count(f"{{{part}") > 1 for part in ("imu", "recording"))
+    if duplicates or re.search("[{}]", "".join(pieces[::2])) or _AMBIGUOUS.search(pattern):
         raise InputError(
             f"{where}: expected {{imu}} or {{imu:name}}, {{recording}} or {{recording:name}}, each "
-            "once, and *, with a character between them that is no digit, such as imu{imu}/*.csv, "
+            "once, and *, separated by characters that are not digits, such as imu{imu}/*.csv, "
             f"got {pattern}"
         )
     return re.compile("".join(_PARTS.get(piece, re.escape(piece)) for piece in pieces))

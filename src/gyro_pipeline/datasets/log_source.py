@@ -1,4 +1,4 @@
-"""What all sources of raw logs have in common."""
+"""The base class of all sources of raw logs."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,17 +14,17 @@ from gyro_pipeline.parameters import Sensor
 
 
 class LogSource(AbstractDataset[Logs, Logs]):
-    """Logs of one sensor in a folder, read only.
+    """Logs of a sensor in a folder, read only.
 
     Args:
-        sensor: Name of the sensor the files are of.
-        sensors: All sensors, as in ``conf/base/globals.yml``; None: nothing is known of this one.
-        source: Where the logs come from, as stored paths name it.
+        sensor: Name of the sensor.
+        sensors: All sensors, as in ``conf/base/globals.yml``; None if the sensor has no entry.
+        source: Name of the source, as in stored paths.
         path: Folder of the files.
         metadata: For other tools, such as Kedro-Viz.
 
     Raises:
-        InputError: No such sensor, or its entry is not usable.
+        InputError: The sensor is unknown, or its entry is invalid.
     """
 
     def __init__(
@@ -46,14 +46,14 @@ class LogSource(AbstractDataset[Logs, Logs]):
         self.metadata = metadata
 
     def state(self) -> str:
-        """A hash of what is listed: recordings, and the files that they are in."""
+        """A hash of the listed recordings and the state of their files."""
         return fingerprint(
             [(entry.imu, entry.recording, entry.key) for entry in self.load().entries]
         )
 
     def save(self, data: Logs) -> None:
         """Refuse: logs are read only."""
-        raise DatasetError(f"{self._sensor}: logs are read only, {self._path} is not written to")
+        raise DatasetError(f"{self._sensor}: logs are read only; {self._path} is never written to")
 
     def _describe(self) -> dict[str, Any]:
         return {"sensor": self._sensor, "source": self._source, "path": str(self._path)}
@@ -62,7 +62,8 @@ class LogSource(AbstractDataset[Logs, Logs]):
 def _entry(sensor: str, sensors: Mapping[str, Mapping[str, Any]]) -> Sensor:
     if sensor not in sensors:
         raise InputError(
-            f"unknown sensor {sensor!r}; conf/base/globals.yml knows {', '.join(sensors)}"
+            f"unknown sensor {sensor!r}; expected one of {', '.join(sensors)}, or a new entry in "
+            "conf/base/globals.yml"
         )
     try:
         return Sensor.model_validate(sensors[sensor])

@@ -19,23 +19,23 @@ _LOG = logging.getLogger(__name__)
 class PublishedFile(Parameter):
     """A file of a public git repository."""
 
-    # Not `path`: Kedro takes a value of that name for a local path, and makes it an absolute one.
-    remote: str = Field(min_length=1, description="its path below the base address")
-    blob: str = Field(pattern="^[0-9a-f]{40}$", description="git blob id of its content")
+    # not `path`, as Kedro turns values of this name into absolute local paths
+    remote: str = Field(min_length=1, description="path below the base address")
+    blob: str = Field(pattern="^[0-9a-f]{40}$", description="git blob id of the content")
 
 
 class PublishedLogs(ArrayLogs):
-    """Array files that are fetched once, verified at every load, and read as any such files.
+    """Array files that are downloaded once and verified at every load.
 
     Args:
-        sensor, sensors, source, axes_order, metadata: As :class:`~.array_logs.ArrayLogs` has them.
+        sensor, sensors, source, axes_order, metadata: As for :class:`~.array_logs.ArrayLogs`.
         address: Base address, to which the files' paths are relative.
-        path: Local folder of the files. Those already there are verified, not fetched.
-        files: ``remote`` (path below the address) and ``blob`` (git blob id) of each:
+        path: Local folder of the files. Existing files are verified, not downloaded.
+        files: ``remote`` (path below the address) and ``blob`` (git blob id) of each file:
             ``{"train": …, "test": …}``, or ``{"all": …}``.
 
     Raises:
-        InputError: An unknown sensor, or an entry that is not as described here.
+        InputError: The sensor is unknown, or an argument is not as described here.
     """
 
     def __init__(
@@ -49,17 +49,17 @@ class PublishedLogs(ArrayLogs):
         axes_order: Sequence[str] | None = None,
         metadata: dict[str, Any] | None = None,
     ) -> None:
-        self._published = {split: _published(sensor, split, files[split]) for split in files}
+        self._published = {split: _published_file(sensor, split, files[split]) for split in files}
         names = {split: PurePosixPath(file.remote).name for split, file in self._published.items()}
         super().__init__(sensor, sensors, source, path, names, axes_order, metadata)
         self._address = address.rstrip("/")
 
     def load(self) -> Logs:
-        """Fetch what is not there, verify all of it, and list the recordings.
+        """Download missing files, verify all files, and list the recordings.
 
         Raises:
-            InputError: As the cause of Kedro's ``DatasetError``, a file that cannot be fetched, is
-                another one than was published, or cannot be used.
+            InputError: A file cannot be downloaded, is not the published one, or cannot be used; as
+                the cause of Kedro's ``DatasetError``.
         """
         for split, file in self._published.items():
             ensure(f"{self._address}/{file.remote}", self._path / self._files[split], file.blob)
@@ -71,7 +71,7 @@ class PublishedLogs(ArrayLogs):
         return super()._describe() | {"address": self._address, "files": files}
 
 
-def _published(sensor: str, split: str, file: Mapping[str, str]) -> PublishedFile:
+def _published_file(sensor: str, split: str, file: Mapping[str, str]) -> PublishedFile:
     try:
         return PublishedFile.model_validate(file)
     except ValidationError as error:

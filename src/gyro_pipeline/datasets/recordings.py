@@ -25,28 +25,28 @@ from gyro_pipeline.logs import Finding, Listing, Recording, with_recordings
 _ENGINE: Final = "h5netcdf"
 
 _INSPECTION: Final = "inspection"
-"""The variable (imu, recording) with all of a :class:`Recording` but its samples, as JSON."""
+"""The variable (imu, recording) with each :class:`Recording` without its samples, as JSON."""
 _SEAL: Final = "fingerprint"
-"""Of all else in such a text: it may be damaged in a file that is not complete."""
-_PLACE: Final = ("imu", "recording")
+"""Key of a hash of the rest of such a JSON text, which may be damaged in an incomplete file."""
+_DIMENSIONS: Final = ("imu", "recording")
 _TEXT: Final = h5py.string_dtype()
 _UNITS: Final = {"angular_rate": "deg/s", "temperature_c": "degrees Celsius", "acceleration_g": "g"}
 
 
 class Recordings(StoredFile):
-    """Keeps recordings in one netCDF file and reads them lazily.
+    """Stores recordings in a netCDF file and reads them lazily.
 
-    What ``load`` returns stays in the file until values are asked for, and again afterwards, so
-    it is small to hold and is handed to another process as a reference to the file. Whoever opens
-    the file, in whichever process, gets what was there when it was loaded, or an error.
+    ``load`` returns arrays whose values are read from the file each time they are needed, so they
+    take little memory and are sent to another process as a reference to the file. Any process that
+    opens the file gets the content that was loaded, or an error.
 
-    What is saved are labelled arrays, which may themselves be read from the same file. Those with
-    ``samples``, 0 for recordings that are not to be used, but without ``angular_rate`` complete
-    what :class:`InspectedRecordings` has kept.
+    ``save`` takes labelled arrays, which may be read from the same file. Arrays with ``samples``, 0
+    for recordings that are not to be used, but without ``angular_rate`` complete the file of
+    :class:`InspectedRecordings`.
     """
 
     def save(self, data: xr.Dataset) -> None:
-        """Write the file under a temporary name and rename it; open readers keep the old one."""
+        """Write the file under a temporary name and rename it; open readers keep the old file."""
         if "samples" not in data or "angular_rate" in data:
             super().save(data)
             return
@@ -61,18 +61,17 @@ class Recordings(StoredFile):
 
     def _write(self, data: xr.Dataset, path: Path) -> None:
         require_room(path, data.nbytes)
-        # in place of the encodings that variables read from a file carry, which say how they were
-        # stored there and not what they hold now
+        # replaces the encodings of variables from a file, which describe the storage there
         encoding = {name: {"_FillValue": None} for name in data.variables}
         data.to_netcdf(path, engine=_ENGINE, encoding=encoding)
 
 
 class InspectedRecordings(AbstractDataset[Listing | Recording, list[Recording]]):
-    """Keeps recordings one by one, as they are read, in a netCDF file beside the final one.
+    """Stores recordings one by one, as they are read, in a netCDF file beside the final file.
 
-    A :class:`Listing` begins the file with what is there already of the recordings that it lists,
-    from a reading that was interrupted or from the last complete one. A chunk holds a recording,
-    so rejected and absent ones take no space. :class:`Recordings` completes the file.
+    Saving a :class:`Listing` begins the file with those of its recordings that an interrupted or
+    the last complete run has stored. Each recording is a chunk, so rejected and absent recordings
+    take no space. :class:`Recordings` completes the file.
 
     Args:
         filepath: The final netCDF file.
@@ -80,7 +79,7 @@ class InspectedRecordings(AbstractDataset[Listing | Recording, list[Recording]])
     """
 
     used_up = True
-    """:class:`Recordings` takes the file over: whoever labels recordings anew begins another."""
+    """The content is gone after use: :class:`Recordings` renames the file."""
 
     def __init__(self, filepath: str, metadata: dict[str, Any] | None = None) -> None:
         self._final = Path(filepath)
@@ -89,12 +88,12 @@ class InspectedRecordings(AbstractDataset[Listing | Recording, list[Recording]])
         self.metadata = metadata
 
     def load(self) -> list[Recording]:
-        """All recordings that are there, by IMU and number, without their samples."""
+        """All stored recordings, ordered by IMU and number, without their samples."""
         self._release()
         return list(_stored(self._source()))
 
     def save(self, data: Listing | Recording) -> None:
-        """Begin a file for the recordings of a listing, or add one of them."""
+        """Begin a file for the recordings of a listing, or add a recording."""
         if isinstance(data, Recording):
             self._writer = self._writer or _Writer(self._path)
             self._writer.add(data)
@@ -109,7 +108,7 @@ class InspectedRecordings(AbstractDataset[Listing | Recording, list[Recording]])
 
     @staticmethod
     def state() -> str:
-        """Nothing: it is what a reading goes on from, and decides no result."""
+        """A constant, as the stored recordings only save time and affect no result."""
         return ""
 
     def _source(self) -> Path:
@@ -130,39 +129,43 @@ class InspectedRecordings(AbstractDataset[Listing | Recording, list[Recording]])
 class _Writer:
     """Adds recordings to a file that :func:`_begin` wrote.
 
-    The file stays open, as opening it takes longer than writing. A process that is killed loses at
-    most the recordings of the last ``every_s`` seconds: their descriptions, which mark them as
-    complete, are written together after their samples.
+    The file stays open, as opening it takes longer than writing. The descriptions of recordings,
+    which mark them as complete, are written every ``every_s`` seconds, after the samples. So a
+    killed process loses the recordings of ``every_s`` seconds at most.
     """
 
     def __init__(self, path: Path, every_s: float = 1.0) -> None:
         self._file = h5py.File(path, "r+")
-        self._index = [{int(n): i for i, n in enumerate(self._file[name])} for name in _PLACE]
+        self._indices = [
+            {int(n): i for i, n in enumerate(self._file[name])} for name in _DIMENSIONS
+        ]
         self._arrays = dict[str, h5py.Dataset]()
         self._texts = dict[tuple[int, ...], str]()
         self._every_s, self._due = every_s, time.monotonic()
 
     def add(self, recording: Recording) -> None:
-        """Write the samples, and the description with those of the next ``every_s`` seconds."""
+        """Write the samples now, and the description within ``every_s`` seconds."""
         require_room(Path(self._file.filename), sum(v.nbytes for v in recording.variables.values()))
-        index = tuple(of[n] for of, n in zip(self._index, recording.place, strict=True))
+        index = tuple(
+            indices[n] for indices, n in zip(self._indices, recording.labels, strict=True)
+        )
         for name, values in recording.variables.items():
             if name not in self._arrays or self._arrays[name].shape[-1] < values.shape[-1]:
-                _make_room(self._file, name, values)
+                _enlarge(self._file, name, values)
                 self._arrays[name] = self._file[name]
-            stored = self._arrays[name].id  # an assignment takes three times as long
-            part = stored.get_space()
-            part.select_hyperslab((*index, *[0] * values.ndim), (1, 1, *values.shape))
-            stored.write(h5py.h5s.create_simple(values.shape), part, values)
+            dataset = self._arrays[name].id  # an assignment to the array takes three times as long
+            space = dataset.get_space()
+            space.select_hyperslab((*index, *[0] * values.ndim), (1, 1, *values.shape))
+            dataset.write(h5py.h5s.create_simple(values.shape), space, values)
         findings = [vars(finding) for finding in recording.findings]
-        contents = {name: data_hash(values, None) for name, values in recording.variables.items()}
-        described = vars(recording) | {"findings": findings, "variables": contents}
-        self._texts[index] = json.dumps(described | {_SEAL: fingerprint(described)})
+        hashes = {name: data_hash(values, None) for name, values in recording.variables.items()}
+        description = vars(recording) | {"findings": findings, "variables": hashes}
+        self._texts[index] = json.dumps(description | {_SEAL: fingerprint(description)})
         if time.monotonic() >= self._due:
             self._flush()
 
     def close(self) -> None:
-        """Write what is left to write."""
+        """Write the remaining descriptions and close the file."""
         self._flush()
         self._file.close()
 
@@ -176,7 +179,7 @@ class _Writer:
 
 
 def path_in_progress(final: Path) -> Path:
-    """The file in which recordings are kept while others are still read."""
+    """The file that stores recordings while others are still read."""
     return final.with_suffix(f".unfinished{final.suffix}")
 
 
@@ -184,24 +187,24 @@ def open_recordings(path: Path) -> xr.Dataset:
     """Open a file that :class:`Recordings` wrote.
 
     Returns:
-        Its content, as :func:`~gyro_pipeline.logs.with_recordings` leaves it, with the values still
-        in the file.
+        Its content without unusable recordings (:func:`~gyro_pipeline.logs.with_recordings`), read
+        lazily.
 
     Raises:
-        InputError: A damaged file.
+        InputError: The file is damaged.
     """
     files = CachingFileManager(_open_unchanged, str(path), check_content(path), mode="r")
     store = H5NetCDFStore(files, mode="r")
-    # values that are cached once read would be pickled, and kept in memory
+    # cached values would be kept in memory and pickled
     lazy = xr.open_dataset(store, cache=False, drop_variables=[_INSPECTION])
-    # netCDF gives NumPy numbers, which JSON does not take
+    # attributes are NumPy numbers, which json cannot write
     plain = {key: v.item() if isinstance(v, np.generic) else v for key, v in lazy.attrs.items()}
     recordings = lazy.assign_attrs(plain)
     return with_recordings(recordings) if "samples" in recordings else recordings
 
 
 def _open_unchanged(path: str, digest: str, mode: str) -> h5netcdf.File:
-    """Open a file whose content has this digest, also in a worker that was sent a reference."""
+    """Open a file if its digest is unchanged, also in a worker that was sent a reference."""
     if digest_of(Path(path)) != digest:
         raise InputError(
             f"{path}: replaced or changed since this run loaded it; type the same command again"
@@ -209,64 +212,64 @@ def _open_unchanged(path: str, digest: str, mode: str) -> h5netcdf.File:
     return h5netcdf.File(path, mode, decode_vlen_strings=True)
 
 
-def _begin(path: Path, places: Collection[tuple[int, int]]) -> None:
-    """Write a file with the labels of all recordings that are listed, and none of them."""
-    imus, numbers = (np.unique(labels) for labels in zip(*places, strict=True))
+def _begin(path: Path, recordings: Collection[tuple[int, int]]) -> None:
+    """Write a file with the labels of recordings, given as IMU and number, without samples."""
+    imus, numbers = (np.unique(labels) for labels in zip(*recordings, strict=True))
     with h5netcdf.File(path, "w") as file:
         sizes = {"imu": len(imus), "recording": len(numbers), "axis": len(AXES)}
         file.dimensions = sizes | {"sample": None}
         file.create_variable("imu", ("imu",), np.int64, data=imus)
         file.create_variable("recording", ("recording",), np.int64, data=numbers)
         file.create_variable("axis", ("axis",), _TEXT, data=np.array(AXES, object))
-        file.create_variable(_INSPECTION, _PLACE, _TEXT)
+        file.create_variable(_INSPECTION, _DIMENSIONS, _TEXT)
 
 
-def _make_room(file: h5py.File, name: str, values: np.ndarray) -> None:
-    """Add a variable that is not there, or samples to all of them."""
+def _enlarge(file: h5py.File, name: str, values: np.ndarray) -> None:
+    """Add a variable, and samples to all variables, until the values fit."""
     with h5netcdf.File(file, "r+") as netcdf:
         if values.shape[-1] > netcdf.dimensions["sample"].size:
             netcdf.resize_dimension("sample", values.shape[-1])
         if name not in netcdf.variables:
-            dimensions = (*_PLACE, *(["axis"] if values.ndim > 1 else []), "sample")
+            dimensions = (*_DIMENSIONS, *(["axis"] if values.ndim > 1 else []), "sample")
             layout = {"fillvalue": np.float32(np.nan), "chunks": (1, 1, *values.shape)}
             variable = netcdf.create_variable(name, dimensions, np.float32, **layout)
             variable.attrs["units"] = _UNITS[name]
 
 
-def _stored(path: Path, wanted: Mapping[tuple[int, int], str] | None = None) -> Iterator[Recording]:
-    """Recordings of a file by IMU and number, without their samples.
+def _stored(path: Path, keys: Mapping[tuple[int, int], str] | None = None) -> Iterator[Recording]:
+    """Recordings of a file, ordered by IMU and number, without their samples.
 
-    Where keys are given, only those that have them, with their samples, if these are as they were
-    written. Of a damaged file, as a process that is killed may leave it, what can be read.
+    With ``keys``, only the recordings with these keys and undamaged samples, including the samples.
+    A file that a killed process left damaged is read as far as possible.
     """
     damage = OSError, KeyError, ValueError
     with suppress(*damage), h5py.File(path) as file:
         for index, text in np.ndenumerate(file[_INSPECTION][()]):
             if not text:
                 continue
-            described = json.loads(text)
-            if described.pop(_SEAL) != fingerprint(described):
+            description = json.loads(text)
+            if description.pop(_SEAL) != fingerprint(description):
                 continue
-            contents = described.pop("variables")
-            described["findings"] = tuple(Finding(**kind) for kind in described["findings"])
-            recording = Recording(**described)
-            if wanted is None:
+            hashes = description.pop("variables")
+            description["findings"] = tuple(Finding(**kind) for kind in description["findings"])
+            recording = Recording(**description)
+            if keys is None:
                 yield recording
-            elif recording.key and recording.key == wanted.get(recording.place):
+            elif recording.key and recording.key == keys.get(recording.labels):
                 stretch = (*index, ..., slice(recording.stop - recording.start))
-                with suppress(*damage):  # each by itself, or one would hide the others
-                    kept = {name: file[name][stretch] for name in contents}
-                    if contents == {name: data_hash(v, None) for name, v in kept.items()}:
-                        yield replace(recording, variables=kept)
+                with suppress(*damage):  # damage to a recording must not hide the following ones
+                    variables = {name: file[name][stretch] for name in hashes}
+                    if hashes == {name: data_hash(v, None) for name, v in variables.items()}:
+                        yield replace(recording, variables=variables)
 
 
 def _erase(path: Path, samples: xr.DataArray) -> None:
-    """Take back what was kept of recordings that are not to be used after all."""
+    """Erase stored recordings whose number of samples is 0, as they are not to be used."""
     with h5py.File(path, "r+") as file:
         texts = file[_INSPECTION][()]
-        for index in map(tuple, np.argwhere(samples.transpose(*_PLACE).to_numpy() == 0)):
+        for index in map(tuple, np.argwhere(samples.transpose(*_DIMENSIONS).to_numpy() == 0)):
             names = json.loads(texts[index] or "{}").get("variables", [])
             for name in names:
                 file[name][index] = np.nan
             if names:
-                file[_INSPECTION][index] = ""  # to be read again, should it be used some day
+                file[_INSPECTION][index] = ""  # so that it is read again if it is needed later

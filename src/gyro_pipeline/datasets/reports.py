@@ -1,4 +1,4 @@
-"""What people read: tables, figures and the page that shows them."""
+"""Writes the tables, the figures and the page of a report."""
 
 import base64
 import re
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 
 _PNG_DPI = 160
 _LONGEST = 35
-_BROKEN = r"p{4cm}"
-"""How LaTeX sets columns with texts of more characters than that."""
+_WRAPPED = r"p{4cm}"
+"""LaTeX format of columns with texts of more characters than ``_LONGEST``."""
 
 _FORMULA = re.compile(r"[=@\t\r]|[+-](?![\d.,\s\[\]+\-%/]*$)")
-"""A text that a spreadsheet would compute; one of digits and signs alone it would not."""
+"""A text that a spreadsheet would take for a formula; it never does so with digits and signs."""
 
 _LATEX = str.maketrans(
     {
@@ -60,15 +60,11 @@ _LATEX = str.maketrans(
 )
 
 
-class ReportTable(AbstractDataset[pd.DataFrame, pd.DataFrame]):
-    """Writes a table as CSV with all digits, and as Markdown and LaTeX to be read.
-
-    In the latter two, numbers have four significant digits and a missing value is a dash. LaTeX
-    needs the package ``booktabs``; a character that it has no form for is a question mark. In the
-    CSV file a text that a spreadsheet would take for a formula has an apostrophe before it.
+class _ReportFile(AbstractDataset[Any, Any]):
+    """Base of the datasets of a report.
 
     Args:
-        filepath: The CSV file; the others lie beside it.
+        filepath: The main file; other formats are beside it.
         metadata: For other tools, such as Kedro-Viz.
     """
 
@@ -76,8 +72,23 @@ class ReportTable(AbstractDataset[pd.DataFrame, pd.DataFrame]):
         self._path = Path(filepath)
         self.metadata = metadata
 
+    def _exists(self) -> bool:
+        return self._path.is_file()
+
+    def _describe(self) -> dict[str, Any]:
+        return {"filepath": str(self._path)}
+
+
+class ReportTable(_ReportFile):
+    """Writes a table as CSV with all digits, and as Markdown and LaTeX for readers.
+
+    In the latter two, numbers have four significant digits and a missing value is a dash. LaTeX
+    needs the package ``booktabs``; characters without a LaTeX form become question marks. In the
+    CSV file a text that a spreadsheet would take for a formula begins with an apostrophe.
+    """
+
     def load(self) -> pd.DataFrame:
-        """Read the table, all digits of it."""
+        """Read the table with all digits."""
         return read_table(self._path)
 
     def save(self, data: pd.DataFrame) -> None:
@@ -90,39 +101,19 @@ class ReportTable(AbstractDataset[pd.DataFrame, pd.DataFrame]):
         with replacing(self._path) as temporary:
             write_table(data.map(_no_formula).rename(columns=_no_formula), temporary)
         for suffix, text in texts.items():
-            with replacing(self._path.with_name(self._path.stem + suffix)) as temporary:
-                temporary.write_text(text, encoding="utf-8")
-
-    def _exists(self) -> bool:
-        return self._path.is_file()
-
-    def _describe(self) -> dict[str, Any]:
-        return {"filepath": str(self._path)}
+            _write_text(self._path.with_name(self._path.stem + suffix), text)
 
 
-class ReportFigure(AbstractDataset["Figure", Path]):
-    """Writes a figure as PNG and SVG; the same figure gives the same bytes.
-
-    Args:
-        filepath: The PNG file; the other lies beside it.
-        metadata: For other tools, such as Kedro-Viz.
-    """
-
-    def __init__(self, filepath: str, metadata: dict[str, Any] | None = None) -> None:
-        self._path = Path(filepath)
-        self.metadata = metadata
+class ReportFigure(_ReportFile):
+    """Writes a figure as PNG and SVG; the same figure gives the same bytes."""
 
     def load(self) -> Path:
-        """Name the PNG file, to be shown elsewhere."""
+        """Path of the PNG file."""
         return self._path
 
     def save(self, data: "Figure") -> None:
-        """Write both files.
-
-        Args:
-            data: The figure.
-        """
-        import matplotlib as mpl  # noqa: PLC0415 - only those who draw wait for it
+        """Write both files."""
+        import matplotlib as mpl  # noqa: PLC0415 - imported slowly, and needed for drawing only
 
         with mpl.rc_context({"svg.hashsalt": "gyro_pipeline"}):
             with replacing(self._path) as temporary:
@@ -130,77 +121,63 @@ class ReportFigure(AbstractDataset["Figure", Path]):
             with replacing(self._path.with_name(f"{self._path.stem}.svg")) as temporary:
                 data.savefig(temporary, metadata={"Date": None})
 
-    def _exists(self) -> bool:
-        return self._path.is_file()
 
-    def _describe(self) -> dict[str, Any]:
-        return {"filepath": str(self._path)}
-
-
-class ReportPage(AbstractDataset[str, str]):
-    """Writes a report as Markdown, as one HTML file that needs no other, and a list of all reports.
+class ReportPage(_ReportFile):
+    """Writes a report as Markdown and as a self-contained HTML file, and a list of all reports.
 
     Args:
-        filepath: The HTML file, in the folder of its source; the Markdown file lies beside it.
-        all_reports: An HTML file above those folders, which links to the reports in all of them.
+        filepath: The HTML file, in the folder of its source; the Markdown file is beside it.
+        all_reports: An HTML file above these folders, with links to the reports in all of them.
         metadata: For other tools, such as Kedro-Viz.
     """
 
     def __init__(
         self, filepath: str, all_reports: str, metadata: dict[str, Any] | None = None
     ) -> None:
-        self._path, self._all = Path(filepath), Path(all_reports)
-        self.metadata = metadata
+        super().__init__(filepath, metadata)
+        self._all = Path(all_reports)
 
     def load(self) -> str:
         """Read the Markdown."""
         return self._path.with_suffix(".md").read_text(encoding="utf-8")
 
     def save(self, data: str) -> None:
-        """Write the report in both formats, and the list of all reports anew.
+        """Write the report in both formats, and update the list of all reports.
 
         Args:
             data: The page as Markdown. Pictures are files beside it.
         """
-        self._write(self._path.with_suffix(".md"), data)
-        self._write(self._path, to_html(data, self._path.parent))
-        pages = self._all.parent.rglob(self._path.name)
-        lines = [
-            f"- [{name}]({name}/{self._path.name})"
-            for name in sorted(
-                page.parent.relative_to(self._all.parent).as_posix() for page in pages
-            )
-            if name != "."
-        ]
-        listed = "# Rapid gyroscope calibration: all reports\n\n" + "\n".join(lines) + "\n"
-        self._write(self._all, to_html(listed, self._all.parent))
-
-    @staticmethod
-    def _write(path: Path, text: str) -> None:
-        with replacing(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        _write_text(self._path.with_suffix(".md"), data)
+        _write_text(self._path, to_html(data, self._path.parent))
+        root, name = self._all.parent, self._path.name
+        folders = sorted(page.parent.relative_to(root).as_posix() for page in root.rglob(name))
+        lines = [f"- [{folder}]({folder}/{name})" for folder in folders if folder != "."]
+        page = "# Rapid gyroscope calibration: all reports\n\n" + "\n".join(lines) + "\n"
+        _write_text(self._all, to_html(page, root))
 
     def _exists(self) -> bool:
         return self._path.is_file() and self._path.with_suffix(".md").is_file()
 
-    def _describe(self) -> dict[str, Any]:
-        return {"filepath": str(self._path)}
+
+def _write_text(path: Path, text: str) -> None:
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def to_html(markdown: str, folder: Path) -> str:
-    """A page that needs no other file.
+    """Convert Markdown to a page that needs no other file.
 
-    HTML in the text is shown as it is written, never taken for markup.
+    HTML in the text is shown literally.
 
     Args:
         markdown: The text. It begins with a heading, the title of the page.
-        folder: Where pictures are looked for.
+        folder: Folder of the pictures.
 
     Raises:
-        DatasetError: A picture is not there.
+        DatasetError: A picture does not exist.
     """
     parser = MarkdownIt("commonmark", {"html": False}).enable("table")
-    parser.add_render_rule("image", _embedded)
+    parser.add_render_rule("image", _embed_picture)
     parser.add_render_rule("table_open", lambda *_: '<div class="wide" tabindex="0">\n<table>\n')
     parser.add_render_rule("table_close", lambda *_: "</table>\n</div>\n")
     tokens = parser.parse(markdown)
@@ -221,40 +198,34 @@ def to_html(markdown: str, folder: Path) -> str:
     return page.render(title=title, body=body, contents=contents)
 
 
-def _embedded(
+def _embed_picture(
     renderer: RendererHTML,
     tokens: Sequence[Token],
-    place: int,
+    index: int,
     options: Any,
     env: MutableMapping[str, Any],
 ) -> str:
-    """A picture as an address that holds it."""
-    name, words = unquote(str(tokens[place].attrGet("src"))), tokens[place].content
+    """Render a picture as a data address."""
+    name, caption = unquote(str(tokens[index].attrGet("src"))), tokens[index].content
     path = Path(env["folder"]) / name
     if ":" in name or not path.is_file():
         raise DatasetError(f"{path}: no such picture")
     content = base64.b64encode(path.read_bytes()).decode("ascii")
-    return f'<img src="data:image/png;base64,{content}" alt="Figure: {escape(words)}">'
+    return f'<img src="data:image/png;base64,{content}" alt="Figure: {escape(caption)}">'
 
 
 def to_latex(table: pd.DataFrame) -> str:
-    """Write a table as LaTeX.
+    """Format a table, without its index, as a LaTeX ``tabular`` with the rules of ``booktabs``.
 
-    Args:
-        table: Its index is not written.
-
-    Returns:
-        A ``tabular`` with the rules of the package ``booktabs``, for a plain article. Long texts
-        are broken into lines.
+    Long texts are broken into lines.
     """
     rows = [list(table.columns.map(str))]
     rows += [[plain(value) for value in row] for row in table.itertuples(index=False, name=None)]
     long = [max(map(len, column)) > _LONGEST for column in zip(*rows, strict=True)]
+    numeric = [pd.api.types.is_numeric_dtype(dtype) for dtype in table.dtypes]
     alignment = "".join(
-        _BROKEN if broken else "r" if right else "l"
-        for broken, right in zip(
-            long, [pd.api.types.is_numeric_dtype(dtype) for dtype in table.dtypes], strict=True
-        )
+        _WRAPPED if wrapped else "r" if right else "l"
+        for wrapped, right in zip(long, numeric, strict=True)
     )
     head, *body = [" & ".join(_latex(cell) for cell in row) + r" \\" for row in rows]
     begin = rf"\begin{{tabular}}{{{alignment}}}"
@@ -268,8 +239,8 @@ def _latex(text: str) -> str:
         for character in text
         if not unicodedata.combining(character)
     )
-    known = (c if c.isascii() or ord(c) in _LATEX else "?" for c in letters)
-    return "".join(known).translate(_LATEX)
+    supported = (c if c.isascii() or ord(c) in _LATEX else "?" for c in letters)
+    return "".join(supported).translate(_LATEX)
 
 
 def _no_formula(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""The file of a run store: made complete or not at all, and refused where it cannot be used."""
+"""The SQLite file of a run store: its creation and its checks."""
 
 import errno
 import os
@@ -20,7 +20,7 @@ from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.atomic import check_writable, replacing
 
 _BUSY_S = 20
-"""How long to wait for another process that writes to the store."""
+"""Longest wait for another process that writes to the store."""
 
 _ANSWER_S = 5
 _PORTS = {"http": 80, "https": 443, "postgresql": 5432, "mysql": 3306, "mssql": 1433}
@@ -29,25 +29,25 @@ _MOVED = "type `python -m gyro_pipeline.store --artifacts-in mlruns`"
 
 
 def make_store(path: Path) -> None:
-    """Make a store that is complete or not there: MLflow cannot use one that is half made."""
+    """Create a store completely or not at all, since MLflow cannot use an incomplete one."""
     with replacing(path) as temporary:
         MlflowClient(f"sqlite:///{temporary}")
 
 
 def ready_store(path: Path) -> None:
-    """Make the store if there is none, and see that it can be used and written to.
+    """Create the store if it does not exist, and check that it can be used and written to.
 
     Raises:
-        InputError: It is damaged, or missing beside the artifacts of its runs.
-        OSError: It cannot be written to.
+        InputError: The store is damaged, or missing although artifacts of its runs exist.
+        OSError: The store cannot be written to.
     """
     if not path.exists() or not path.stat().st_size:
         artifacts = path.parent / "mlruns"
         if count := sum(1 for _ in artifacts.glob("*/*/artifacts")):
             raise InputError(
-                f"{path}: there is no store, or an empty one, beside {artifacts} with the "
-                f"artifacts of {count} runs; put the store back, or move {artifacts} away to begin "
-                "without these runs"
+                f"{path}: no such file, or an empty one, but {artifacts} has the artifacts of "
+                f"{count} runs; put the store back, or move {artifacts} away to begin without "
+                "these runs"
             )
         make_store(path)
     check_store(path)
@@ -59,7 +59,7 @@ def ready_store(path: Path) -> None:
 
 @cache
 def check_answers(uri: str) -> None:
-    """Ask a server or a database once whether it is there.
+    """Check once that a server or a database answers.
 
     Raises:
         InputError: It does not answer.
@@ -73,11 +73,8 @@ def check_answers(uri: str) -> None:
             requests.get(f"{uri.rstrip('/')}/health", timeout=_ANSWER_S).raise_for_status()
         elif address.hostname:
             sqlalchemy.create_engine(uri).connect().close()
-    except (
-        OSError,
-        sqlalchemy.exc.SQLAlchemyError,
-        ImportError,
-    ) as error:  # requests' are OSErrors
+    # the errors of requests are OSErrors
+    except (OSError, sqlalchemy.exc.SQLAlchemyError, ImportError) as error:
         raise InputError(
             f"{uri}: the run store of MLFLOW_TRACKING_URI does not answer ({error}); start it, "
             "correct the address, or unset the variable to use mlflow.db"
@@ -85,18 +82,18 @@ def check_answers(uri: str) -> None:
 
 
 def check_store(path: Path) -> None:
-    """Refuse a file that is no MLflow store before MLflow would write into it."""
+    """Refuse a file that is not an MLflow store before MLflow writes into it."""
     advice = "move it away to start a new store"
     try:
-        # Writable, so that SQLite can roll back what a killed process left half written.
+        # writable, so that SQLite can roll back the unfinished transaction of a killed process
         uri = f"{path.resolve().as_uri()}?mode=rw"
         with closing(sqlite3.connect(uri, uri=True, timeout=_BUSY_S)) as connection:
             tables = {name for (name,) in connection.execute("select name from sqlite_master")}
-            sound = [row[0] for row in connection.execute("pragma quick_check(1)")]
+            problems = [row[0] for row in connection.execute("pragma quick_check(1)")]
     except sqlite3.DatabaseError as error:
         raise InputError(f"{path}: not a readable SQLite file ({error}); {advice}") from error
-    if sound != ["ok"]:
-        raise InputError(f"{path}: a damaged SQLite file ({sound[0]}); {advice}")
+    if problems != ["ok"]:
+        raise InputError(f"{path}: a damaged SQLite file ({problems[0]}); {advice}")
     if tables and not {"experiments", "alembic_version"} <= tables:
         raise InputError(
             f"{path}: expected an MLflow store, got an SQLite file with tables "
@@ -105,12 +102,12 @@ def check_store(path: Path) -> None:
 
 
 def count_finished(path: Path, study: str, params: Mapping[str, str]) -> int:
-    """How many runs of a study, with these parameters, are FINISHED and not deleted.
+    """Count the FINISHED and not deleted runs of a study that have given parameters.
 
-    It asks the file itself, as MLflow takes seconds to open a store.
+    This reads the file itself, as MLflow takes seconds to open a store.
 
     Raises:
-        InputError: The file is no run store.
+        InputError: The file is not a run store.
     """
     query = (
         "select count(*) from runs join experiments using (experiment_id) where "
@@ -123,19 +120,19 @@ def count_finished(path: Path, study: str, params: Mapping[str, str]) -> int:
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as connection:
             return int(connection.execute(query, values).fetchone()[0])
     except sqlite3.DatabaseError:
-        check_store(path)  # it says what is wrong with the file
+        check_store(path)  # raises an error that says what is wrong
         return 0
 
 
 def check_not_moved(experiment: Experiment, store: Path) -> None:
-    """Refuse to write artifacts where the store used to be, or where the original of a copy is."""
+    """Refuse a store that was moved or copied, as its artifact paths still name the old folder."""
     location = experiment.artifact_location
     if not location.startswith("file:"):
         return
-    folder, own = Path(local_file_uri_to_path(location)), store.parent.resolve()
-    is_ours = folder.name == experiment.name  # MLflow itself takes the experiment's number
-    if is_ours and own not in {parent.resolve() for parent in folder.parents}:
+    folder, project = Path(local_file_uri_to_path(location)), store.parent.resolve()
+    created_here = folder.name == experiment.name  # MLflow would name it by the experiment's number
+    if created_here and project not in {parent.resolve() for parent in folder.parents}:
         raise InputError(
-            f"{store}: the artifacts of {experiment.name} are to be in {folder.parent}, which is "
-            f"not beside this store; if the project was copied or moved, {_MOVED}"
+            f"{store}: the artifacts of {experiment.name} would be written to {folder.parent}, "
+            f"which is not beside this store; if the project was copied or moved, {_MOVED}"
         )

@@ -1,7 +1,7 @@
-"""Files that a stage stores for others: each is loaded as it was written, or not at all.
+"""Files that a stage stores for other stages, protected against changes.
 
-Beside a file is its record, ``<name>.made.json``: the digest of its bytes, the settings that it was
-made with, and the digests of the stored files that it was made from.
+Beside each file is its record, ``<name>.made.json``: the digest of its bytes, the settings behind
+it, and the digests of the stored files that it was computed from.
 """
 
 import hashlib
@@ -18,22 +18,22 @@ from gyro_pipeline.datasets.atomic import replacing
 
 Record = dict[str, Any]
 
-_REPAIR = "type kedro run, with the --env that it belongs to, which makes it again"
+_REPAIR = "type kedro run, with the --env that it belongs to, to make it again"
 
 _digests: dict[tuple[int, ...], str] = {}
-"""Of files by their identity, which a rename keeps: each is read once by a process."""
+"""Digests by file identity, which a rename keeps, so that a process reads each file once."""
 
 
 class StoredFile(AbstractDataset[Any, Any]):
-    """Base of datasets that keep one file: a subclass gives ``_read`` and ``_write``.
+    """Base of datasets of one file; a subclass defines ``_read`` and ``_write``.
 
     Args:
         filepath: The file.
         metadata: For other tools, such as Kedro-Viz.
 
     Attributes:
-        settings: The settings that decide what is saved, by name; set for each run.
-        sources: The stored files that it is made from; likewise.
+        settings: The settings that affect the content, by name; set for each run.
+        sources: The stored files that the content is computed from; set for each run.
     """
 
     def __init__(self, filepath: str, metadata: dict[str, Any] | None = None) -> None:
@@ -45,39 +45,31 @@ class StoredFile(AbstractDataset[Any, Any]):
     def load(self) -> Any:
         """Read the file.
 
-        Returns:
-            What was saved.
-
         Raises:
-            InputError: As the cause of Kedro's ``DatasetError``, a file that is not what was
-                written.
+            InputError: The file was changed or damaged; as the cause of Kedro's ``DatasetError``.
         """
         check_content(self._filepath)
         return self._read(self._filepath)
 
     def save(self, data: Any) -> None:
-        """Write the file under a temporary name, then its record, and rename it.
-
-        Args:
-            data: What the subclass keeps.
-        """
+        """Write the file under a temporary name, then its record, and rename it."""
         with replacing(self._filepath) as temporary:
             self._write(data, temporary)
             self._record(temporary)
 
     def state(self) -> str | None:
-        """Digest of the file; None if it is not there, or is not what was written."""
-        recorded = record_of(self._filepath)
-        return recorded["digest"] if recorded and _is_intact(self._filepath, recorded) else None
+        """Digest of the file; None if it is missing, changed or damaged."""
+        record = record_of(self._filepath)
+        return record["digest"] if record and _is_intact(self._filepath, record) else None
 
     def check_made_with(self, settings: Mapping[str, Any]) -> None:
-        """Refuse a file that other settings or other files made than there are now.
+        """Refuse a file that was computed with other settings or from other files.
 
         Args:
-            settings: Those of this run, by name.
+            settings: The settings of this run, by name.
 
         Raises:
-            InputError: It says which, and what to type.
+            InputError: A setting or a file differs; the message names it.
         """
         problem = _difference(self._filepath, settings)
         if problem and self._exists():
@@ -89,22 +81,25 @@ class StoredFile(AbstractDataset[Any, Any]):
     def _write(self, data: Any, path: Path) -> None:
         raise NotImplementedError
 
-    def _record(self, written: Path) -> None:
-        """Record what was written, under whatever name, and is about to get the file's name."""
-        folder, sources = self._filepath.parent, {}
-        for source in self.sources:
-            recorded = record_of(source._filepath) or {}
-            sources[os.path.relpath(source._filepath, folder)] = recorded.get("digest")
-        status = written.stat()
+    def _record(self, temporary: Path) -> None:
+        """Write the record of a complete file that still has a temporary name."""
+        folder = self._filepath.parent
+        sources = {
+            os.path.relpath(source._filepath, folder): (record_of(source._filepath) or {}).get(
+                "digest"
+            )
+            for source in self.sources
+        }
+        status = temporary.stat()
         record = {
-            "digest": digest_of(written),
+            "digest": digest_of(temporary),
             "bytes": status.st_size,
             "changed_ns": status.st_mtime_ns,
             "settings": self.settings,
             "sources": sources,
         }
-        with replacing(_record_path(self._filepath)) as temporary:
-            temporary.write_text(json.dumps(record, indent=1))
+        with replacing(_record_path(self._filepath)) as path:
+            path.write_text(json.dumps(record, indent=1))
 
     def _exists(self) -> bool:
         return self._filepath.is_file()
@@ -114,24 +109,19 @@ class StoredFile(AbstractDataset[Any, Any]):
 
 
 def check_content(path: Path) -> str:
-    """The digest of a file that is what was written.
-
-    Args:
-        path: The file.
+    """Check that a file is as it was written, and return its digest.
 
     Raises:
-        InputError: It is not there, was changed since, is damaged, or has no record.
+        InputError: The file is missing, changed or damaged, or has no record.
     """
     if not path.exists():
-        raise InputError(f"{path} is not there; first run what makes it, such as kedro run")
-    recorded, digest = record_of(path), digest_of(path)
-    if recorded is None or digest != recorded["digest"]:
-        recorded = record_of(path)  # a run may have replaced both meanwhile
-        digest = digest_of(path)
-    if recorded is None or digest != recorded["digest"]:
-        what = "has no record of how it was made" if recorded is None else "is damaged or changed"
-        raise InputError(f"{path}: {what}, so it may not be what was written; {_REPAIR}")
-    return digest
+        raise InputError(f"{path}: no such file; type kedro run, which makes it, first")
+    for _ in range(2):  # a run may replace the file and its record between the two reads
+        record, digest = record_of(path), digest_of(path)
+        if record is not None and digest == record["digest"]:
+            return digest
+    problem = "has no record of how it was made" if record is None else "is damaged or changed"
+    raise InputError(f"{path}: {problem}, so it may not be what was written; {_REPAIR}")
 
 
 def digest_of(path: Path) -> str:
@@ -149,27 +139,30 @@ def digest_of(path: Path) -> str:
 
 
 def record_of(path: Path) -> Record | None:
-    """How a stored file was made; None if that cannot be told."""
+    """The record of a stored file; None if it is missing or damaged."""
     try:
         record = json.loads(_record_path(path).read_text())
     except (FileNotFoundError, ValueError):
         return None
-    whole = isinstance(record, dict) and {"digest", "settings", "sources"} <= record.keys()
-    return record if whole else None
+    complete = isinstance(record, dict) and {"digest", "settings", "sources"} <= record.keys()
+    return record if complete else None
 
 
 def _is_intact(path: Path, record: Record) -> bool:
     if not path.is_file():
         return False
     status = path.stat()
-    same = [status.st_size, status.st_mtime_ns] == [record.get("bytes"), record.get("changed_ns")]
-    return same or digest_of(path) == record["digest"]
+    unchanged = [status.st_size, status.st_mtime_ns] == [
+        record.get("bytes"),
+        record.get("changed_ns"),
+    ]
+    return unchanged or digest_of(path) == record["digest"]
 
 
 def _difference(path: Path, settings: Mapping[str, Any]) -> str | None:
-    """How the making of a file, and of those that it was made from, differs from now."""
+    """The first difference in the settings or sources of a file, or of its sources, from now."""
     record = record_of(path)
-    if record is None:  # whoever loads it is told
+    if record is None:  # loading the file raises an error
         return None
     for key, value in record["settings"].items():
         if settings.get(key) != value:
@@ -179,17 +172,16 @@ def _difference(path: Path, settings: Mapping[str, Any]) -> str | None:
             return f"{path}: made with {name} {before.get(name)}, this run has {now.get(name)}"
     for relative, digest in record["sources"].items():
         source = Path(os.path.normpath(path.parent / relative))
-        there = record_of(source)
-        if there is not None and there["digest"] != digest:
+        source_record = record_of(source)
+        if source_record is not None and source_record["digest"] != digest:
             return f"{path}: made from another {source} than there is now"
-        problem = _difference(source, settings)
-        if problem:
+        if problem := _difference(source, settings):
             return problem
     return None
 
 
 def _leaves(tree: Any, name: str) -> Iterator[tuple[str, Any]]:
-    """The values in a tree of settings by their names."""
+    """The values in a tree of settings, with their dotted names."""
     if not isinstance(tree, Mapping) or not tree:
         yield name, tree
         return

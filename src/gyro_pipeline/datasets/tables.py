@@ -10,20 +10,17 @@ from gyro_pipeline.tracking import FINGERPRINT
 
 
 class Table(StoredFile):
-    """Keeps a table without its index; numbers come back exactly as they were.
+    """Stores a table without its index; numbers are read back exactly.
 
-    The file is a ``.csv`` or, for long tables, a ``.parquet``. An empty cell is a missing value,
-    and nothing else is.
+    The file is a ``.csv`` or, for long tables, a ``.parquet``. Only an empty cell is a missing
+    value.
     """
 
     def preview(self, nrows: int = 40) -> TablePreview:
         """Show the first rows in Kedro-Viz.
 
         Args:
-            nrows: How many.
-
-        Returns:
-            Columns and rows as Kedro-Viz takes them.
+            nrows: Number of rows.
         """
         return TablePreview(read_table(self._filepath).head(nrows).to_dict(orient="split"))
 
@@ -44,5 +41,5 @@ def read_table(path: Path) -> pd.DataFrame:
     """Read a table that :func:`write_table` wrote."""
     if path.suffix == ".parquet":
         return pd.read_parquet(path)
-    texts = {FINGERPRINT: str}  # some look like numbers
+    texts = {FINGERPRINT: str}  # some fingerprints look like numbers
     return pd.read_csv(path, keep_default_na=False, na_values=[""], dtype=texts)

@@ -1,4 +1,4 @@
-"""The model of a run, as MLflow keeps and serves it."""
+"""The model of a run, as MLflow stores and serves it."""
 
 import logging
 from importlib.metadata import version
@@ -19,12 +19,12 @@ from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.fingerprints import own_code
 from gyro_pipeline.tracking import DESCRIPTION, MODEL
 
-# It tells of every model that its example is valid.
+# MLflow logs for every model that its example is valid.
 logging.getLogger("mlflow.pyfunc").setLevel(logging.WARNING)
 
 _FIT = "fit"
 _REQUIREMENTS = ("gyro-pipeline", "numpy", "torch", "xarray")
-_EXAMPLE_DECIMALS = 6  # of deg/s: the example is text
+_EXAMPLE_DECIMALS = 6  # of the example, in deg/s, as it is stored as text
 
 _DOUBLE = np.dtype(np.float64)
 _SIGNATURE = ModelSignature(
@@ -37,13 +37,13 @@ _SIGNATURE = ModelSignature(
 
 
 def log_model(client: MlflowClient, run: Run, estimator: Estimator, example: np.ndarray) -> str:
-    """Store a fit as the model of a run, in place of one that was left half written.
+    """Store a fit as the model of a run, replacing an incomplete one.
 
     Args:
-        client: Of the run's store.
-        run: It has no other model.
+        client: Client of the run's store.
+        run: A run without a complete model.
         estimator: The fit.
-        example: Windows (n, gyroscopes, samples), deg/s; the first is shown as input example.
+        example: Windows (n, gyroscopes, samples), deg/s; the first becomes the input example.
 
     Returns:
         The digest of the fit.
@@ -70,12 +70,12 @@ def log_model(client: MlflowClient, run: Run, estimator: Estimator, example: np.
 
 
 def model_fit_uri(client: MlflowClient, run: Run) -> str:
-    """Where the fit is that is the model of a run."""
+    """Address of the fit in the model of a run."""
     return f"{client.get_logged_model(str(model_of(run))).artifact_location}/data/{_FIT}"
 
 
 def model_of(run: Run) -> str | None:
-    """Id of the model of a run, if it has one."""
+    """Id of the model of a run; None without a model."""
     outputs = run.outputs.model_outputs if run.outputs else []
     return outputs[0].model_id if outputs else None
 

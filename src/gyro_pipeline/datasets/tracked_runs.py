@@ -60,23 +60,24 @@ from gyro_pipeline.tracking import (
 logger = logging.getLogger(__name__)
 
 _TRAINED = "trained"
-"""Tag, set last: when the last fit ended. A run without it lacks fits."""
+"""Tag, set last: the time at which the last fit ended. A run without it lacks fits."""
 
 _FITS = "fits"
-"""Folder of the fits that are no model."""
+"""Folder of the fits that are not the model."""
 
 _FIT, _ARTIFACT, _METRICS, _PARAMS = "fit.", "artifact.", "digest.metrics", "digest.params"
-"""Tags, or how they begin: the digest of the fit of a fold, of an artifact, of the metrics of the
-evaluation and of the parameters. What has none is not there."""
+"""Tags, or their prefixes, with the digests of fits by fold, of artifacts by name, of the metrics
+of the evaluation and of the parameters. A part of a run without such a tag counts as missing."""
 
 _MODEL_FOLD = "model_fold"
-"""Tag: the fold whose fit is the model of the run, and is stored nowhere else."""
+"""Tag: the fold whose fit is the model of the run, and is stored only there."""
 
 _OWNER = "process"
-"""Tag: the process that writes a run and when it last did, as ``host pid started written``."""
+"""Tag: the process that writes a run, and the time of its last write, as ``host pid started
+written``."""
 
 _SILENT_S = 24 * 3600
-"""After so long without a sign of life a process of another machine counts as dead."""
+"""A process of another machine counts as dead after this time without a write."""
 
 _ABOUT = """Study `{study}` of gyro_pipeline. One run is one row of the study: an estimator, its
 training set, a window length and a seed.
@@ -86,14 +87,14 @@ training set, a window length and a seed.
 the test recordings. Names that end in `_first` are over first windows only. `scores.csv` has the
 rest."""
 
-# One bar for each small artifact would bury everything else on a terminal.
+# A progress bar for each small artifact would hide everything else on a terminal.
 os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
 
 USER_INTERFACE = "http://127.0.0.1:5000"
-"""Where ``mlflow ui`` listens unless told otherwise."""
+"""Default address of ``mlflow ui``."""
 
 _SHARED_VIEW = "mlflow.sharedViewState."
-"""Start of a tag of an experiment: a view of its runs, which the user interface opens by name."""
+"""Prefix of an experiment's tags with views of its runs, which the user interface opens by name."""
 
 _COLUMNS = {
     "params": ("estimator", "real_gyros", "virtual_gyros", "window_s", "seed"),
@@ -111,16 +112,16 @@ _VIEW = {
 
 _CURVE_POINTS = 50
 
-_told_of_older_runs: set[str] = set()
+_stores_with_warning: set[str] = set()
 
 
 class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
-    """Runs of one study, or of all, of one source, or of all, and of one sensor, or of all.
+    """The runs of the store, optionally of a single study, source or sensor.
 
-    Loading returns the runs, newest first: trained ones, and those that a dead process left
-    unfinished, which are ended as KILLED and can be continued. Saving takes one item at a time: a
+    ``load`` returns the runs, newest first: trained runs, and runs that a dead process left
+    unfinished, which are set KILLED and can be continued. ``save`` takes one item at a time: a
     :class:`FittedRun` begins a run or adds to an unfinished one, an :class:`EvaluatedRun`
-    completes it and sets it FINISHED.
+    completes a run and sets it FINISHED.
     """
 
     def __init__(
@@ -131,57 +132,56 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
         study: str | None = None,
         metadata: dict[str, Any] | None = None,
     ) -> None:
-        """Describe a part of the store.
+        """Select a part of the store.
 
         Args:
-            path: SQLite file of the store; ``MLFLOW_TRACKING_URI`` wins where set.
-            source: Only runs on logs from there; None for all.
+            path: SQLite file of the store, unless ``MLFLOW_TRACKING_URI`` is set.
+            source: Only runs on logs from this source; None for all.
             sensor: Only runs on this sensor; None for all.
             study: Only runs of this study, which is the MLflow experiment; None for all.
             metadata: For Kedro plugins.
         """
         self._path = Path(path)
-        wanted = {"source": source, "sensor": sensor}
-        self.only = {key: value for key, value in wanted.items() if value}
+        filters = {"source": source, "sensor": sensor}
+        self.only = {key: value for key, value in filters.items() if value}
         self.study = study
         self.metadata = metadata
         self.provenance: dict[str, str] = {}
-        """Tags that every new run gets; set once per ``kedro run``."""
+        """Tags of every new run; set once per ``kedro run``."""
         self.changed: frozenset[str] = frozenset()
-        """Names of settings that differ from those of ``conf/base``; their values are in names."""
-        self._begun: dict[tuple[str, str], tuple[str, set[str]]] = {}
-        """Runs that fits are added to, by study and fingerprint: the id, and the folds so far."""
+        """Names of settings that differ from ``conf/base``; names of runs state their values."""
+        self._unfinished: dict[tuple[str, str], tuple[str, set[str]]] = {}
+        """Id and completed folds, by study and fingerprint, of runs to which fits are added."""
 
     def load(self) -> list[StoredRun]:
-        """Runs, newest first.
+        """All selected runs, newest first.
 
         Raises:
-            InputError: If the store is damaged, is no MLflow store, or was moved.
+            InputError: The store is damaged, is not an MLflow store, or was moved.
         """
         experiments = self._experiments()
         if not experiments:
             return []
         studies = {e.experiment_id: e.name for e in experiments}
         search = partial(self._client.search_runs, list(studies))
-        # all pages first: what is ended is no longer on the next one
+        # all pages first, as ended runs drop out of the search results
         for run in list(_pages(partial(search, "attributes.status = 'RUNNING'"))):
             if _is_dead(run.data.tags.get(_OWNER, "")):
                 self._client.set_terminated(run.info.run_id, "KILLED")
-        self._tell_of_older_runs()
-        wanted = [f"tags.{LAYOUT_TAG} = '{LAYOUT}'"]
-        wanted += [f"params.{key} = '{value}'" for key, value in self.only.items()]
-        stored = [
-            self._stored(run, studies[run.info.experiment_id])
-            for run in _pages(partial(search, " and ".join(wanted)))
-            if _TRAINED in run.data.tags or _is_left(run)
-            for run in [self._whole(run)]
+        self._warn_of_older_runs()
+        filters = [f"tags.{LAYOUT_TAG} = '{LAYOUT}'"]
+        filters += [f"params.{key} = '{value}'" for key, value in self.only.items()]
+        runs = [
+            self._stored(self._checked(run), studies[run.info.experiment_id])
+            for run in _pages(partial(search, " and ".join(filters)))
+            if _TRAINED in run.data.tags or _can_be_continued(run)
         ]
-        return sorted(stored, key=lambda run: run.started_ms, reverse=True)
+        return sorted(runs, key=lambda run: run.started_ms, reverse=True)
 
     def state(self) -> Any:
-        """How many runs of the study are FINISHED; nothing of all studies, which decides no result.
+        """The number of FINISHED runs of the study; a constant for all studies together.
 
-        What a server holds is not asked for: it always counts as changed.
+        A server is not queried: its runs always count as changed.
         """
         if self.study is None:
             return ""
@@ -210,7 +210,7 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
             ready_store(self._path)
         try:
             client = MlflowClient(tracking_uri=self._uri)
-        except (CommandError, MlflowException) as error:  # also of alembic, about its layout
+        except (CommandError, MlflowException) as error:  # alembic checks the database's layout
             raise InputError(
                 f"{self._uri}: not a run store that this MLflow can open ({error}); move it away, "
                 "or run `mlflow db upgrade` on it"
@@ -221,10 +221,10 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
         return client
 
     def check_reachable(self) -> None:
-        """Refuse a server or database that does not answer, before a run works for it.
+        """Check that a server or database answers before a run computes results for it.
 
         Raises:
-            InputError: It says what was asked.
+            InputError: It does not answer.
         """
         if not self._is_own_file:
             check_answers(self._uri)
@@ -233,15 +233,15 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
         experiments = _pages(self._client.search_experiments)
         return [e for e in experiments if self.study in (None, e.name)]
 
-    def _tell_of_older_runs(self) -> None:
-        """Count the runs of all studies that are not read, once for each store."""
-        if self._uri in _told_of_older_runs:
+    def _warn_of_older_runs(self) -> None:
+        """Log the number of runs of an older layout, once for each store."""
+        if self._uri in _stores_with_warning:
             return
-        _told_of_older_runs.add(self._uri)
+        _stores_with_warning.add(self._uri)
         client = self._client
-        everywhere = [e.experiment_id for e in _pages(client.search_experiments)]
-        wanted = f"tags.{LAYOUT_TAG} IS NULL"
-        runs = _pages(partial(client.search_runs, everywhere, wanted))
+        experiments = [e.experiment_id for e in _pages(client.search_experiments)]
+        older = f"tags.{LAYOUT_TAG} IS NULL"
+        runs = _pages(partial(client.search_runs, experiments, older))
         if count := sum(FINGERPRINT in run.data.tags for run in runs):
             logger.warning("%d runs of an older layout are not read", count)
 
@@ -270,7 +270,7 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
             return Estimator.load(path)
 
     def _uri_of(self, run: Run, tag: str) -> str:
-        """Where that is whose digest a tag holds."""
+        """Address of the fit or artifact whose digest a tag holds."""
         fold = tag.removeprefix(_FIT)
         if tag.startswith(_ARTIFACT):
             return f"{run.info.artifact_uri}/{tag.removeprefix(_ARTIFACT)}"
@@ -280,71 +280,69 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
 
     @contextmanager
     def _downloaded(self, run: Run, tag: str) -> Iterator[Path]:
-        """What was stored, as it was stored, or an error."""
-        uri = self._uri_of(run, tag)
+        """Download a fit or an artifact and check its digest."""
+        run_id, uri = run.info.run_id, self._uri_of(run, tag)
         with tempfile.TemporaryDirectory() as folder:
             try:
                 path = Path(download_artifacts(uri, dst_path=folder, tracking_uri=self._uri))
                 digest = digest_of(path)
-                whole = digest == run.data.tags.get(tag) or digest == self._digest_now(run, tag)
+                intact = digest == run.data.tags.get(tag)
+                # it may have been evaluated since it was loaded
+                intact = intact or digest == self._client.get_run(run_id).data.tags.get(tag)
             except (MlflowException, FileNotFoundError):
-                whole = False
-            if not whole:
-                self._set_back(run, [tag])
+                intact = False
+            if not intact:
+                self._reset(run, [tag])
                 raise InputError(
-                    f"run {run.info.run_id}: {uri} is not there, or not what was written; type the "
-                    "same command again, which makes it again"
+                    f"run {run_id}: {uri} is missing or damaged; type the same command again, "
+                    "which makes it again"
                 )
             yield path
 
-    def _digest_now(self, run: Run, tag: str) -> str | None:
-        """What the store says now: the run may have been evaluated since it was loaded."""
-        return self._client.get_run(run.info.run_id).data.tags.get(tag)
-
-    def _whole(self, run: Run) -> Run:
-        """A run, of which what is damaged or not there is marked as to be made again."""
+    def _checked(self, run: Run) -> Run:
+        """A run after a reset of its damaged or missing parts."""
         tags = run.data.tags
         if run.data.params and tags.get(_PARAMS) != _digest_of(run.data.params):
             raise InputError(
                 f"run {run.info.run_id}: its parameters were changed after it was made; delete it "
                 f"with `mlflow runs delete --run-id {run.info.run_id}`, and it is made again"
             )
-        broken = [tag for tag in tags if tag.startswith((_FIT, _ARTIFACT))]
-        broken = [tag for tag in broken if self._is_broken(run, tag)]
-        judged = tags.get(_METRICS, "")
-        if judged and judged != _metrics_tag(run.data.metrics, judged.split()[1:]):
+        parts = [tag for tag in tags if tag.startswith((_FIT, _ARTIFACT))]
+        broken = [tag for tag in parts if self._is_broken(run, tag)]
+        metrics = tags.get(_METRICS, "")
+        if metrics and metrics != _metrics_tag(run.data.metrics, metrics.split()[1:]):
             broken.append(_METRICS)
-        return self._set_back(run, broken) if broken else run
+        return self._reset(run, broken) if broken else run
 
     def _is_broken(self, run: Run, tag: str) -> bool:
-        """Whether an artifact on this machine is not what was written."""
+        """Whether a fit or an artifact on this machine is missing or damaged."""
         uri = self._uri_of(run, tag)
         if not uri.startswith("file:"):
-            return False  # looked at when it is downloaded
+            return False  # checked when it is downloaded
         path = Path(local_file_uri_to_path(uri))
         return not path.exists() or digest_of(path) != run.data.tags[tag]
 
-    def _set_back(self, run: Run, broken: Sequence[str]) -> Run:
-        """Mark parts of a run as not there: it is trained, or evaluated, again."""
+    def _reset(self, run: Run, broken: Sequence[str]) -> Run:
+        """Mark parts of a run as missing, so that it is trained or evaluated again."""
         run_id, tags = run.info.run_id, run.data.tags
         fits = [tag for tag in broken if tag.startswith(_FIT)]
         if _ARTIFACT + HISTORY in broken and _MODEL_FOLD in tags:
             fits.append(_FIT + tags[_MODEL_FOLD])
-        gone = {*broken, *fits, *([_TRAINED] if fits else []), EVALUATED_WITH}
-        for tag in sorted(gone & tags.keys()):
+        outdated = {*broken, *fits, *([_TRAINED] if fits else []), EVALUATED_WITH}
+        for tag in sorted(outdated & tags.keys()):
             self._client.delete_tag(run_id, tag)
         self._client.update_run(run_id, "KILLED")
         logger.warning(
-            "run %s: damaged or not there: %s; it is %s again",
+            "run %s: damaged or missing: %s; it is %s again",
             *(run_id, ", ".join(broken), "trained" if fits else "evaluated"),
         )
         return self._client.get_run(run_id)
 
     def _save_fitted(self, fitted: FittedRun) -> None:
         key = (fitted.run.study, fitted.run.fingerprint)
-        if key not in self._begun:
-            self._begun[key] = self._begin(fitted)
-        run_id, fits = self._begun[key]
+        if key not in self._unfinished:
+            self._unfinished[key] = self._begin(fitted)
+        run_id, fits = self._unfinished[key]
         tags = {_OWNER: _this_process()}
         if fitted.is_model:
             run = self._client.get_run(run_id)
@@ -361,52 +359,51 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
         fits.add(fitted.fold)
         if fits >= set(fitted.run.folds):
             tags[_TRAINED] = str(fitted.ended_ms)
-            del self._begun[key]
-            if not self._is_own_file and self._is_stored_already(fitted):
+            del self._unfinished[key]
+            if not self._is_own_file and self._is_duplicate(fitted):
                 self._client.delete_run(run_id)
                 return
         self._client.log_batch(run_id, tags=_tags(tags))
 
-    def _is_stored_already(self, fitted: FittedRun) -> bool:
-        """Whether another project trained the same at the same time and was done first."""
-        others = self._same_runs(fitted, f"tags.{_TRAINED} LIKE '%'")
+    def _is_duplicate(self, fitted: FittedRun) -> bool:
+        """Whether another project trained the same run at the same time and ended first."""
+        others = any(_TRAINED in run.data.tags for run in self._same_runs(fitted))
         if others:
             logger.warning("%s: another project has trained it meanwhile", fitted.run.name)
-        return bool(others)
+        return others
 
-    def _same_runs(self, fitted: FittedRun, more: str = "") -> list[Run]:
-        wanted = f"tags.{LAYOUT_TAG} = '{LAYOUT}' and tags.{FINGERPRINT} = "
-        wanted += f"'{fitted.run.fingerprint}'" + (f" and {more}" if more else "")
+    def _same_runs(self, fitted: FittedRun) -> Iterable[Run]:
+        same = f"tags.{LAYOUT_TAG} = '{LAYOUT}' and tags.{FINGERPRINT} = '{fitted.run.fingerprint}'"
         study = self._experiment_id(fitted.run.study)
-        return list(_pages(partial(self._client.search_runs, [study], wanted)))
+        return _pages(partial(self._client.search_runs, [study], same))
 
     def _begin(self, fitted: FittedRun) -> tuple[str, set[str]]:
-        """The run that a fit is added to: one that was left unfinished, or a new one."""
-        wanted, experiment_id = fitted.run, self._experiment_id(fitted.run.study)
-        run = next((run for run in self._same_runs(fitted) if _is_left(run)), None)
+        """Continue the unfinished run that a fit belongs to, or create a run."""
+        identity, experiment_id = fitted.run, self._experiment_id(fitted.run.study)
+        run = next((run for run in self._same_runs(fitted) if _can_be_continued(run)), None)
         if run is None:
             tags = self._tags_of(fitted)
-            differs = [f"{key} {wanted.params[key]}" for key in self.changed & wanted.params.keys()]
+            changed = self.changed & identity.params.keys()
+            differences = sorted(f"{key} {identity.params[key]}" for key in changed)
             env = self.provenance.get("kedro_env", "base")
-            name = ", ".join([wanted.name, *sorted(differs)])
-            name += f" ({env})" * (env != "base")
+            name = ", ".join([identity.name, *differences]) + f" ({env})" * (env != "base")
             run = self._client.create_run(experiment_id, fitted.started_ms, tags, name)
         else:
             self._client.update_run(run.info.run_id, "RUNNING")
             self._client.set_tag(run.info.run_id, _OWNER, _this_process())
         inputs = run.inputs.dataset_inputs if run.inputs else []
-        if not (run.data.params and inputs):  # also where a kill came between the two
-            params = [Param(key, str(value)) for key, value in wanted.params.items()]
+        if not (run.data.params and inputs):  # a killed process may have stored only the first
+            params = [Param(key, str(value)) for key, value in identity.params.items()]
             self._client.log_batch(run.info.run_id, params=params)
             self._client.log_inputs(run.info.run_id, [_dataset(fitted.dataset)])
         return str(run.info.run_id), set(_fits(run))
 
     def _tags_of(self, fitted: FittedRun) -> dict[str, str]:
         run = fitted.run
-        shown = {key: str(run.params[key]) for key in ("sensor", "estimator") if key in run.params}
+        columns = ("sensor", "estimator")
         return {
             **self.provenance,
-            **shown,
+            **{key: str(run.params[key]) for key in columns if key in run.params},
             "study": run.study,
             "recommended": str(fitted.estimator.recommended),
             **run.tags,
@@ -449,8 +446,8 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
         if existing is not None:
             experiment_id = existing.experiment_id
         else:
-            own = self._path.parent / "mlruns" / study
-            location = own.as_uri() if self._is_own_file else None
+            folder = self._path.parent / "mlruns" / study
+            location = folder.as_uri() if self._is_own_file else None
             experiment_id = self._client.create_experiment(study, location)
         if existing is None or DESCRIPTION not in existing.tags:
             about = _ABOUT.format(study=study)
@@ -458,7 +455,7 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
         return str(experiment_id)
 
     def _log_artifacts(self, run_id: str, artifacts: Mapping[str, Any]) -> dict[str, str]:
-        """Store artifacts, and give the tags with their digests."""
+        """Store artifacts and return the tags with their digests."""
         tags = {}
         with tempfile.TemporaryDirectory() as folder:
             for name, content in artifacts.items():
@@ -476,29 +473,29 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
 
 
 def run_link(runs: Sequence[TrackedRuns]) -> str | None:
-    """Address at which MLflow's user interface shows the runs of a study, the best first.
+    """Address at which MLflow's user interface shows the runs of a study, the best run first.
 
-    A tag of the experiment holds the filter and the columns of that view.
+    A tag of the experiment stores the filter and the columns of this view.
 
     Args:
-        runs: Datasets of one study; the view is narrowed to their source and sensor if all that
-            name one agree.
+        runs: Datasets of the same study. The view is narrowed to their source and sensor if these
+            do not differ.
 
     Returns:
-        The link; None if the study has no runs.
+        The address; None if the study has no runs.
     """
     first = runs[0]
     experiment = next(iter(first._experiments()), None)
     if experiment is None:
         return None
-    wanted, name = [f"tags.{LAYOUT_TAG} = '{LAYOUT}'"], "runs"
+    filters, name = [f"tags.{LAYOUT_TAG} = '{LAYOUT}'"], "runs"
     for key in ("source", "sensor"):
         values = {dataset.only[key] for dataset in runs if key in dataset.only}
         if len(values) == 1:
             (value,) = values
-            wanted.append(f"params.{key} = '{value}'")
+            filters.append(f"params.{key} = '{value}'")
             name += f"_{value}"
-    view = json.dumps(_VIEW | {"searchFilter": " and ".join(wanted)})
+    view = json.dumps(_VIEW | {"searchFilter": " and ".join(filters)})
     if experiment.tags.get(_SHARED_VIEW + name) != view:
         first._client.set_experiment_tag(experiment.experiment_id, _SHARED_VIEW + name, view)
     server = first._uri.rstrip("/") if first._uri.startswith("http") else USER_INTERFACE
@@ -506,14 +503,14 @@ def run_link(runs: Sequence[TrackedRuns]) -> str | None:
     return f"{server}/#/experiments/{experiment.experiment_id}/runs?{query}"
 
 
-def _dataset(described: Mapping[str, str]) -> DatasetInput:
+def _dataset(recordings: Mapping[str, str]) -> DatasetInput:
     """The recordings that a run was fitted to, as MLflow shows them."""
-    rest = {key: value for key, value in described.items() if key not in ("name", "digest")}
+    rest = {key: value for key, value in recordings.items() if key not in ("name", "digest")}
     dataset = Dataset(
-        name=described["name"],
-        digest=described["digest"],
+        name=recordings["name"],
+        digest=recordings["digest"],
         source_type="local",
-        source=json.dumps({"uri": described["source"]}),
+        source=json.dumps({"uri": recordings["source"]}),
         profile=json.dumps(rest),
     )
     return DatasetInput(dataset, [InputTag("mlflow.data.context", "training")])
@@ -532,7 +529,7 @@ def _digest_of(texts: Mapping[str, str]) -> str:
 
 
 def _metrics_tag(metrics: Mapping[str, float], names: Iterable[str]) -> str:
-    """A digest of some metrics, and their names."""
+    """A digest of selected metrics, and their names."""
     values = {name: repr(metrics.get(name)) for name in names}
     return " ".join([fingerprint(values), *sorted(values)])
 
@@ -546,14 +543,14 @@ def _this_process() -> str:
     return f"{platform.node()} {process.pid} {process.create_time()} {time.time():.0f}"
 
 
-def _is_left(run: Run) -> bool:
-    """Whether a run lacks fits that nobody else is about to add."""
+def _can_be_continued(run: Run) -> bool:
+    """Whether a run lacks fits that no other living process is adding."""
     if _TRAINED in run.data.tags:
         return False
     owner = run.data.tags.get(_OWNER, "")
     running = run.info.status == RunStatus.to_string(RunStatus.RUNNING)
-    own = owner.split()[:-1] == _this_process().split()[:-1]
-    return not running or own or _is_dead(owner)
+    by_this_process = owner.split()[:-1] == _this_process().split()[:-1]
+    return not running or by_this_process or _is_dead(owner)
 
 
 def _pages(search: Callable[..., Any]) -> Iterable[Any]:
@@ -567,7 +564,7 @@ def _pages(search: Callable[..., Any]) -> Iterable[Any]:
 
 
 def _is_dead(owner: str) -> bool:
-    """Whether a run's process is gone, or on another machine and long silent."""
+    """Whether a run's process has ended, or has not written for long from another machine."""
     parts = owner.split()
     if len(parts) != len(_this_process().split()):
         return False
@@ -581,9 +578,9 @@ def _is_dead(owner: str) -> bool:
 
 
 def _thinned(history: pd.DataFrame, ended_ms: int) -> list[Metric]:
-    """About 50 points of each curve: the whole history is an artifact."""
+    """About 50 points of each curve; the full history is an artifact."""
     step = -(-len(history) // _CURVE_POINTS)
-    rows = history.iloc[::-step].iloc[::-1]  # the last epoch is always among them
+    rows = history.iloc[::-step].iloc[::-1]  # always including the last epoch
     return [
         Metric(name, float(value), ended_ms, int(epoch))
         for name in rows.columns.intersection(["train_loss", "val_loss"])

@@ -1,1 +1,1 @@
-"""What a stationary gyroscope gives and what can be known from it: pure NumPy, deg/s, seconds."""
+"""Models of stationary gyroscopes, their noise and their bias: NumPy and SciPy, deg/s, seconds."""

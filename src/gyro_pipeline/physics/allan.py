@@ -6,8 +6,8 @@ IEEE Std 952 models the Allan variance at averaging time t as
 
 with white noise N (angle random walk), bias instability B (flicker noise, whose floor is
 0.664 B) and rate random walk K. For white noise the mean of t seconds has standard deviation
-N / sqrt(t), which is why N and not the sample sigma is used everywhere: the two differ as soon
-as successive samples are correlated.
+N / sqrt(t). N is used everywhere rather than the standard deviation of samples, since the two
+are no longer equivalent if successive samples are correlated.
 """
 
 from collections.abc import Iterator
@@ -18,19 +18,20 @@ import scipy
 from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import InputError
+from gyro_pipeline.physics.bias import runs
 
 SHORTEST_FIT_SAMPLES = 8
-"""Shorter averages show how successive samples are correlated (by an anti-alias filter), for which
-the model has no term: a lag-1 correlation rho changes N^2 by the factor
-1 - 3 rho / (m (1 + 2 rho)) at m samples, 8 % at m = 8 for rho = -0.15."""
+"""Shortest average for fits. Shorter ones show the correlation of successive samples (by an
+anti-alias filter), for which the model has no term: a lag-1 correlation rho changes N^2 by the
+factor 1 - 3 rho / (m (1 + 2 rho)) at m samples, 8 % at m = 8 for rho = -0.15."""
 
 FLICKER_FLOOR = 2 * np.log(2) / np.pi
 """Allan variance of flicker noise in units of B^2."""
 
 _POINTS = 20
-_LONGEST_FRACTION = 5  # of the recording: beyond, too few independent averages are left
+_LONGEST_FRACTION = 5  # beyond a fifth of the recording, independent averages are too few
 _TERMS = 3
-_CLOSED = 10  # a gap is closed at averaging times of so many times its length
+_CLOSED = 10  # least ratio of an averaging time to a gap that is closed
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class NoiseFigures:
 
 
 def averaging_times_s(n_samples: int, rate_hz: float) -> NDArray[np.float64]:
-    """Averaging times for one recording, spaced evenly in the logarithm.
+    """Averaging times for a recording, spaced evenly in the logarithm.
 
     Args:
         n_samples: Length of the recording.
@@ -54,7 +55,7 @@ def averaging_times_s(n_samples: int, rate_hz: float) -> NDArray[np.float64]:
 
     Returns:
         (m,), s: increasing whole multiples of the sample period, from one sample to a fifth of
-        the recording; at most 20, fewer where the recording is short.
+        the recording; at most 20, fewer for short recordings.
     """
     longest = max(1, n_samples // _LONGEST_FRACTION)
     factors = np.unique(np.rint(np.geomspace(1, longest, _POINTS)))
@@ -64,11 +65,11 @@ def averaging_times_s(n_samples: int, rate_hz: float) -> NDArray[np.float64]:
 def allan_variance(
     samples: NDArray[np.floating], rate_hz: float, times_s: NDArray[np.floating]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Overlapping Allan variance of one recording (NIST SP1065, equation 11).
+    """Overlapping Allan variance of a recording (NIST SP1065, equation 11).
 
-    It is the mean over the stretches between masked samples, by their counts of differences. A gap
-    of up to a tenth of an averaging time is closed, as it moves samples by less than the average
-    resolves; else a few masked samples would cost the long averaging times.
+    It is the mean over the stretches between gaps, weighted by their numbers of differences. Gaps
+    of up to a tenth of an averaging time are closed, as they hardly move samples; otherwise a few
+    masked samples would make long averaging times impossible.
 
     Args:
         samples: (n,), deg/s; NaN where masked.
@@ -76,12 +77,12 @@ def allan_variance(
         times_s: (m,), s, whole multiples of the sample period, in any order.
 
     Returns:
-        The variance (m,), (deg/s)^2, in the order of ``times_s``, and of how many differences it is
-        the mean, (m,). It is NaN, of none, where every stretch is shorter than two averages.
+        The variance (m,), (deg/s)^2, in the order of ``times_s``, and its number of differences,
+        (m,). Where every stretch is shorter than two averages, these are NaN and 0.
 
     Raises:
-        InputError: An averaging time is no multiple of the sample period. allantools itself would
-            move it without a word.
+        InputError: An averaging time is not a multiple of the sample period; allantools would
+            silently change it.
     """
     factors = np.rint(times_s * rate_hz).astype(int)
     if not np.allclose(factors, times_s * rate_hz, rtol=1e-9) or factors.min() < 1:
@@ -90,11 +91,11 @@ def allan_variance(
             f"got {times_s}"
         )
     squares, counts = np.zeros(factors.shape), np.zeros(factors.shape, np.int64)
-    gaps = _gaps(samples)
+    gaps = runs(np.isnan(samples))  # start and end, exclusive, of each gap
     closed = np.searchsorted(np.sort(gaps[:, 1] - gaps[:, 0]), factors // _CLOSED, side="right")
-    for alike in (closed == number for number in np.unique(closed)):
-        for stretch in _stretches(samples, gaps, factors[alike].min() // _CLOSED):
-            fits = alike & (stretch.size > 2 * factors)
+    for group in (closed == number for number in np.unique(closed)):
+        for stretch in _stretches(samples, gaps, factors[group].min() // _CLOSED):
+            fits = group & (stretch.size > 2 * factors)
             count = np.where(fits, stretch.size - 2 * factors + 1, 0)
             squares[fits] += count[fits] * _overlapping(stretch, factors[fits], rate_hz)
             counts += count
@@ -105,7 +106,7 @@ def allan_variance(
 def mean_variance(
     variances: NDArray[np.floating], counts: NDArray[np.integer]
 ) -> NDArray[np.float64]:
-    """Mean of several recordings' Allan variances, by their counts of differences.
+    """Mean of several recordings' Allan variances, weighted by their numbers of differences.
 
     Args:
         variances: (recordings, ..., m), (deg/s)^2.
@@ -119,16 +120,10 @@ def mean_variance(
         return np.asarray(np.nansum(variances * weights, axis=0) / weights.sum(axis=0))
 
 
-def _gaps(samples: NDArray[np.floating]) -> NDArray[np.int64]:
-    """First masked sample of each gap and the sample after it, (gaps, 2)."""
-    masked = np.concatenate([[False], np.isnan(samples), [False]])
-    return np.flatnonzero(masked[1:] != masked[:-1]).reshape(-1, 2)
-
-
 def _stretches(
-    samples: NDArray[np.floating], gaps: NDArray[np.int64], longest: int
+    samples: NDArray[np.floating], gaps: NDArray[np.integer], longest: int
 ) -> Iterator[NDArray[np.floating]]:
-    """Measured samples between gaps longer than so many samples; shorter ones are closed."""
+    """Unmasked samples between gaps longer than ``longest`` samples; shorter gaps are closed."""
     ends = gaps[gaps[:, 1] - gaps[:, 0] > longest].ravel()
     for part in np.split(samples, ends)[::2]:
         yield part[~np.isnan(part)]
@@ -137,7 +132,7 @@ def _stretches(
 def _overlapping(
     samples: NDArray[np.floating], factors: NDArray[np.integer], rate_hz: float
 ) -> NDArray[np.float64]:
-    """Overlapping Allan variance at averages of so many samples, in any order."""
+    """Overlapping Allan variance for averages of ``factors`` samples, in any order."""
     import allantools  # noqa: PLC0415 - it imports matplotlib
 
     if not factors.size:
@@ -155,19 +150,19 @@ def fit_noise(
     duration_s: float | NDArray[np.floating],
     shortest_s: float,
 ) -> NoiseFigures:
-    """Fit N, B and K, none of them negative, to an Allan variance.
+    """Fit nonnegative N, B and K to an Allan variance.
 
-    Least squares on relative errors, since the variance spans decades. The relative scatter of a
-    measured Allan variance is sqrt(2 / degrees of freedom), of which there are about
-    ``duration_s / t``, so a point weighs by their root.
+    This is a least-squares fit of relative errors, since the variance spans decades. The relative
+    standard deviation of a measured Allan variance is sqrt(2 / degrees of freedom), with about
+    ``duration_s / t`` degrees of freedom, whose root is the weight of a point.
 
     Args:
         times_s: (m,), s, averaging times.
         variance: (m,), (deg/s)^2, usually the mean over many recordings.
-        duration_s: Length of one recording; (m,) where not all are long enough for all averaging
-            times, then of those that are.
+        duration_s: Length of a recording; if some recordings are too short for some averaging
+            times, the length of the others for each time, (m,).
         shortest_s: Shorter averaging times are left out; ``SHORTEST_FIT_SAMPLES`` sample periods
-            where successive samples may be correlated.
+            if successive samples may be correlated.
 
     Returns:
         The noise figures.
@@ -175,9 +170,8 @@ def fit_noise(
     Raises:
         InputError: Fewer than three averaging times have a variance, or one is not positive.
     """
-    kept = times_s >= shortest_s * (1 - 1e-9)  # a time that is equal but for rounding is kept
-    kept = kept & ~np.isnan(variance)
-    times, measured = times_s[kept].astype(np.float64), variance[kept].astype(np.float64)
+    usable = (times_s >= shortest_s * (1 - 1e-9)) & ~np.isnan(variance)  # up to rounding
+    times, measured = times_s[usable].astype(np.float64), variance[usable].astype(np.float64)
     if times.size < _TERMS or not np.all(measured > 0):
         raise InputError(
             f"noise fit: expected at least {_TERMS} averaging times from {shortest_s:g} s on, each "
@@ -185,7 +179,7 @@ def fit_noise(
             "longer and not constant"
         )
     terms = np.stack([1 / times, np.full_like(times, FLICKER_FLOOR), times / 3], axis=1)
-    durations_s = np.broadcast_to(duration_s, times_s.shape)[kept]
+    durations_s = np.broadcast_to(duration_s, times_s.shape)[usable]
     weight = np.sqrt(durations_s / times) / measured
     squares, _ = scipy.optimize.nnls(terms * weight[:, None], measured * weight)
     white, instability, random_walk = np.sqrt(squares)

@@ -1,6 +1,6 @@
-"""Bias of a stationary recording: its mean, and how long the running mean takes to settle.
+"""Bias of a stationary recording: its mean, and the settling time of the running mean.
 
-Samples that hold no measurement are NaN; they are in no sum and no count.
+Masked samples are NaN and do not count.
 """
 
 import numpy as np
@@ -29,18 +29,18 @@ def sample_sigma(samples: NDArray[np.floating]) -> NDArray[np.float64]:
     Returns:
         (...), deg/s.
     """
-    # given a dtype, NumPy would still round deviations to that of the samples on the way
+    # with the argument dtype, NumPy would still round deviations to the precision of the samples
     return np.asarray(np.nanstd(samples.astype(np.float64), axis=-1, ddof=1))
 
 
 def fill_masked(samples: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Replace masked samples by the mean of the others, which leaves that mean as it is.
+    """Replace masked samples by the mean of the others, which does not change the mean.
 
     Args:
         samples: (..., n), deg/s; NaN where masked.
 
     Returns:
-        (..., n); the samples themselves where none is masked.
+        (..., n); the input itself if no sample is masked.
     """
     masked = np.isnan(samples)
     if not masked.any():
@@ -49,10 +49,16 @@ def fill_masked(samples: NDArray[np.floating]) -> NDArray[np.floating]:
     return np.where(masked, means, samples)
 
 
+def runs(mask: NDArray[np.bool_]) -> NDArray[np.integer]:
+    """Start and end, exclusive, of each run of true values, (run, 2)."""
+    edges = np.concatenate([[False], mask, [False]])
+    return np.flatnonzero(edges[1:] != edges[:-1]).reshape(-1, 2)
+
+
 def windows_at(
     samples: NDArray[np.floating], size: int, starts: NDArray[np.integer]
 ) -> NDArray[np.floating]:
-    """Windows of a recording; masked samples are the mean of their window.
+    """Windows of a recording, with masked samples replaced by the mean of their window.
 
     Args:
         samples: (..., n), deg/s; NaN where masked.
@@ -79,12 +85,12 @@ def settling_time_s(
         (...), s, between one sample period and the whole recording.
     """
     recordings = samples.reshape(-1, samples.shape[-1])
-    # one recording at a time: its running mean is float64, the whole set would be twice the input
-    times = [_settled_count(row, tolerance_dps) / rate_hz for row in recordings]
+    # one recording at a time, as the float64 running means of all would take much memory
+    times = [_settling_count(row, tolerance_dps) / rate_hz for row in recordings]
     return np.array(times, dtype=np.float64).reshape(samples.shape[:-1])
 
 
-def _settled_count(recording: NDArray[np.floating], tolerance_dps: float) -> float:
+def _settling_count(recording: NDArray[np.floating], tolerance_dps: float) -> float:
     """Number of samples after which the running mean no longer leaves the band."""
     measured = np.flatnonzero(~np.isnan(recording))
     if not measured.size:

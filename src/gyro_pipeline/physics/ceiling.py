@@ -1,32 +1,32 @@
-"""The limit of every estimator that sees only the window, under white noise.
+"""The ceiling: the least RMSE of any estimator that sees only the window, under white noise.
 
-The bias b of a power-on is Normal(mu, tau^2): mu the prior mean, tau the turn-on spread. The mean
-of t seconds scatters about it by N / sqrt(t). The window has T0 of the recording's T seconds, m is
-its mean and n that of the other T - T0 seconds. With
+The bias b of a power-on is Normal(mu, tau^2), with the prior mean mu and the turn-on spread tau.
+The mean of t seconds scatters about it by N / sqrt(t). The window has T0 of the recording's T
+seconds, m is its mean, and n is the mean of the other T - T0 seconds. With
 
     r = T0 / T,    q = tau^2 T0 / N^2,    beta = q / (1 + q)
 
-the window tells about b only through m, and the posterior of b has mean mu + beta (m - mu) and
-variance tau^2 (1 - beta) = beta N^2 / T0.
+the window has information about b only through m, and the posterior of b has mean
+mu + beta (m - mu) and variance tau^2 (1 - beta) = beta N^2 / T0.
 
-Truth (a), PAPER, is the mean of the whole recording, GT = r m + (1 - r) n. The running mean errs
-by m - GT = (1 - r) (m - n), whose variance is (1 - r)^2 N^2 (1 / T0 + 1 / (T - T0)), that is
-N^2 (1 / T0 - 1 / T). The best estimate is E[GT | window] = r m + (1 - r) (mu + beta (m - mu)),
-which errs by (1 - r) (posterior error of b, and n's own N^2 / (T - T0)). The ratio of the two
-variances is
+Truth (a), PAPER, is the mean of the whole recording, GT = r m + (1 - r) n. The error of the running
+mean is m - GT = (1 - r) (m - n), whose variance is (1 - r)^2 N^2 (1 / T0 + 1 / (T - T0)), that is
+N^2 (1 / T0 - 1 / T). The best estimate is E[GT | window] = r m + (1 - r) (mu + beta (m - mu)). Its
+error is (1 - r) times the sum of the posterior error of b and the averaging noise of n, whose
+variance is N^2 / (T - T0). The ratio of the two variances is
 
     rho^2 = r + (1 - r) q / (1 + q)
 
-Truth (b), DISJOINT, is n with its averaging noise N^2 / (T - T0) taken off the squared error, and
-truth (c), TRUE, is b itself. For both the running mean's squared error is N^2 / T0, the best
-estimate is the posterior mean, and rho^2 = q / (1 + q).
+Truth (b), DISJOINT, is n, with its averaging noise N^2 / (T - T0) subtracted from the squared
+error, and truth (c), TRUE, is b itself. For both, the running mean's squared error is N^2 / T0, the
+best estimate is the posterior mean, and rho^2 = q / (1 + q).
 
 For truth (a), the time t at which the running mean alone reaches the best RMSE solves
 N^2 (1 / t - 1 / T) = rho^2 N^2 (1 / T0 - 1 / T), so the saving is S = 1 - T0 / t =
 (1 - rho^2) (1 - r). The gain in accuracy is A = 1 - rho. With tau = 0: A = 1 - sqrt(r),
 S = (1 - r)^2.
 
-Several axes: the squared errors of both add up, so the same formulas hold for the ratio of
+For several axes, the squared errors of both add up, so the same formulas hold for the ratio of
 the pooled values.
 """
 
@@ -48,7 +48,7 @@ def running_mean_rmse(
         noise: N, deg/s * sqrt(s).
         window_s: T0.
         recording_s: T.
-        truth: PAPER, DISJOINT (its own averaging noise taken off) or TRUE.
+        truth: PAPER, DISJOINT (with its averaging noise subtracted) or TRUE.
 
     Returns:
         RMSE, deg/s, of the arguments' common shape.
@@ -68,7 +68,7 @@ def ceiling_rmse(
     recording_s: ArrayLike,
     truth: str,
 ) -> NDArray[np.float64]:
-    """Smallest RMSE that an estimator which sees only the window can have.
+    """The least RMSE of any estimator that sees only the window.
 
     Args:
         noise: N, deg/s * sqrt(s).
@@ -123,7 +123,7 @@ def oracle(
     recording_s: float,
     truth: str,
 ) -> NDArray[np.float64]:
-    """Best estimate by one who knows mu, tau and N; its RMSE is ``ceiling_rmse``.
+    """Best estimate with known mu, tau and N; its RMSE is ``ceiling_rmse``.
 
     Args:
         window_mean: m, deg/s.
@@ -132,7 +132,7 @@ def oracle(
         noise: N, deg/s * sqrt(s).
         window_s: T0.
         recording_s: T.
-        truth: PAPER, DISJOINT or TRUE; the best estimate for PAPER is not the best of the bias.
+        truth: PAPER, DISJOINT or TRUE; the best estimate for PAPER is not that of the bias.
 
     Returns:
         Estimate, deg/s, of the arguments' common shape.
@@ -149,12 +149,12 @@ def oracle(
 def turn_on_spread(
     recording_means: NDArray[np.floating], averaging: ArrayLike
 ) -> NDArray[np.float64]:
-    """Turn-on spread tau: what the recordings' means scatter beyond their averaging noise.
+    """Turn-on spread tau: the scatter of the recordings' means beyond their averaging noise.
 
     Args:
-        recording_means: (n, ...), deg/s; NaN where a recording is lacking.
-        averaging: Variance of that noise, (deg/s)^2, broadcast against the trailing shape: N^2 / T
-            if it is white.
+        recording_means: (n, ...), deg/s; NaN where a recording is missing.
+        averaging: Variance of the averaging noise, (deg/s)^2, broadcast against the trailing shape:
+            N^2 / T if the noise is white.
 
     Returns:
         (...), deg/s; 0 where the means scatter less than their averaging noise.
@@ -175,16 +175,17 @@ def turn_on_spread(
 def spread_draws(
     recording_means: NDArray[np.floating], averaging: ArrayLike, draws: int
 ) -> NDArray[np.float64]:
-    """Turn-on spreads that recordings allow, whose quantiles make intervals.
+    """Draws of the turn-on spread, whose quantiles are intervals.
 
-    If all is normal, the scatter of n means is their variance times a chi-square of n - 1 degrees
-    of freedom over n - 1. So its inverse is drawn (a generalised pivot; Weerahandi 1993, Journal of
-    the American Statistical Association 88), and the averaging noise taken off.
+    For normal means, the scatter of n means is their variance times a chi-square variable of n - 1
+    degrees of freedom over n - 1. So the scatter is divided by draws of this variable (a
+    generalised pivot; Weerahandi 1993, Journal of the American Statistical Association 88), and the
+    averaging noise is subtracted.
 
     Args:
         recording_means: As for :func:`turn_on_spread`.
-        averaging: Likewise.
-        draws: How many; always the same ones.
+        averaging: As for :func:`turn_on_spread`.
+        draws: Number of draws, from a fixed seed.
 
     Returns:
         (draws, ...), deg/s.
@@ -193,19 +194,19 @@ def spread_draws(
     scatter = np.nanvar(recording_means, axis=0, ddof=1, dtype=np.float64)
     generator = np.random.default_rng(0)
     pivots = freedom / generator.chisquare(freedom, (draws, *scatter.shape))
-    left = scatter * pivots - np.asarray(averaging, np.float64)
-    return np.asarray(np.sqrt(np.maximum(0.0, left)))
+    variances = scatter * pivots - np.asarray(averaging, np.float64)
+    return np.asarray(np.sqrt(np.maximum(0.0, variances)))
 
 
 def joint_draws(
     recording_means: NDArray[np.floating], averaging: ArrayLike, draws: int
 ) -> NDArray[np.float64]:
-    """Covariance of the turn-on bias of all axes: the estimate, then what recordings allow.
+    """Covariance of the turn-on bias of all axes: the estimate, then draws.
 
     Args:
         recording_means: (n, axes), deg/s, of more recordings than axes.
         averaging: Variance of their averaging noise, (axes,), (deg/s)^2.
-        draws: How many, as by :func:`spread_draws`, of a Wishart distribution.
+        draws: Number of draws, as by :func:`spread_draws`, but from a Wishart distribution.
 
     Returns:
         (1 + draws, axes, axes), (deg/s)^2; positive semidefinite.
@@ -213,8 +214,8 @@ def joint_draws(
     scatter, freedom = np.cov(recording_means.T), len(recording_means) - 1
     pivots = scipy.stats.wishart.rvs(freedom, np.eye(len(scatter)) / freedom, draws, random_state=0)
     root = np.linalg.cholesky(scatter)
-    drawn = root @ np.linalg.inv(pivots) @ root.T
-    values, vectors = np.linalg.eigh(np.concatenate([scatter[None], drawn]) - np.diag(averaging))
+    samples = root @ np.linalg.inv(pivots) @ root.T
+    values, vectors = np.linalg.eigh(np.concatenate([scatter[None], samples]) - np.diag(averaging))
     return np.asarray((vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.swapaxes(1, 2))
 
 
@@ -233,14 +234,14 @@ def pooled(rmse_per_axis: ArrayLike) -> NDArray[np.float64]:
 def _posterior_weight(
     noise: ArrayLike, turn_on_spread: ArrayLike, window_s: ArrayLike
 ) -> NDArray[np.float64]:
-    """The beta = q / (1 + q) of the window mean, written so that tau = 0 needs no care."""
+    """The weight beta = q / (1 + q) of the window mean, in a form that is valid for tau = 0."""
     prior = np.asarray(turn_on_spread, np.float64) ** 2
     averaging = np.asarray(noise, np.float64) ** 2 / np.asarray(window_s, np.float64)
     return prior / (prior + averaging)
 
 
 def _includes_window(truth: str) -> bool:
-    """Whether the truth is an average over the window, too."""
+    """Whether the truth is an average that includes the window."""
     if truth not in (PAPER, DISJOINT, TRUE):
         raise InputError(f"truth: expected {PAPER!r}, {DISJOINT!r} or {TRUE!r}, got {truth!r}")
     return truth == PAPER

@@ -1,13 +1,13 @@
-"""What a device's past calibrations say about its next bias.
+"""Prediction of a device's next bias from its past calibrations.
 
-From one recording to the next the bias walks on, and each power-on adds its turn-on deviation:
+From one recording to the next the bias walks, and each power-on adds its turn-on deviation:
 
     bias of recording i = level_i + deviation_i,    level_(i + 1) = level_i + step
 
 with a step of standard deviation D per recording number and a deviation of standard deviation tau
 (a local-level model). A calibration, the mean of a recording, adds its averaging noise. The prior
-of a recording is the conditional mean of its bias given the calibrations before it, the first level
-being unknown (kriging). With D = 0 that is their mean, and the spread tau.
+of a recording is the conditional distribution of its bias given the calibrations before it, with an
+unknown first level (kriging). With D = 0 its mean is that of the calibrations, and its spread tau.
 """
 
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from gyro_pipeline.physics.recording_model import RecordingModel
 
-_FEWEST_PAST = 3  # with fewer calibrations before it, a recording has the prior of all
+_FEWEST_PAST = 3  # a recording after fewer calibrations has the prior of all recordings
 
 
 def merged_calibrations(
@@ -28,24 +28,24 @@ def merged_calibrations(
     more_numbers: NDArray[np.integer],
     more_labels: NDArray[np.float64],
 ) -> tuple[NDArray[np.integer], NDArray[np.float64]]:
-    """Calibrations and further ones in their order, each once.
+    """Merge two sets of calibrations by recording number, each recording once.
 
     Args:
-        numbers: Of recordings, (n,).
+        numbers: Numbers of the recordings, (n,).
         labels: Their means, (n, ...), deg/s.
-        more_numbers: Of further ones.
-        more_labels: Likewise.
+        more_numbers: Numbers of the second set, (m,).
+        more_labels: Means of the second set, (m, ...), deg/s.
     """
-    both, first = np.unique(np.concatenate([numbers, more_numbers]), return_index=True)
-    return both, np.concatenate([labels, more_labels])[first]
+    merged, first = np.unique(np.concatenate([numbers, more_numbers]), return_index=True)
+    return merged, np.concatenate([labels, more_labels])[first]
 
 
 @dataclass(frozen=True)
 class BiasHistory:
-    """Calibrations of one gyroscope, in order, and how its bias walks.
+    """Calibrations of a gyroscope, in order, and the parameters of its bias.
 
     Attributes:
-        numbers: Of the recordings, (n,), increasing.
+        numbers: Numbers of the recordings, (n,), increasing.
         labels: Their means, (n,), deg/s.
         averaging: Averaging noise of a label, (deg/s)^2.
         step: D, deg/s.
@@ -65,13 +65,13 @@ class BiasHistory:
         """Fit D and tau by restricted maximum likelihood, with tau's weak prior.
 
         Args:
-            numbers: Of the recordings, (n,), increasing.
+            numbers: Numbers of the recordings, (n,), increasing.
             labels: Their means, (n,), deg/s.
-            model: Of one recording; its noise makes the averaging noise of a label.
+            model: Model of a recording; its noise determines the averaging noise of a label.
         """
         edges = np.array([0, model.samples])
         averaging = float(model.noise_covariance(edges)[0, 0])
-        if model.mean.size > 1:  # the warm-up is in the label, with its own amplitude
+        if model.mean.size > 1:  # the label includes the warm-up, whose amplitude varies
             averaging += float(model.profiles(edges)[0, 1] ** 2 * model.covariance[1, 1])
         scale = np.log(labels.std(ddof=1))
 
@@ -86,41 +86,41 @@ class BiasHistory:
 
         starts = [scale + np.array(start) for start in ((-1.0, -0.5), (-4.0, 0.0))]
         bounds = [(scale - 9, scale + 3)] * 2
-        found = [
+        fits = [
             scipy.optimize.minimize(deviance, x, bounds=bounds, method="L-BFGS-B") for x in starts
         ]
-        best = min(found, key=lambda result: result.fun)
+        best = min(fits, key=lambda fit: fit.fun)
         return cls(numbers, labels, averaging, *map(float, np.exp(best.x)))
 
     def extended(self, numbers: NDArray[np.integer], labels: NDArray[np.float64]) -> Self:
-        """The history with further calibrations, (n,) each; D and tau stay as they are."""
-        both = merged_calibrations(self.numbers, self.labels, numbers, labels)
-        return replace(self, numbers=both[0], labels=both[1])
+        """The history with further calibrations, (n,) each, and unchanged D and tau."""
+        merged = merged_calibrations(self.numbers, self.labels, numbers, labels)
+        return replace(self, numbers=merged[0], labels=merged[1])
 
     def _covariance(self, numbers: NDArray[np.integer]) -> NDArray[np.float64]:
-        """Of labels, about a level that is unknown at the first recording."""
+        """Covariance of labels about the unknown level of the first recording."""
         since = numbers - self.numbers[0]
         walk = self.step**2 * np.minimum(since[:, None], since[None, :])
         return walk + (self.deviation**2 + self.averaging) * np.eye(numbers.size)
 
     def prior(self, model: RecordingModel, recording: int | None) -> RecordingModel:
-        """The model with the prior of one recording.
+        """The model with the prior of a certain recording.
 
         Args:
-            model: With the prior of any recording; kept where fewer than three calibrations came
-                before.
-            recording: Its number; None for the one after all.
+            model: Model with the prior of any recording, which is kept if fewer than three
+                calibrations precede the recording.
+            recording: Number of the recording; None for the next one.
         """
         next_number = int(self.numbers[-1]) + 1 if recording is None else recording
         past = self.numbers < next_number
         if past.sum() < _FEWEST_PAST:
             return model
-        # the warm-up's share of a label is the same for all but for its scatter
+        # the warm-up's contribution to a label is the same for all, apart from its scatter
         offset = model.profiles(np.array([0, model.samples]))[0, 1:] @ model.mean[1:]
         numbers, labels = self.numbers[past], self.labels[past] - offset
         covariance = self._covariance(np.append(numbers, next_number))
-        among, with_next = covariance[:-1, :-1], covariance[:-1, -1]
-        solved = np.linalg.solve(among, np.column_stack([np.ones(numbers.size), with_next]))
+        of_past, with_next = covariance[:-1, :-1], covariance[:-1, -1]
+        solved = np.linalg.solve(of_past, np.column_stack([np.ones(numbers.size), with_next]))
         information = solved[:, 0].sum()
         level = solved[:, 0] @ labels / information
         mean = level + solved[:, 1] @ (labels - level)

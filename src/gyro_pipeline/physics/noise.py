@@ -1,4 +1,4 @@
-"""Simulated gyroscope noise: white (also correlated over one sample), flicker, random walk."""
+"""Simulated gyroscope noise: white (optionally with lag-1 correlation), flicker, random walk."""
 
 import numpy as np
 import scipy
@@ -18,20 +18,20 @@ def simulate_noise(
     flicker_dps: float = 0.0,
     random_walk_dps_rts: float = 0.0,
 ) -> NDArray[np.float32]:
-    """Zero-mean noise of stationary gyroscopes, every recording independent of the others.
+    """Zero-mean noise of stationary gyroscopes, independent between recordings.
 
     The mean of t seconds of the white part scatters by N / sqrt(t), so sigma = N sqrt(rate).
-    With a lag-1 correlation it is the moving average x_i = e_i + theta e_(i-1), scaled so that N,
-    its level at frequency zero, stays what was asked for: sigma = N sqrt(rate / (1 + 2 lag1)).
+    With a lag-1 correlation it is the moving average x_i = e_i + theta e_(i-1), scaled so that its
+    level at frequency zero remains N: sigma = N sqrt(rate / (1 + 2 lag1)).
 
     Args:
         generator: Source of randomness.
         shape: (..., n), n samples per recording.
         rate_hz: Samples per second.
         white_dps_rts: N, deg/s * sqrt(s), broadcast against ``shape[:-1]``.
-        lag1_correlation: Of successive samples of the white part, between -0.5 and 0.5.
-        flicker_dps: Bias instability B, deg/s: the Allan deviation has its floor at 0.664 B.
-        random_walk_dps_rts: K, deg/s / sqrt(s): a walk that starts at 0 at power-on and whose
+        lag1_correlation: Correlation of successive samples of the white part, -0.5 to 0.5.
+        flicker_dps: Bias instability B, deg/s; the floor of the Allan deviation is 0.664 B.
+        random_walk_dps_rts: K, deg/s / sqrt(s), of a walk that starts at 0 at power-on; its
             variance after t seconds is K^2 t.
 
     Returns:
@@ -42,8 +42,8 @@ def simulate_noise(
     """
     if not -_MA1_LIMIT < lag1_correlation < _MA1_LIMIT:
         raise InputError(
-            f"lag1_correlation: expected between -0.5 and 0.5, got {lag1_correlation}; no noise "
-            "that is correlated over one sample only has more"
+            f"lag1_correlation: expected between -0.5 and 0.5, the limits for noise that is "
+            f"correlated over one sample only, got {lag1_correlation}"
         )
     noise = generator.standard_normal(shape, dtype=np.float32)
     theta = 2 * lag1_correlation / (1 + np.sqrt(1 - 4 * lag1_correlation**2))
@@ -61,7 +61,7 @@ def simulate_noise(
 def warm_up(
     amplitude_dps: ArrayLike, time_constant_s: ArrayLike, samples: int, rate_hz: float
 ) -> NDArray[np.float64]:
-    """The bias settling after power-on: amplitude times exp(-t / time constant).
+    """Warm-up of the bias after power-on: amplitude times exp(-t / time constant).
 
     Args:
         amplitude_dps: (...), deg/s, at power-on.
@@ -78,8 +78,8 @@ def warm_up(
 
 
 def _correlate(generator: np.random.Generator, noise: NDArray[np.float32], theta: float) -> None:
-    """Turn white samples e into e_i + theta e_(i-1), in place."""
-    for row in noise.reshape(-1, noise.shape[-1]):  # by recording: temporaries stay small
+    """Replace white samples e by e_i + theta e_(i-1), in place."""
+    for row in noise.reshape(-1, noise.shape[-1]):  # by recording, to keep temporaries small
         before = generator.standard_normal(dtype=np.float32)
         row[1:] += np.float32(theta) * row[:-1]
         row[0] += np.float32(theta) * before
@@ -90,11 +90,11 @@ def _add_flicker(
 ) -> None:
     """Add noise of one-sided spectral density B^2 / (pi f), in place.
 
-    That density has the Allan variance (2 ln 2 / pi) B^2 at every averaging time (IEEE Std 952
-    writes the two-sided half of it). Frequencies below one in two recordings are left out: over
-    one recording they are a constant, which is the turn-on spread's to give. A spectrum of
-    twice the length is drawn and half of the signal kept, because the inverse transform is
-    periodic: kept whole, a recording would end where it began.
+    This density has the Allan variance (2 ln 2 / pi) B^2 at every averaging time (IEEE Std 952
+    states the two-sided density, which is half of it). Frequencies below one cycle in two
+    recordings are left out: within a recording they are a constant, which is part of the turn-on
+    spread. The spectrum has twice the length and half of the signal is used, because the inverse
+    transform is periodic and would end a recording where it began.
     """
     length = scipy.fft.next_fast_len(2 * noise.shape[-1], real=True)
     k = np.arange(1, length // 2 + 1)
@@ -110,6 +110,6 @@ def _add_flicker(
 def _add_random_walk(
     generator: np.random.Generator, noise: NDArray[np.float32], step_dps: float
 ) -> None:
-    """Add the running sum of independent steps, the first before the first sample, in place."""
+    """Add the running sum of independent steps, from the first sample on, in place."""
     for row in noise.reshape(-1, noise.shape[-1]):
         row[:] += step_dps * np.cumsum(generator.standard_normal(row.size))

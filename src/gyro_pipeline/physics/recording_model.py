@@ -1,19 +1,19 @@
-"""One gyroscope's recording as a Gaussian process, and the best linear estimates it allows.
+"""A gyroscope's recording as a Gaussian process, and the best linear estimates under this model.
 
 A sample at time t after power-on is
 
     b + a exp(-t / time constant) + white noise N + flicker noise B + random walk K
 
-with the bias b and, where the sensor warms up, the amplitude a drawn at each power-on from a normal
-distribution, the prior. The noise is what :mod:`gyro_pipeline.physics.noise` simulates: flicker of
+The bias b and, if the sensor warms up, the amplitude a are drawn at each power-on from a normal
+distribution, the prior. The noise is that of :mod:`gyro_pipeline.physics.noise`: flicker of
 one-sided density B^2 / (pi f) down to one cycle in two recordings, and a random walk from 0 at
 power-on. Means over blocks of samples, the mean of the whole recording and the bias are then
-jointly normal, with covariances that are exact for blocks of any lengths. So the best estimate of
-each from the blocks of a window is linear, and is their conditional mean.
+jointly normal, with covariances that are exact for blocks of any length. So the best estimate of
+each from the blocks of a window is linear: the conditional mean.
 
-Only the window needs to be cut finely: what lies before and after it is one block each. Block
-means lose nothing of white noise and random walk that matters, as long as a block is much shorter
-than the time at which flicker equals white noise, 2 pi N^2 / B^2 (20 s for N = 5.4, B = 3 mdps).
+Only the window needs short blocks; the samples before and after it are one block each. Block means
+lose no relevant information if a block is much shorter than the time at which flicker equals white
+noise, 2 pi N^2 / B^2 (20 s for N = 5.4, B = 3 mdps).
 """
 
 from collections.abc import Sequence
@@ -35,16 +35,16 @@ _MOST_BLOCKS = 200
 
 @dataclass(frozen=True)
 class RecordingModel:
-    """What is known of one gyroscope before a window is seen.
+    """The prior knowledge of a gyroscope.
 
     Attributes:
-        samples: Of a whole recording.
+        samples: Samples of a whole recording.
         rate_hz: Samples per second.
         noise: N, B and K.
-        mean: Of the prior: bias and, if the sensor warms up, amplitude; (1,) or (2,), deg/s.
-        covariance: Of the prior, with the uncertainty of ``mean`` if it was learned; (1, 1) or
+        mean: Mean of the prior: bias and, if the sensor warms up, amplitude; (1,) or (2,), deg/s.
+        covariance: Covariance of the prior, with the uncertainty of a fitted ``mean``; (1, 1) or
             (2, 2), (deg/s)^2.
-        time_constant_s: Of the warm-up; not used without one.
+        time_constant_s: Time constant of the warm-up; not used without one.
     """
 
     samples: int
@@ -68,14 +68,14 @@ class RecordingModel:
         return np.tensordot(np.square(figures), unit, axes=1)
 
     def averaging_variance(self) -> float:
-        """By how much the mean of a whole recording scatters about the bias, (deg/s)^2."""
+        """Variance of the mean of a whole recording about the bias, (deg/s)^2."""
         edges = np.array([0, self.samples])
         of_noise = self.noise_covariance(edges)[0, 0]
         decay = self.profiles(edges)[0, 1:]
         return float(of_noise + decay @ self.covariance[1:, 1:] @ decay)
 
     def profiles(self, edges: NDArray[np.integer]) -> NDArray[np.float64]:
-        """Block means of what the bias and the amplitude are multiplied with, (m, 1) or (m, 2)."""
+        """Block means of the factors of the bias and the amplitude, (m, 1) or (m, 2)."""
         return profiles(edges, self.rate_hz, self.time_constant_s)[:, : self.mean.size]
 
 
@@ -84,10 +84,10 @@ class LinearEstimate:
     """An estimate that is a weighted sum of a window's block means.
 
     Attributes:
-        edges: Of the blocks within the window, (m + 1,), samples.
+        edges: Edges of the blocks within the window, (m + 1,), samples.
         weights: (m,).
         constant: deg/s.
-        variance: Of the error, (deg/s)^2.
+        variance: Variance of the error, (deg/s)^2.
     """
 
     edges: NDArray[np.integer]
@@ -106,13 +106,13 @@ def innovations(
     windows: NDArray[np.floating],
     block_s: float = BLOCK_S,
 ) -> NDArray[np.float64]:
-    """What each block of a window adds to the blocks before it, in units of its own scatter.
+    """Normalised innovations: the prediction error of each block of a window from earlier blocks.
 
-    If the model holds these are independent and normal, with mean 0 and variance 1, and independent
-    of the error of :func:`best_linear`: there is nothing left to learn from them.
+    If the model holds, these are independent and normal, with mean 0 and variance 1, and
+    independent of the error of :func:`best_linear`, so they contain no further information.
 
     Args:
-        model: What is known before.
+        model: The model of a recording.
         start: First sample of the windows, counted from power-on.
         windows: (n, samples), deg/s.
         block_s: See :func:`best_linear`.
@@ -130,10 +130,10 @@ def innovations(
 def best_linear(
     model: RecordingModel, start: int, size: int, truth: str, block_s: float = BLOCK_S
 ) -> LinearEstimate:
-    """The best estimate of a truth from a window; none is better if all is Gaussian.
+    """The best linear estimate of a truth from a window, optimal for Gaussian noise and priors.
 
     Args:
-        model: What is known before.
+        model: The model of a recording.
         start: First sample of the window, counted from power-on.
         size: Samples of the window.
         truth: PAPER (mean of the whole recording), DISJOINT (mean outside the window) or TRUE
@@ -141,16 +141,16 @@ def best_linear(
         block_s: The window is cut into blocks of about this length, 200 at most.
 
     Returns:
-        Weights, constant and error variance. For DISJOINT the variance still holds the averaging
+        Weights, constant and error variance. For DISJOINT the variance includes the averaging
         noise of the truth.
 
     Raises:
-        InputError: A window that is not inside the recording, or an unknown truth.
+        InputError: The window is not inside the recording, or the truth is unknown.
     """
     return WindowModel.of(model, start, size, truth, block_s).best(model.mean, model.covariance)
 
 
-def mean_squares(  # noqa: PLR0917 - those of best_linear, and other priors
+def mean_squares(  # noqa: PLR0917 - the arguments of best_linear, and other priors
     model: RecordingModel,
     start: int,
     size: int,
@@ -160,31 +160,32 @@ def mean_squares(  # noqa: PLR0917 - those of best_linear, and other priors
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Expected squared errors of the best linear estimate and of the running mean.
 
-    The first is the ceiling for this noise: its root is the least RMSE that any function of the
-    window can have, if all is Gaussian and the model is known.
+    The first is the ceiling for this noise: its root is the least RMSE of any function of the
+    window, if everything is Gaussian and the model is known.
 
     Args:
-        model: The drawn one, or a fitted one.
+        model: The true model, or a fitted one.
         start: First sample of the window, counted from power-on.
         size: Samples of the window.
-        truth: PAPER, DISJOINT (the averaging noise of that truth is taken off, which may leave a
-            negative square where noise is correlated) or TRUE.
+        truth: PAPER, DISJOINT (its averaging noise is subtracted, which may give a negative square
+            if noise is correlated) or TRUE.
         block_s: See :func:`best_linear`.
-        covariances: Of several priors instead of the model's, (n, 1, 1) or (n, 2, 2), (deg/s)^2.
+        covariances: Covariances of n priors, used instead of the model's, (n, 1, 1) or (n, 2, 2),
+            (deg/s)^2.
 
     Returns:
-        Two squares, (deg/s)^2; two of (n,) if ``covariances`` are given.
+        Two squares, (deg/s)^2; with ``covariances`` two arrays (n,).
 
     Raises:
-        InputError: A window that is not inside the recording, or an unknown truth.
+        InputError: The window is not inside the recording, or the truth is unknown.
     """
     window = WindowModel.of(model, start, size, truth, block_s)
     priors = model.covariance if covariances is None else covariances
     weights = np.diff(window.edges) / size
-    off = weights @ window.design - window.coefficients
-    of_noise = window.own + weights @ (window.covariance @ weights - 2 * window.shared)
-    mean = priors @ off @ off + (off @ model.mean) ** 2 + of_noise
-    averaging = window.own if truth == DISJOINT else 0.0
+    factors = weights @ window.design - window.coefficients
+    of_noise = window.truth_noise + weights @ (window.covariance @ weights - 2 * window.shared)
+    mean = priors @ factors @ factors + (factors @ model.mean) ** 2 + of_noise
+    averaging = window.truth_noise if truth == DISJOINT else 0.0
     return window.variance(priors) - averaging, np.asarray(mean - averaging)
 
 
@@ -195,12 +196,12 @@ def joint_squares(
     truth: str,
     covariances: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Expected squared error, mean over axes, of who sees the windows of all axes together.
+    """Expected squared error, mean over axes, of the best estimate from the windows of all axes.
 
-    That is less than axis by axis where biases of a power-on are correlated between axes.
+    It is smaller than that of separate estimates if biases are correlated between axes.
 
     Args:
-        models: Of each axis; their priors of the bias are not used.
+        models: Models of the axes; their priors of the bias are not used.
         start: First sample of the window, counted from power-on.
         size: Samples of the window.
         truth: PAPER or TRUE.
@@ -213,8 +214,8 @@ def joint_squares(
     firsts = np.concatenate([[0], np.cumsum([model.mean.size for model in models])])
     priors = np.zeros((len(covariances), firsts[-1], firsts[-1]))
     for model, first in zip(models, firsts[:-1], strict=True):
-        own = slice(first, first + model.mean.size)
-        priors[:, own, own] = np.diag(np.diag(model.covariance))
+        block = slice(first, first + model.mean.size)
+        priors[:, block, block] = np.diag(np.diag(model.covariance))
     priors[:, firsts[:-1, None], firsts[:-1]] = covariances
     information = scipy.linalg.block_diag(*(window.information for window in windows))
     posterior = np.linalg.solve(np.eye(firsts[-1]) + priors @ information, priors)
@@ -225,7 +226,7 @@ def joint_squares(
     return np.asarray(np.mean(of_axes, axis=0))
 
 
-@lru_cache(maxsize=1 << 16)  # a curve asks for the same in every recording
+@lru_cache(maxsize=1 << 16)  # curves of all recordings need the same values
 def outside_noise(
     noise: NoiseFigures, samples: int, rate_hz: float, start: int, size: int
 ) -> float:
@@ -233,7 +234,7 @@ def outside_noise(
 
     Args:
         noise: N, B and K.
-        samples: Of the whole recording, more than ``size``.
+        samples: Samples of the whole recording, more than ``size``.
         rate_hz: Samples per second.
         start: First sample of the window, counted from power-on.
         size: Samples of the window.
@@ -254,17 +255,18 @@ def outside_noise(
 
 @dataclass(frozen=True, eq=False)
 class WindowModel:
-    """A window's block means y and a truth, before anything is known of bias and amplitude c.
+    """Joint model of a window's block means y and a truth, for any prior of c.
 
-    y = X c + e and the truth is g c + f, with the noise e and f.
+    With c the bias and, if any, the amplitude, y = X c + e and the truth is g c + f; e and f are
+    noise.
 
     Attributes:
-        edges: Of the blocks within the window, (m + 1,), samples.
+        edges: Edges of the blocks within the window, (m + 1,), samples.
         design: X, (m, 1) or (m, 2).
         coefficients: g, (1,) or (2,).
-        covariance: Of e, (m, m), (deg/s)^2.
+        covariance: Covariance of e, (m, m), (deg/s)^2.
         shared: Covariance of e and f, (m,).
-        own: Variance of f.
+        truth_noise: Variance of f.
     """
 
     edges: NDArray[np.integer]
@@ -272,13 +274,13 @@ class WindowModel:
     coefficients: NDArray[np.float64]
     covariance: NDArray[np.float64]
     shared: NDArray[np.float64]
-    own: float
+    truth_noise: float
 
     @classmethod
     def of(
         cls, model: RecordingModel, start: int, size: int, truth: str, block_s: float = BLOCK_S
     ) -> "WindowModel":
-        """The same for every prior of the model; see :func:`best_linear`."""
+        """The model of a window, which does not depend on the prior; see :func:`best_linear`."""
         stop = start + size
         if not 0 <= start < stop <= model.samples:
             raise InputError(
@@ -302,45 +304,46 @@ class WindowModel:
     @cached_property
     def _solved(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The inverse of the covariance of e times ``shared``, (m,), and times X."""
-        both = np.column_stack([self.shared, self.design])
-        solved = scipy.linalg.solve(self.covariance, both, assume_a="pos")
+        right = np.column_stack([self.shared, self.design])
+        solved = scipy.linalg.solve(self.covariance, right, assume_a="pos")
         return solved[:, 0], solved[:, 1:]
 
     @cached_property
     def information(self) -> NDArray[np.float64]:
-        """What y tells of c."""
+        """Fisher information of y about c."""
         return np.asarray(self.design.T @ self._solved[1])
 
     @cached_property
-    def _rest(self) -> NDArray[np.float64]:
-        """How the truth depends on c, given y."""
+    def _sensitivity(self) -> NDArray[np.float64]:
+        """Coefficients of c in the truth, given y."""
         return np.asarray(self.coefficients - self.design.T @ self._solved[0])
 
     def _posterior(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Covariance of c, given y; of (..., k, k) as well."""
-        shrinking = np.eye(self._rest.size) + covariance @ self.information
+        """Covariance of c given y, for prior covariances (..., k, k)."""
+        shrinking = np.eye(self._sensitivity.size) + covariance @ self.information
         return np.asarray(np.linalg.solve(shrinking, covariance))
 
     def variance(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Of the error of :meth:`best`, (...), under each of the priors (..., k, k)."""
+        """Variance of the error of :meth:`best`, (...), for prior covariances (..., k, k)."""
         return self.error_variance(self._posterior(covariance))
 
     def error_variance(self, posterior: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Of the error, (...), where c is known with the covariance (..., k, k)."""
-        foretold = self._solved[0] @ self.shared
-        return np.asarray(self.own - foretold + posterior @ self._rest @ self._rest)
+        """Variance of the error, (...), for posterior covariances of c (..., k, k)."""
+        explained = self._solved[0] @ self.shared
+        of_c = posterior @ self._sensitivity @ self._sensitivity
+        return np.asarray(self.truth_noise - explained + of_c)
 
     def best(self, mean: NDArray[np.float64], covariance: NDArray[np.float64]) -> LinearEstimate:
         """The conditional mean of the truth given y, under a normal prior of c.
 
         Args:
-            mean: Of the prior, (1,) or (2,), deg/s.
-            covariance: Of the prior, (deg/s)^2; may be singular.
+            mean: Mean of the prior, (1,) or (2,), deg/s.
+            covariance: Covariance of the prior, (deg/s)^2; may be singular.
         """
         of_noise, of_design = self._solved
-        posterior, rest = self._posterior(covariance), self._rest
-        weights = of_noise + of_design @ (posterior @ rest)
-        constant = rest @ (mean - posterior @ self.information @ mean)
+        posterior, sensitivity = self._posterior(covariance), self._sensitivity
+        weights = of_noise + of_design @ (posterior @ sensitivity)
+        constant = sensitivity @ (mean - posterior @ self.information @ mean)
         variance = self.error_variance(posterior)
         return LinearEstimate(self.edges, weights, float(constant), float(variance))
 
@@ -348,7 +351,7 @@ class WindowModel:
 def _averaging(
     lengths: NDArray[np.integer], inside: NDArray[np.bool_], truth: str
 ) -> NDArray[np.float64]:
-    """Weights with which the noise of all blocks, (m,), enters a truth."""
+    """Weights of the noise of all blocks, (m,), in a truth."""
     if truth == PAPER:
         return lengths / lengths.sum()
     if truth == DISJOINT and not inside.all():
@@ -373,7 +376,7 @@ def block_edges(size: int, block: int) -> NDArray[np.integer]:
 
 
 def block_means(samples: NDArray[np.floating], edges: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Means of blocks, (..., n) to (..., m); sums are in float64."""
+    """Means of blocks, (..., n) to (..., m), computed in float64."""
     sums = np.add.reduceat(samples, edges[:-1], axis=-1, dtype=np.float64)
     return np.asarray(sums / np.diff(edges))
 
@@ -397,7 +400,7 @@ def noise_covariances(
 
     Args:
         edges: (m + 1,), sample numbers, increasing.
-        samples: Of the whole recording, which sets the lowest frequency of the flicker.
+        samples: Samples of the whole recording, which determines the lowest frequency of flicker.
         rate_hz: Samples per second.
 
     Returns:
@@ -405,10 +408,10 @@ def noise_covariances(
     """
     lengths = np.diff(edges).astype(np.float64)
     white = np.diag(rate_hz / lengths)
-    of_sum = _flicker_sum_variance(samples)
-    # of sums over [a, b) and [c, d): half of V(d - a) + V(c - b) - V(c - a) - V(d - b)
-    at = of_sum[np.abs(edges[:, None] - edges[None, :])]
-    flicker = (at[:-1, 1:] + at[1:, :-1] - at[:-1, :-1] - at[1:, 1:]) / 2
+    # the covariance of sums over [a, b) and [c, d) is half of
+    # V(d - a) + V(c - b) - V(c - a) - V(d - b)
+    v = _flicker_sum_variance(samples)[np.abs(edges[:, None] - edges[None, :])]
+    flicker = (v[:-1, 1:] + v[1:, :-1] - v[:-1, :-1] - v[1:, 1:]) / 2
     middle = (edges[:-1] + edges[1:] + 1) / 2  # mean number of steps until a sample of the block
     walk = np.minimum(middle[:, None], middle[None, :]) / rate_hz
     # within a block: the mean of min(i, j) + 1 over all pairs of its samples
@@ -419,7 +422,7 @@ def noise_covariances(
 
 @lru_cache(maxsize=8)
 def _flicker_sum_variance(samples: int) -> NDArray[np.float64]:
-    """Variance V(m) of the sum of m successive samples of flicker with B = 1, (samples + 1,).
+    """Variance V(m) of the sum of m successive samples of flicker noise with B = 1, (samples + 1,).
 
     The autocovariance is that of ``physics.noise``: (1 / pi) sum of cos(2 pi k lag / length) / k.
     """
@@ -437,7 +440,7 @@ def constant_bias(
     """A model without warm-up.
 
     Args:
-        samples: Of a whole recording.
+        samples: Samples of a whole recording.
         rate_hz: Samples per second.
         noise: N, B and K.
         prior_mean: mu, deg/s.

@@ -8,13 +8,13 @@ with mean X c and covariance
 
 where X = (x_1, x_2) holds the block means of 1 and of the warm-up's decay, c = (mean bias, mean
 amplitude), tau is the turn-on spread and s the spread of the amplitude. REML is the likelihood of
-what is left of the data once c has been fitted (Patterson & Thompson 1971, Biometrika 58), so that
-the variances are not too small by what fitting c took.
+the residuals after c has been fitted (Patterson & Thompson 1971, Biometrika 58), so that fitting c
+does not bias the variances.
 
-A handful of recordings can give a spread of zero by chance, and an estimator that believes it pulls
+With a handful of recordings, a spread can be zero by chance, and an estimator would shrink
 everything to the mean. Therefore log tau + log s is added, the weak prior of Chung et al. 2013
-(Psychometrika 78, 685): the maximum is then off zero by about one standard error, and with many
-recordings nowhere else than without it.
+(Psychometrika 78, 685). It moves the maximum away from zero by about one standard error, and does
+not matter with many recordings.
 """
 
 from dataclasses import dataclass
@@ -36,16 +36,17 @@ from gyro_pipeline.physics.recording_model import (
 )
 
 FEWEST_RECORDINGS = 3
-"""Fewer do not fix a spread, even with its weak prior."""
+"""Fewer recordings do not determine a spread, even with its weak prior."""
 
 _BLOCK_S = 0.5
-_RANGE = 1e4  # of a standard deviation about its first guess
-_STEP = 1e-3  # of the numerical gradient, in logarithms
-_CHANCE = 0.05  # of a warm-up where there is none, at most
-_TIME_CONSTANTS = (0.02, 0.1, 0.3, 1.0, 3.0)  # of the recording: limits, and where searches start
+_RANGE = 1e4  # factor by which a standard deviation may differ from its first guess
+_STEP = 1e-3  # step of the numerical gradient, in logarithms
+_CHANCE = 0.05  # largest probability of detecting a warm-up where none exists
+_TIME_CONSTANTS = (0.02, 0.1, 0.3, 1.0, 3.0)
+"""Shares of the recording: the limits of the time constant, and between them starts of searches."""
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")  # of matrices so small, more only wait
+@threadpool_limits.wrap(limits=1, user_api="blas")  # more threads do not help small matrices
 def fit_recording_model(
     recordings: NDArray[np.floating],
     rate_hz: float,
@@ -57,18 +58,18 @@ def fit_recording_model(
     Args:
         recordings: (n, samples), deg/s, from power-on; no NaN.
         rate_hz: Samples per second.
-        warm_up: Whether there is one; its time constant is the same in all recordings. None: if
-            the recordings say so, by a test that finds one where there is none in at most 5 %, and
-            by the Bayesian information criterion (Schwarz 1978, Annals of Statistics 6), and are
-            longer than its time constant: what the bias settles to after they end, they do not say.
-        noise: Known N, B and K; fitted together with the rest if None.
+        warm_up: Whether the bias has a warm-up; its time constant is the same in all recordings.
+            None: a warm-up is included if a test at the 5 % level and the Bayesian information
+            criterion (Schwarz 1978, Annals of Statistics 6) favour it, and its time constant is not
+            longer than a recording, which would not show the bias that it settles to.
+        noise: Known N, B and K; None: fitted with the other parameters.
 
     Returns:
         The model; its prior is that of the next recording: the spread between recordings plus
-        the uncertainty of the mean, learned from n of them.
+        the uncertainty of the mean.
 
     Raises:
-        InputError: Fewer than three recordings.
+        InputError: There are fewer than three recordings.
     """
     if len(recordings) < FEWEST_RECORDINGS:
         raise InputError(
@@ -77,11 +78,11 @@ def fit_recording_model(
         )
     samples = recordings.shape[-1]
     means = block_means(recordings, block_edges(samples, round(_BLOCK_S * rate_hz)))
-    given = means.tobytes(), len(means), samples, rate_hz
-    stationary = _fitted(*given, bool(warm_up), noise)
+    data = means.tobytes(), len(means), samples, rate_hz
+    stationary = _fit(*data, bool(warm_up), noise)
     if warm_up is not None or not stationary.warms_up:
         return stationary.model
-    warming = _fitted(*given, True, noise)
+    warming = _fit(*data, True, noise)
     settles = warming.model.time_constant_s <= samples / rate_hz
     return (warming if settles and warming.criterion < stationary.criterion else stationary).model
 
@@ -95,8 +96,8 @@ class _Fit:
     warms_up: bool
 
 
-@lru_cache(maxsize=256)  # several estimators ask for the same
-def _fitted(  # noqa: PLR0917 - what a fit depends on
+@lru_cache(maxsize=256)  # several estimators need the same fit
+def _fit(  # noqa: PLR0917 - the arguments are the key of the cache
     means: bytes,
     count: int,
     samples: int,
@@ -104,7 +105,7 @@ def _fitted(  # noqa: PLR0917 - what a fit depends on
     warm_up: bool,
     noise: NoiseFigures | None,
 ) -> _Fit:
-    """Fit to the block means of so many recordings, float64."""
+    """Fit the model to block means (count, m), float64."""
     table = np.frombuffer(means).reshape(count, -1)
     likelihood = _Likelihood(table, samples, rate_hz, warm_up, noise)
     starts_s = [np.inf]
@@ -115,16 +116,17 @@ def _fitted(  # noqa: PLR0917 - what a fit depends on
     _, mean, uncertainty = likelihood.deviance(x)
     mean[0] += likelihood.offset
     covariance = np.diag(np.square(spreads)) + uncertainty
-    fitted = noise or NoiseFigures(*map(float, figures))
-    model = RecordingModel(samples, rate_hz, fitted, mean, covariance, time_constant_s)
+    noise = noise or NoiseFigures(*map(float, figures))
+    model = RecordingModel(samples, rate_hz, noise, mean, covariance, time_constant_s)
     return _Fit(model, likelihood.criterion(x), not warm_up and likelihood.warms_up(x))
 
 
 def guarded_spread(scatter: ArrayLike, freedom: ArrayLike, averaging: ArrayLike) -> float:
-    """The turn-on spread tau from recordings' means alone, with the same weak prior.
+    """The turn-on spread tau from the means of recordings, with the same weak prior.
 
-    The means of group g (a gyroscope) scatter by tau^2 + v_g about their own mean, where v_g is
-    the averaging noise of one. The maximum of the restricted likelihood times tau.
+    The means of group g (a gyroscope) scatter about their group's mean with variance tau^2 + v_g,
+    where v_g is the averaging noise of a mean. The result maximises the restricted likelihood times
+    tau.
 
     Args:
         scatter: (groups,), sum of the squared deviations from the mean, (deg/s)^2.
@@ -132,10 +134,10 @@ def guarded_spread(scatter: ArrayLike, freedom: ArrayLike, averaging: ArrayLike)
         averaging: (groups,), v, (deg/s)^2, such as N^2 / T.
 
     Returns:
-        One tau for all groups, deg/s; never 0 unless all is.
+        A common tau of all groups, deg/s; 0 only if scatter and averaging noise are 0.
     """
-    given = (scatter, freedom, averaging)
-    squares, nu, v = (np.atleast_1d(np.asarray(value, np.float64)) for value in given)
+    arguments = (scatter, freedom, averaging)
+    squares, nu, v = (np.atleast_1d(np.asarray(value, np.float64)) for value in arguments)
     largest = squares.sum() + (nu * v).sum()
     if largest == 0:
         return 0.0
@@ -145,19 +147,19 @@ def guarded_spread(scatter: ArrayLike, freedom: ArrayLike, averaging: ArrayLike)
         share = variance / (variance + v)
         return float(np.sum(share * (nu - squares / (variance + v)))) - 1
 
-    # negative where tau is nothing beside v, positive where it explains more than all scatter
+    # the slope is negative at a negligible tau, and positive at one beyond all scatter
     limits = np.log(largest) + np.array([-60.0, 5.0])
     return float(np.exp(scipy.optimize.brentq(slope, *limits) / 2))
 
 
 class _Likelihood:
-    """Of the block means of one gyroscope's recordings.
+    """Restricted likelihood of the block means of a gyroscope's recordings.
 
-    The parameters x are logarithms: of N, B and K unless they are known, of tau, and with a
-    warm-up of s and the time constant.
+    The parameters x are logarithms of N, B and K, unless these are known, of tau, and, with a
+    warm-up, of s and the time constant.
     """
 
-    def __init__(  # noqa: PLR0917 - what a likelihood depends on
+    def __init__(  # noqa: PLR0917 - the data and the model
         self,
         means: NDArray[np.float64],
         samples: int,
@@ -169,23 +171,23 @@ class _Likelihood:
         self.offset = float(means.mean())
         self.means = means - self.offset
         self.levels = self.means.mean(axis=1)
-        self.rest = (self.means - self.levels[:, None]).T
-        # as many columns as there are blocks have the same squares as all recordings'
-        self.scatter = scipy.linalg.qr(self.rest.T, mode="economic")[1].T
-        self.noise = lru_cache(maxsize=16)(self._noise)  # of a gradient's steps, most keep it
+        self.residuals = (self.means - self.levels[:, None]).T
+        # the triangular factor has the same squares with at most as many columns as blocks
+        self.scatter = scipy.linalg.qr(self.residuals.T, mode="economic")[1].T
+        self.noise = lru_cache(maxsize=16)(self._noise)  # most steps of a gradient do not change it
         self.rate_hz, self.duration_s, self.warm_up = rate_hz, samples / rate_hz, warm_up
         self.unit = noise_covariances(self.edges, samples, rate_hz)
-        self.known: NDArray[np.float64] | None = None
+        self.fixed_noise: NDArray[np.float64] | None = None
         if noise is not None:
-            self.known = np.array([noise.white, noise.instability, noise.random_walk])
+            self.fixed_noise = np.array([noise.white, noise.instability, noise.random_walk])
 
     def guess(self, time_constant_s: float) -> NDArray[np.float64]:
-        """Where a search starts: the noise from differences of blocks, tau from their means."""
+        """Start of a search: noise from differences of blocks, tau from means of recordings."""
         block_s = np.diff(self.edges).mean() / self.rate_hz
         jumps = np.diff(self.means, axis=1).std() / np.sqrt(2)
         white = max(jumps * np.sqrt(block_s), np.finfo(float).tiny)
         spread = self.means.mean(axis=1).std(ddof=1)
-        figures = [white, white / 3, white / 50] if self.known is None else []
+        figures = [white, white / 3, white / 50] if self.fixed_noise is None else []
         settling = [(self.means[:, 0] - self.means[:, -1]).std(), time_constant_s]
         return np.log(np.maximum([*figures, spread, *(settling if self.warm_up else [])], 1e-12))
 
@@ -194,17 +196,20 @@ class _Likelihood:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
         """N, B and K; tau and s; the time constant in seconds."""
         values = np.exp(x)
-        figures, rest = (values[:3], values[3:]) if self.known is None else (self.known, values)
-        return figures, rest[:2] if self.warm_up else rest, rest[2] if self.warm_up else np.inf
+        figures = self.fixed_noise
+        if figures is None:
+            figures, values = values[:3], values[3:]
+        return figures, values[:2], values[2] if self.warm_up else np.inf
 
     def deviance(
         self, x: NDArray[np.float64]
     ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-        """-2 times the restricted log-likelihood and prior; the fitted c and its covariance.
+        """-2 times the log of restricted likelihood times prior; the fitted c and its covariance.
 
-        Each recording alone gives a c with the noise's covariance, and residuals that do not
-        depend on the spreads. The c of several then scatter by that covariance and the spreads. So
-        a spread may be any multiple of the noise, as it is from unit to unit.
+        Each recording is fitted separately: this gives its c, with the covariance of the noise, and
+        residuals that do not depend on the spreads. The c of all recordings then scatter with this
+        covariance plus the spreads. So a spread may be any multiple of the noise, as it is between
+        units.
         """
         figures, spreads, time_constant_s = self.unpack(x)
         root, log_determinant, squares = self.noise(*figures.tolist())
@@ -214,38 +219,39 @@ class _Likelihood:
             root, white, lower=True, trans="T", check_finite=False
         )
         information = white.T @ white
-        own = np.linalg.solve(information, weighted.T @ self.rest)
-        squares = squares - np.sum(own * (information @ own))
-        own[0] += self.levels
-        mean, scatter = own.mean(axis=1), np.linalg.inv(information) + np.diag(spreads**2)
-        off, n = own - mean[:, None], self.levels.size
+        fits = np.linalg.solve(information, weighted.T @ self.residuals)
+        squares = squares - np.sum(fits * (information @ fits))
+        fits[0] += self.levels
+        mean, scatter = fits.mean(axis=1), np.linalg.inv(information) + np.diag(spreads**2)
+        deviations, n = fits - mean[:, None], self.levels.size
         deviance = n * (log_determinant + np.linalg.slogdet(information)[1])
         deviance += (n - 1) * np.linalg.slogdet(scatter)[1] + mean.size * np.log(n)
-        deviance += squares + np.sum(off * np.linalg.solve(scatter, off))
+        deviance += squares + np.sum(deviations * np.linalg.solve(scatter, deviations))
         return float(deviance - 2 * np.log(spreads).sum()), mean, scatter / n
 
     def _noise(self, *figures: float) -> tuple[NDArray[np.float64], float, float]:
-        """Of N, B and K: the root of their covariance, its log determinant, and squares.
+        """The root of the noise's covariance, its log determinant, and the sum of squares.
 
-        The squares are those of the block means about each recording's level, whitened.
+        The squares are those of the whitened block means about each recording's level.
         """
         root = np.linalg.cholesky(np.tensordot(np.square(figures), self.unit, axes=1))
         white = scipy.linalg.solve_triangular(root, self.scatter, lower=True, check_finite=False)
         return root, float(2 * np.log(np.diag(root)).sum()), float(np.sum(white**2))
 
     def criterion(self, x: NDArray[np.float64]) -> float:
-        """-2 times the log-likelihood, plus log n for each parameter, spreads and means."""
+        """The Bayesian information criterion: -2 log-likelihood, plus log n for each parameter."""
         deviance, mean, uncertainty = self.deviance(x)
         _, spreads, _ = self.unpack(x)
-        # without what restricts it and without the weak prior
+        # undo the restriction and the weak prior
         deviance += np.linalg.slogdet(uncertainty)[1] + 2 * np.log(spreads).sum()
         return float(deviance + (x.size + mean.size) * np.log(len(self.means)))
 
     def warms_up(self, x: NDArray[np.float64]) -> bool:
-        """Whether a decay from power-on explains more of the recordings than chance would.
+        """Whether a decay from power-on explains more of the recordings than by chance.
 
-        Each recording's amplitude, fitted by generalised least squares, is normal with a known
-        variance if there is no warm-up; the squares of their sum and of each are then chi-squared.
+        Without a warm-up, the amplitudes of recordings, fitted by generalised least squares, are
+        normal with known variance, so the square of their sum and the sum of their squares follow
+        chi-squared distributions.
         """
         figures, spreads, _ = self.unpack(x)
         covariance = np.tensordot(np.square(figures), self.unit, axes=1) + spreads[0] ** 2
@@ -255,18 +261,18 @@ class _Likelihood:
         decays = [
             profiles(self.edges, self.rate_hz, share * self.duration_s)[:, 1] for share in shares
         ]
-        both = np.column_stack([(self.means - mean[0]).T, *decays])
-        white = scipy.linalg.solve_triangular(root, both, lower=True, check_finite=False)
+        columns = np.column_stack([(self.means - mean[0]).T, *decays])
+        white = scipy.linalg.solve_triangular(root, columns, lower=True, check_finite=False)
         y, decay = white[:, : len(self.means)], white[:, len(self.means) :]
-        amplitudes = decay.T @ y / np.sqrt(np.sum(decay**2, axis=0))[:, None]  # in their sigma
-        count, looks = len(self.means), 2 * len(shares)
-        alike = np.abs(amplitudes.sum(axis=1)).max() / np.sqrt(count)
+        amplitudes = decay.T @ y / np.sqrt(np.sum(decay**2, axis=0))[:, None]  # over their sigma
+        count, tests = len(self.means), 2 * len(shares)
+        common = np.abs(amplitudes.sum(axis=1)).max() / np.sqrt(count)
         scatter = np.sum(amplitudes**2, axis=1).max()
-        chances = scipy.stats.chi2.sf([alike**2, scatter], [1, count])
-        return bool(chances.min() < _CHANCE / looks)
+        p_values = scipy.stats.chi2.sf([common**2, scatter], [1, count])
+        return bool(p_values.min() < _CHANCE / tests)
 
     def maximise(self, time_constant_s: float) -> "scipy.optimize.OptimizeResult":
-        """Search from the guess with this time constant."""
+        """Maximise the likelihood, from the guess with this time constant."""
         start = self.guess(time_constant_s)
         reach = np.log(_RANGE)
         bounds = np.column_stack([start - reach, start + reach])

@@ -1,12 +1,12 @@
-"""A bias that settles after power-on: what recordings show of it, and what it would explain.
+"""Warm-up: a bias that settles after power-on, measured from recordings, and its consequences.
 
-The bias is b + a exp(-t / time constant), with an amplitude a that is much the same at every
-power-on. The running mean of the first T0 seconds is then off from the mean of the recording by a
+The bias is b + a exp(-t / time constant), with an amplitude a that is about the same at every
+power-on. The running mean of the first T0 seconds then differs from the mean of the recording by a
 times
 
     d = w(T0) - w(T),    w(t) = (time constant / t) (1 - exp(-t / time constant))
 
-and whoever knows the device, even by a constant, knows that in advance.
+An estimator that knows the device can correct this difference by a constant.
 """
 
 from dataclasses import dataclass
@@ -23,17 +23,17 @@ Array = NDArray[np.float64]
 
 _BLOCK_S = 1.0
 LAST = 0.25
-"""Part of a recording, at its end, by whose mean it is centred."""
+"""Share of a recording, at its end, whose mean is subtracted."""
 
 
 @dataclass(frozen=True)
 class Settling:
-    """Mean rate against time after power-on, less that of each recording's last part.
+    """Mean rate against time after power-on, less the mean of each recording's last part.
 
     Attributes:
-        time_s: (m,), middles of the blocks.
+        time_s: (m,), centres of the blocks.
         rate: (axes, m), deg/s, mean over the recordings.
-        half: Half of its 95 % interval over recordings, the same shape; NaN for a single one.
+        half: Half of its 95 % interval over recordings, same shape; NaN for a single recording.
     """
 
     time_s: Array
@@ -42,7 +42,7 @@ class Settling:
 
 
 def settling(recordings: NDArray[np.floating], rate_hz: float) -> Settling:
-    """What all recordings together show of a warm-up.
+    """The common settling of recordings after power-on.
 
     Args:
         recordings: (n, axes, samples), deg/s, from power-on; no NaN.
@@ -58,7 +58,7 @@ def settling(recordings: NDArray[np.floating], rate_hz: float) -> Settling:
 
 @dataclass(frozen=True)
 class CommonWarmUp:
-    """The amplitude that recordings have in common, for a time constant.
+    """The common amplitude of recordings, for a time constant.
 
     Attributes:
         amplitude: (axes,), deg/s.
@@ -70,19 +70,19 @@ class CommonWarmUp:
 
     @property
     def bound(self) -> Array:
-        """The largest amplitude, of either sign, that the interval holds, (axes,), deg/s."""
+        """The largest absolute amplitude within the interval, (axes,), deg/s."""
         return np.asarray(np.abs(self.amplitude) + self.half)
 
 
 def fit_common_warm_up(
     recordings: NDArray[np.floating], rate_hz: float, time_constant_s: float
 ) -> CommonWarmUp:
-    """Fit each recording's amplitude beside its level, by least squares, and average them.
+    """Fit the amplitude and the level of each recording by least squares; average the amplitudes.
 
     Args:
         recordings: (n, axes, samples), deg/s, from power-on; no NaN.
         rate_hz: Samples per second.
-        time_constant_s: Of all recordings.
+        time_constant_s: Time constant of all recordings.
     """
     edges = block_edges(recordings.shape[-1], round(_BLOCK_S * rate_hz))
     decay = profiles(edges, rate_hz, time_constant_s)[:, 1]
@@ -99,10 +99,10 @@ def amplitude_needed(
     recording_s: float,
     time_constant_s: ArrayLike,
 ) -> Array:
-    """Amplitude of a warm-up with which an accuracy gain in first windows is the ceiling.
+    """Amplitude of the warm-up that would make an accuracy gain in first windows the ceiling.
 
-    The best estimator knows the amplitude, so its error is that without a warm-up. The running
-    mean's is larger by a d.
+    The best estimator knows the amplitude, so a warm-up does not change its error. The running
+    mean's error increases by a d.
 
     Args:
         gain: A, a fraction.
@@ -110,20 +110,20 @@ def amplitude_needed(
         turn_on_spread: tau of each axis, deg/s.
         window_s: T0.
         recording_s: T.
-        time_constant_s: Of the warm-up, of any shape.
+        time_constant_s: Time constants of the warm-up, any shape.
 
     Returns:
-        deg/s, of the shape of ``time_constant_s``; 0 where the gain needs none.
+        deg/s, same shape as ``time_constant_s``; 0 where the gain needs no warm-up.
     """
-    given = window_s, recording_s, PAPER
-    best = pooled(ceiling_rmse(noise, turn_on_spread, *given))
-    mean = pooled(running_mean_rmse(noise, *given))
-    off = np.sqrt(np.maximum((best / (1 - gain)) ** 2 - mean**2, 0.0))
+    lengths_and_truth = window_s, recording_s, PAPER
+    best = pooled(ceiling_rmse(noise, turn_on_spread, *lengths_and_truth))
+    mean = pooled(running_mean_rmse(noise, *lengths_and_truth))
+    error = np.sqrt(np.maximum((best / (1 - gain)) ** 2 - mean**2, 0.0))
     time = np.asarray(time_constant_s, np.float64)
     of_window, of_recording = (
         time / length * -np.expm1(-length / time) for length in (window_s, recording_s)
     )
-    return np.asarray(off / (of_window - of_recording))
+    return np.asarray(error / (of_window - of_recording))
 
 
 def _half(values: Array) -> Array:

@@ -1,15 +1,15 @@
-"""Quality control of one recording: was it at rest, and which of its rows hold a measurement?
+"""Quality control of a recording: was it at rest, and which of its rows hold a measurement?
 
-A recording goes through steps until one rejects it; each of them says what it looks for. What
-is brief is masked and does not end the recording; a gap in time does. Limits know how many samples
-they compare. Motion rejects all of a recording: rates alone do not tell which part was at rest, and
-after a turn the Earth's rate falls differently on the axes.
+A recording passes through checks until one rejects it. Brief disturbances are masked and do not end
+the recording; a gap in time does. Limits account for the number of samples that are compared.
+Motion rejects the whole recording: rates alone do not show which part was at rest, and after a turn
+the Earth's rate is distributed differently among the axes.
 
-Not told are a rotation as steady as a bias, steps of 0.1 deg/s up and down every few seconds, and
-sways of 0.05 deg/s or, of any size, of a period of one or two blocks. Neither are several devices
-in random order that are less than about 8 sigma apart, nor those in turn where rows slip and they
-are less than about 4 sigma apart. More than 16 devices in turn may be missed; a steady vibration at
-a half, a third or a quarter of the sample rate is taken for devices.
+The checks cannot detect a rotation as steady as a bias, steps of 0.1 deg/s up and down every few
+seconds, sways of 0.05 deg/s, and sways of any size with a period of one or two blocks. They miss
+several devices in random order less than about 8 sigma apart, or in turn less than about 4 sigma
+apart if rows are lost, and may miss more than 16 devices in turn. They take a steady vibration at a
+half, a third or a quarter of the sample rate for several devices.
 """
 
 from dataclasses import dataclass
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Inspected:
-    """What quality control says about a recording.
+    """The result of quality control for a recording.
 
     Attributes:
-        outcome: KEPT, REPAIRED or REJECTED, the worst that a finding ends in.
-        start: First sample of the log that makes the recording, 0-based.
-        stop: The sample after its last; equal to ``start`` if there is none.
-        masked: (stop - start,), rows in it that hold no measurement.
-        findings: Of the reading, then of the checks.
+        outcome: KEPT, REPAIRED or REJECTED, the worst outcome of the findings.
+        start: First sample of the log to keep, from 0.
+        stop: End of the samples to keep, exclusive; equal to ``start`` if none is kept.
+        masked: (stop - start,), whether each row is masked.
+        findings: Findings of the reader, then of the checks.
     """
 
     outcome: str
@@ -43,12 +43,17 @@ class Inspected:
 
 
 def inspect(log: Log, rate_hz: float, quality: "Quality") -> Inspected:
-    """Judge a recording of so many samples a second, and say which of its rows can be used.
+    """Check a recording, and determine which of its rows can be used.
+
+    Args:
+        log: The recording.
+        rate_hz: Samples per second.
+        quality: Thresholds.
 
     Raises:
-        InputError: If the samples are not three columns.
+        InputError: The samples are not three columns.
     """
-    # the calibrator shares the test of rest, and needs NumPy alone for it
+    # here, as the calibrator uses the rest detector only, which needs no more than NumPy
     from gyro_pipeline.quality import masks, motion, values  # noqa: PLC0415
     from gyro_pipeline.quality.recording import Recording  # noqa: PLC0415
 

@@ -1,4 +1,4 @@
-"""Rows that hold no measurement are masked, and the others must be long enough."""
+"""Checks that mask rows without a measurement, and require enough of the others."""
 
 from statistics import NormalDist
 
@@ -7,7 +7,8 @@ import numpy as np
 from gyro_pipeline.conventions import AXES
 from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED
 from gyro_pipeline.parameters import LEAST_BLOCKS
-from gyro_pipeline.quality.recording import Recording, median, runs
+from gyro_pipeline.physics.bias import runs
+from gyro_pipeline.quality.recording import Recording, median
 from gyro_pipeline.quality.rest import Array, Mask
 
 
@@ -21,36 +22,36 @@ def cut_zero_rows(recording: Recording) -> None:
 
 
 def mask_non_finite(recording: Recording, largest: float = 1e12) -> None:
-    """Mask no numbers, and garbage bytes read as a number whose square may overflow."""
+    """Mask NaN, infinity, and garbage so large that its square may overflow."""
     rates = recording.rates
     if not (rates.size and -largest < rates.min() <= rates.max() < largest):  # NaN fails as well
         _mask_samples(recording, "non-finite values", ~(np.abs(rates) < largest))
 
 
 def mask_stuck(recording: Recording, least_s: float = 0.1) -> None:
-    """Mask runs of equal values of an axis, for ``least_s`` and longer than chance allows.
+    """Mask runs of equal values of an axis that last ``least_s`` and are longer than by chance.
 
-    Where a sample equals the one before with probability p, n samples hold a run of more than k
-    with a probability of at most n p^k. p is the axis's own, from its samples outside the longest
-    run, so a coarse quantisation allows longer runs.
+    If a sample equals the previous one with probability p, n samples contain a run of more than k
+    with a probability of at most n p^k. p is estimated from the samples of the axis outside the
+    longest run, so a coarse quantisation allows longer runs.
     """
-    rates, held = recording.rates, np.zeros(recording.rates.shape, bool)
+    rates, stuck = recording.rates, np.zeros(recording.rates.shape, bool)
     least = max(round(least_s * recording.rate_hz), 2)
-    same = rates[:, 1:] == rates[:, :-1]
-    for axis in np.flatnonzero(same.sum(axis=1) + 1 >= least):
-        lengths = np.diff(np.flatnonzero(np.concatenate([[True], ~same[axis], [True]])))
+    repeats = rates[:, 1:] == rates[:, :-1]
+    for axis in np.flatnonzero(repeats.sum(axis=1) + 1 >= least):
+        lengths = np.diff(np.flatnonzero(np.concatenate([[True], ~repeats[axis], [True]])))
         others = lengths.sum() - lengths.max()
-        p = (others - lengths.size + 2) / (others + 2)  # Laplace's: never 0 or 1
+        p = (others - lengths.size + 2) / (others + 2)  # Laplace's estimate, never 0 or 1
         chance = np.ceil(np.log(recording.quality.false_alarm / rates.shape[1]) / np.log(p))
-        held[axis] = np.repeat(lengths > max(least - 1, chance), lengths)
-    _mask_samples(recording, "stuck values", held)
+        stuck[axis] = np.repeat(lengths > max(least - 1, chance), lengths)
+    _mask_samples(recording, "stuck values", stuck)
 
 
 def mask_dropouts(recording: Recording) -> None:
-    """Mask rows that are zero on all axes, where they come ten times as often as by chance.
+    """Mask rows that are zero on all axes, if they are ten times as frequent as by chance.
 
-    By chance axes are zero independently, as often as in rows that are not zero on all of them. At
-    least c rows where m are expected have a probability of at most (e m / c)^c.
+    By chance, axes are zero independently, as often as in the other rows. The probability of at
+    least c rows, where m are expected, is at most (e m / c)^c.
     """
     zeros = recording.used == 0
     rows = np.count_nonzero(zeros.all(axis=0))
@@ -63,14 +64,14 @@ def mask_dropouts(recording: Recording) -> None:
 
 
 def _mask_samples(recording: Recording, check: str, samples: Mask) -> None:
-    """Mask rows that have a sample, (axis, n), of no measurement, and were not masked before."""
+    """Mask the rows with any of the given samples, (axis, n), that are not masked yet."""
     rows = samples.any(axis=0) & ~recording.masked
     axes = ", ".join(np.array(AXES)[samples[:, rows].any(axis=1)])
     recording.mask(check, rows, f"{'axes' if ',' in axes else 'axis'} {axes}, ")
 
 
 def keep_longest_stretch(recording: Recording) -> None:
-    """Keep the rows between two gaps of which most can be used."""
+    """Keep the stretch between two gaps that has the most usable rows."""
     edges = np.unique([0, *recording.log.gap_rows, recording.masked.size])
     if edges.size > 2:  # noqa: PLR2004 - more than one stretch
         used = np.add.reduceat(~recording.masked, edges[:-1], dtype=np.intp)
@@ -83,7 +84,7 @@ def keep_longest_stretch(recording: Recording) -> None:
 
 
 def require_length(recording: Recording) -> None:
-    """Reject where too few rows, or too small a share of the stretch, can be used."""
+    """Reject a recording if too few rows, or too small a share of them, are usable."""
     q, rate_hz, rows = recording.quality, recording.rate_hz, recording.masked.size
     used = rows - np.count_nonzero(recording.masked)
     least = max(q.least_s * rate_hz, LEAST_BLOCKS * recording.size)
@@ -98,13 +99,13 @@ def require_length(recording: Recording) -> None:
 
 
 def mask_bursts(recording: Recording, few: int = 3) -> None:
-    """Mask spikes, fewer than ``few`` rows, and shocks, with a block about where they may ring.
+    """Mask spikes of fewer than ``few`` rows, and shocks with a block on each side for ringing.
 
-    A shock of the first rows is a start. What lasts longer than a shock may is a motion.
+    A shock in the first rows is a start. Anything longer than a shock is a motion.
     """
     size, level = recording.size, median(recording.blocks.means)[:, None]
     spikes, shocks, start, motion = np.zeros((4, recording.masked.size), bool)
-    for first, last in runs(beyond_noise(recording)):
+    for first, last in runs(exceeds_noise(recording)):
         if last - first < few:
             spikes[first:last] = True
         else:
@@ -114,40 +115,40 @@ def mask_bursts(recording: Recording, few: int = 3) -> None:
         kind = motion if last - first >= longest else shocks if first else start
         shocks[first:last], kind[first:last] = False, True
     kinds = {"motion": motion, "start": start, "shocks": shocks, "spikes": spikes}
-    for check, chosen in kinds.items():
-        rows = chosen & ~recording.masked
+    for check, kind in kinds.items():
+        rows = kind & ~recording.masked
         if rows.any() and not recording.rejected:
-            far = np.abs(recording.rates[:, rows] - level).max(axis=1)
-            detail = f"up to {far.max():.3g} deg/s from the level, axis {AXES[far.argmax()]}, "
+            peaks = np.abs(recording.rates[:, rows] - level).max(axis=1)
+            detail = f"up to {peaks.max():.3g} deg/s from the level, axis {AXES[peaks.argmax()]}, "
             if check == "motion":
                 recording.add(check, REJECTED, f"{detail}{recording.where(rows)} (quality.shock_s)")
             else:
                 recording.mask(check, rows, detail)
 
 
-def beyond_noise(recording: Recording) -> Mask:
-    """Rows farther from the level about them than noise explains, and blocks whose other rows are.
+def exceeds_noise(recording: Recording) -> Mask:
+    """Mask of rows that deviate from the local level by more than noise, and of such blocks.
 
-    White noise has any row with a probability of ``false_alarm``, however many there are.
+    In white noise, any such row occurs with probability ``false_alarm``, for any number of rows.
     """
     rates, (starts, means, _, sigma, noise) = recording.filled, recording.blocks
     edges = np.append(0, starts[1:])
     lengths = np.diff(edges, append=rates.shape[1])
-    apart = rates - local_levels(means).repeat(lengths, axis=1)
+    deviations = rates - local_levels(means).repeat(lengths, axis=1)
     normal = -NormalDist().inv_cdf(recording.quality.false_alarm / (2 * rates.size))
     limits = normal * np.sqrt(1 + np.pi / (18 * recording.size)) * sigma
-    rows = (np.abs(apart) > limits[:, None]).any(axis=0)
-    left_out = rows | recording.masked
-    apart[:, np.flatnonzero(left_out)] = 0
-    counts = np.maximum(lengths - np.add.reduceat(left_out, edges, dtype=np.intp), 1)
-    shifts = np.abs(np.add.reduceat(apart, edges, axis=1) / counts)
+    rows = (np.abs(deviations) > limits[:, None]).any(axis=0)
+    excluded = rows | recording.masked
+    deviations[:, np.flatnonzero(excluded)] = 0
+    counts = np.maximum(lengths - np.add.reduceat(excluded, edges, dtype=np.intp), 1)
+    shifts = np.abs(np.add.reduceat(deviations, edges, axis=1) / counts)
     blocks = shifts > recording.quality.least_change_dps + 6 * noise[:, None]
     return rows | blocks.any(axis=0).repeat(lengths)
 
 
 def local_levels(means: Array) -> Array:
-    """Medians of nine block means, (axis, block), so that a movement does not hide itself."""
-    # a slope goes on beyond the ends, whatever two of the first or of the last blocks hold
+    """Running medians of nine block means, (axis, block), which a movement hardly affects."""
+    # a slope is continued beyond the ends, robustly against two outliers among the last blocks
     before = 2 * median(means[:, :5])[:, None] - means[:, 8:4:-1]
     after = 2 * median(means[:, -5:])[:, None] - means[:, -6:-10:-1]
     padded = np.hstack([before, means, after])

@@ -1,4 +1,4 @@
-"""Values that no gyroscope at rest gives, each told by a function of its own."""
+"""Checks for values that no gyroscope at rest measures."""
 
 from itertools import combinations
 from statistics import NormalDist
@@ -16,7 +16,7 @@ READER = "in `reader:` of the catalog entry in catalog.yml"
 
 
 def check_equal_axes(recording: Recording) -> None:
-    """Two axes of the same values: one column of the file was read twice."""
+    """Reject two axes with the same values, where a column of the file was read twice."""
     for first, second in combinations(range(len(AXES)), 2):
         used = recording.used
         if used.size and np.array_equal(used[first], used[second]):
@@ -25,10 +25,11 @@ def check_equal_axes(recording: Recording) -> None:
 
 
 def check_repeats(recording: Recording, reported: float = 0.01, most: float = 0.2) -> None:
-    """Rows that repeat the one before, or an axis its own values, beyond what coarse steps make.
+    """Reject rows that repeat the previous row, and axes that repeat values, beyond chance.
 
-    By chance axes repeat independently: an axis as often as where the one that repeats least does
-    not. Noise makes counts of changes by 0, 1, 2 steps that are log-concave: n0 n2 <= n1^2.
+    By chance, axes repeat independently; their shares are measured where the axis with the fewest
+    repeats does not repeat. For noise, the counts of changes by 0, 1 and 2 quantisation steps are
+    log-concave: n0 n2 <= n1^2.
     """
     shares, same = recording.repeats, recording.changes == 0
     rarest = int(np.argmin(shares))
@@ -36,9 +37,9 @@ def check_repeats(recording: Recording, reported: float = 0.01, most: float = 0.
         others = np.delete(same, rarest, axis=0)[:, ~same[rarest]]
         chance = shares[rarest] * np.prod(others.mean(axis=1))
         share = (same.all(axis=0).mean() - chance) / (1 - chance)
-        detail = f"{share:.1%} of the rows repeat the one before"
+        detail = f"{share:.1%} of the rows repeat the previous row"
         if share > most:
-            detail += f", {1 / (1 - share):.3g} rows a sample; type `repeats: drop` {READER}"
+            detail += f", {1 / (1 - share):.3g} rows per sample; type `repeats: drop` {READER}"
             recording.add("repeated rows", REJECTED, detail)
             return
         if share > reported + 4 * np.sqrt(chance / same.shape[1]):
@@ -49,12 +50,12 @@ def check_repeats(recording: Recording, reported: float = 0.01, most: float = 0.
         share = (repeats - ones**2 / (2 * max(twos, 1))) / sizes.size
         if share > most:
             detail = f"axis {AXES[axis]} repeats {share:.0%} of its values beyond chance; log each "
-            detail += "sample once, at the sensor's own rate"
+            detail += "sample once, at the sensor's rate"
             recording.add("repeated values", REJECTED, detail)
 
 
 def check_steps(recording: Recording) -> None:
-    """A quantisation step above the noise, on the coarsest axis."""
+    """Report or reject a quantisation step above the noise, on the coarsest axis."""
     steps, largest = recording.steps / MDPS, recording.quality.largest_step
     # rounding to a step adds step^2 / 12 to the variance (Sheppard)
     variances = median(recording.blocks.variances) / MDPS**2 - steps**2 / 12
@@ -68,29 +69,30 @@ def check_steps(recording: Recording) -> None:
 
 
 def check_dead_band(recording: Recording, least: int = 8) -> None:
-    """Zeros amid the noise that come too often: small values, or parts of a count, were cut."""
+    """Reject zeros that are too frequent, where small values or fractions of counts were cut."""
     for axis, rates in enumerate(recording.used):
         if np.count_nonzero(rates == 0) < least or not rates.min() < 0 < rates.max():
             continue
-        values, _, often = frequent_values(recording, axis)
-        if (often[values == 0] > 0).any():
+        values, _, excess = frequent_values(recording, axis)
+        if (excess[values == 0] > 0).any():
             band, step = np.abs(values[values != 0]).min(), np.median(np.diff(values))
             cut = f"± {band:.2g} deg/s" if band > 1.5 * step else "counts cut to zero?"  # noqa: PLR2004
-            detail = f"axis {AXES[axis]}, {cut}: 0 comes {often.max():.2g} times as often as its "
+            detail = f"axis {AXES[axis]}, {cut}: 0 is {excess.max():.2g} times as frequent as its "
             detail += "neighbours; the mean is pulled to zero; log the raw rates"
             recording.add("dead band", REJECTED, detail)
 
 
 def check_levels(recording: Recording, least: float = 3) -> None:
-    """The value that comes most beyond its neighbours: a flat top at an end, elsewhere a code.
+    """Reject a value far more frequent than its neighbours: saturation at an end, else a code.
 
-    Elsewhere it comes ``least`` times as often: where numbers are rounded twice, two share a value.
+    A value inside the range must be ``least`` times as frequent, since rounding twice can merge two
+    values.
     """
     for axis, name in enumerate(AXES):
-        values, counts, often = frequent_values(recording, axis)
-        often[1:-1][often[1:-1] < least] = 0
-        if often.any():
-            most = often.argmax()
+        values, counts, excess = frequent_values(recording, axis)
+        excess[1:-1][excess[1:-1] < least] = 0
+        if excess.any():
+            most = excess.argmax()
             check, verb = "frequent value", "held"
             if most in {0, values.size - 1}:
                 check, verb = "saturation", "cut off"
@@ -101,21 +103,22 @@ def check_levels(recording: Recording, least: float = 3) -> None:
 def frequent_values(
     recording: Recording, axis: int, least: float = 1.5, most: int = 3
 ) -> tuple[Array, NDArray[np.integer], Array]:
-    """Values, their counts, and how many times as often as their neighbours they come; 0: chance.
+    """Values, their counts, and the ratio of each count to that expected from its neighbours.
 
-    The neighbours' counts give the one between by a cubic through their logarithms, which is exact
-    for normal noise on a fine grid and too large on a coarse one, or by a line where that is more.
-    Chance is that of runs, as of independent samples. More than ``most`` such values are a pattern,
-    as of numbers rounded twice, which moves no mean.
+    The expected count is that of a cubic through the logarithms of the neighbours' counts, which is
+    exact for normal noise on a fine grid and too large on a coarse one, or that of a line if this
+    is larger. The ratio is 0 where chance explains it; runs count as independent samples. It is 0
+    as well if more than ``most`` values are too frequent: such patterns, as of numbers that are
+    rounded twice, do not move the mean.
     """
-    # in the log's own type: of float32 this is faster
+    # sorting is faster in float32, if the log has it
     ordered = np.sort(recording.used[axis].astype(recording.log.samples.dtype))
-    if not np.any(ordered[7:] == ordered[:-7]):  # fewer never are beyond chance
+    if not np.any(ordered[7:] == ordered[:-7]):  # smaller counts are never beyond chance
         return np.zeros(0), np.zeros(0, np.intp), np.zeros(0)
     values, counts = np.unique(ordered, return_counts=True)
-    if values.size < 3:  # noqa: PLR2004 - of two values alone, nothing is a tail
+    if values.size < 3:  # noqa: PLR2004 - too few for neighbours on both sides
         return values, counts, np.zeros(values.size)
-    # beyond the ends a tail goes on to less than one count
+    # a tail continues beyond the ends with less than one count
     below, above = (np.clip(a**2 / b, 0.05, 0.5) for a, b in (counts[:2], counts[:-3:-1]))
     padded = np.array([below, below, *counts, above, above])
     second, first, _, third, fourth = sliding_window_view(padded, values.size)
@@ -123,19 +126,19 @@ def frequent_values(
     expected = np.exp(np.maximum(near / 2, (4 * near - far) / 6)) / counts
     repeated = recording.used[axis, 1:][recording.changes[axis] == 0]
     runs = counts - np.bincount(np.searchsorted(values, repeated), minlength=values.size)
-    # twice the root of a count scatters by 1
+    # twice the root of a count has a standard deviation of 1
     variance = (16 / first + 16 / third + 1 / second + 1 / fourth) / 36 * counts
     beyond = 2 * np.sqrt(runs) * (1 - np.sqrt(expected)) / np.sqrt(1 + expected * variance)
     limit = -NormalDist().inv_cdf(recording.quality.false_alarm / (len(AXES) * values.size))
-    often = np.where((beyond > limit) & (1 / expected >= least), 1 / expected, 0)
-    return values, counts, often * (np.count_nonzero(often) <= most)
+    excess = np.where((beyond > limit) & (1 / expected >= least), 1 / expected, 0)
+    return values, counts, excess * (np.count_nonzero(excess) <= most)
 
 
 def check_turns(recording: Recording) -> None:
-    """Rows of several levels, as of several devices: in turn, or in any order if far apart."""
+    """Reject rows of several devices, whose levels alternate, or are far apart in any order."""
     widths = np.maximum(0.4 * np.sqrt(recording.squares), recording.steps)
-    apart = [jump_apart(*axis) for axis in zip(recording.changes, widths, strict=True)]
-    jumps = np.maximum(apart, jumps_in_turn(recording))
+    sizes = [jump_size(*axis) for axis in zip(recording.changes, widths, strict=True)]
+    jumps = np.maximum(sizes, periodic_jumps(recording))
     if jumps.any():
         detail = f"axis {AXES[jumps.argmax()]} jumps by {jumps.max():.2g} deg/s from row to row; "
         detail += "several sensors in one file? Split it by device, or log a column that names the "
@@ -143,52 +146,53 @@ def check_turns(recording: Recording) -> None:
         recording.add("mixed rows", REJECTED, detail)
 
 
-def jumps_in_turn(recording: Recording, least: float = 0.5) -> Array:
-    """(axis,), how far rows jump that are a period, or a divisor of it, apart; 0: nowhere.
+def periodic_jumps(recording: Recording, least: float = 0.5) -> Array:
+    """Size of jumps that repeat with a period, (axis,), deg/s; 0 without such jumps.
 
-    The periods have 2 to 16 devices in turn as divisors. Changes that are a period apart have means
-    of their own, beyond ``least`` times the noise and beyond chance. Nearly all of one frequency is
-    a vibration, unless 2 to 4 rows make its period.
+    The periods have 2 to 16 devices in turn as divisors. The mean changes at each phase of a period
+    differ by more than ``least`` times the noise and by more than chance. A single dominant
+    frequency is a vibration, unless its period is 2 to 4 rows.
     """
     rates, squares, jumps = recording.filled, recording.squares, np.zeros(len(AXES))
     for period in (60, 56, 54, 44, 52, 48) if rates.shape[1] > 600 else (12,):  # noqa: PLR2004
         count = rates.shape[1] // period
-        turns = rates[:, : count * period].reshape(len(AXES), count, period)
-        levels = np.ones(count) @ turns / count
+        phases = rates[:, : count * period].reshape(len(AXES), count, period)
+        levels = np.ones(count) @ phases / count
         means = np.diff(levels)
         sizes = np.ptp(means, axis=1) / 2
         within = np.maximum(squares - (means**2).mean(axis=1), 0.01 * squares) / (1 - 1 / count)
         beyond = sizes > max(least, 7 / np.sqrt(count)) * np.sqrt(within / 2)
         for axis in np.flatnonzero(beyond & (sizes > jumps)):
-            around = np.diff(levels[axis], append=levels[axis, 0])
-            powers = np.abs(np.fft.rfft(around)) ** 2
+            cycle = np.diff(levels[axis], append=levels[axis, 0])
+            powers = np.abs(np.fft.rfft(cycle)) ** 2
             main = powers.argmax()
             if main in {period / 2, period / 3, period / 4} or powers[main] < 0.9 * powers.sum():  # noqa: PLR2004
                 jumps[axis] = sizes[axis]
     return jumps
 
 
-def jump_apart(changes: Array, width: float, hollow: float = 0.1, share: float = 0.02) -> float:
-    """How far rows jump where hardly a change, (n - 1,), is smaller but for small ones; 0: nowhere.
+def jump_size(changes: Array, width: float, hollow: float = 0.1, share: float = 0.02) -> float:
+    """Size of jumps that are separated by a gap from small changes, (n - 1,); 0 without a gap.
 
-    A bin of sizes of changes, of a ``width`` that is not below a quantisation step, holds less than
-    ``hollow`` of a later one, which holds a ``share`` of all. Neither noise nor a vibration has it.
+    In the histogram of the sizes of changes, with bins of a ``width`` of at least a quantisation
+    step, a bin holds less than ``hollow`` times a later one, which holds at least a ``share`` of
+    all. Neither noise nor a vibration has such a gap.
     """
     counts = np.bincount((np.abs(changes) * (1 / width) + 0.5).astype(np.intp))
     later = np.maximum.accumulate(counts[::-1])[::-1]
-    clear = np.sqrt(later) - np.sqrt(counts) > 4  # noqa: PLR2004 - they scatter by a half
+    clear = np.sqrt(later) - np.sqrt(counts) > 4  # noqa: PLR2004 - roots of counts scatter by 1/2
     low = np.flatnonzero(clear & (counts < hollow * later) & (later > share * changes.size))
     return width * (low[-1] + np.argmax(counts[low[-1] :])) if low.size else 0.0
 
 
 def check_noise(recording: Recording, least_mdps_rts: float = 0.2) -> None:
-    """More noise than a MEMS gyroscope has, or a smaller N: the best have 0.33 mdps sqrt(s)."""
-    # of changes, not of samples: a swing is a motion, and no noise
+    """Reject too much noise, and report too little: the best MEMS have N of 0.33 mdps sqrt(s)."""
+    # from changes rather than samples, as a slow swing is motion rather than noise
     sigma = np.sqrt(recording.squares.max() / 2)
     density = recording.blocks.noise.max() * np.sqrt(recording.size / recording.rate_hz) / MDPS
     largest = recording.quality.largest_noise_dps
     if sigma > largest:
-        detail = f"{sigma:.3g} deg/s, expected at most {largest:g} of a gyroscope at rest; check "
+        detail = f"{sigma:.3g} deg/s, expected at most {largest:g} for a gyroscope at rest; check "
         recording.add("noise level", REJECTED, f"{detail}the unit (quality.largest_noise_dps)")
     elif density < least_mdps_rts:
         detail = f"N is {density:.2g} mdps sqrt(s), less noise than any MEMS gyroscope has; check "

@@ -1,12 +1,12 @@
-"""A logger's file in, a recording in deg/s out: :func:`log_of` is the flow.
+"""Readers of loggers' files: a file in, a recording in deg/s out.
 
-A file is a table (``table``, made by ``text``, ``lines``, ``stored``, ``vehicles``). Names, units,
-format and options say which of its columns are the rates (``columns``) and in which unit
-(``scales``). Some of its rows are samples (``rows``), their time is told by content (``stamps``,
-``times``), and their values must be a gyroscope's (``counts``). Whatever contradicts each other is
-collected, then refused at once (``File.settle``) unless the options are trusted: so ends a file in
-which devices take turns. Where samples are missing (``clock``) is a row in ``Log.gap_rows``, and
-quality control keeps the longest stretch between two of them: so ends a file with a gap.
+:func:`log_of` has all steps. A file is read as a table (``table``, with ``text``, ``lines``,
+``stored`` and ``vehicles``). Names, units, the format and the options determine the columns of the
+rates (``columns``) and their unit (``scales``). Then the rows that are samples are selected
+(``rows``), their times are recognised by content (``stamps``, ``times``), and their values must be
+plausible for a gyroscope (``counts``). Contradictions, such as rows of several devices, are
+collected and refused together (``File.settle``) unless the options are trusted. Gaps (``clock``)
+are listed in ``Log.gap_rows``; quality control keeps the longest stretch between two of them.
 """
 
 from pathlib import Path
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from gyro_pipeline.logs import Log
 from gyro_pipeline.parameters import ReaderOptions
-from gyro_pipeline.readers.columns import Beside, acceleration_of, rate_columns, temperature_of
-from gyro_pipeline.readers.counts import contradict_values, signed
+from gyro_pipeline.readers.columns import Auxiliary, acceleration_of, rate_columns, temperature_of
+from gyro_pipeline.readers.counts import contradict_values, to_signed
 from gyro_pipeline.readers.file import File
 from gyro_pipeline.readers.formats import FORMATS
 from gyro_pipeline.readers.rows import contradict_turns, sample_rows
@@ -36,20 +36,20 @@ def read_log(
     expected_rate_hz: float | None = None,
     imu: int | None = None,
 ) -> Log:
-    """Read one recording from a logger's file.
+    """Read a recording from a logger's file.
 
     Args:
-        path: The file; what it is, its content tells.
-        options: What it does not say of itself.
+        path: The file; its type is recognised by its content.
+        options: Everything that the file does not say about itself.
         expected_rate_hz: A sample rate that differs by more than ``options.rate_tolerance_pct`` is
-            a REJECTED finding; None: not compared.
-        imu: Whose recording, where ``options.columns`` has those of several IMUs.
+            a REJECTED finding; None: no comparison.
+        imu: Number of the IMU, if ``options.columns`` names the columns of several.
 
     Returns:
-        The recording in deg/s, with NaN, infinity and zeros as they are in the file.
+        The recording in deg/s, with the NaN, infinity and zeros of the file.
 
     Raises:
-        InputError: The file cannot be read, or can be read in two ways; says where and why.
+        InputError: The file cannot be read, or is ambiguous; the message says where and why.
     """
     return log_of(read_table(path, options), options, expected_rate_hz, imu)
 
@@ -60,7 +60,7 @@ def log_of(
     expected_rate_hz: float | None = None,
     imu: int | None = None,
 ) -> Log:
-    """The recording that a table holds; arguments and errors are those of :func:`read_log`."""
+    """The recording in a table; arguments and errors are as for :func:`read_log`."""
     file = File(table, options)
     columns = rate_columns(file, imu)
     scale, are_counts = scale_of(file, columns)
@@ -68,7 +68,7 @@ def log_of(
     numbers = [table.numbers(number) for number in columns]
     if len({*map(len, numbers)}) > 1:
         lengths = [len(column) for column in numbers]
-        raise file.refusal(f"expected columns of one length, got {lengths}; correct columns")
+        raise file.refusal(f"expected columns of equal length, got {lengths}; correct columns")
     raw = np.array(numbers).T
     keep = sample_rows(file, raw)
     timing = timing_of(file, keep)
@@ -79,23 +79,23 @@ def log_of(
     compare_rates(file, timing.rate_hz, expected_rate_hz, keep)
     file.settle()
     gap_rows = np.union1d(timing.gap_rows, counted_gaps(file, keep)).astype(np.intp)
-    celsius = _beside(file, temperature, keep)
+    celsius = _auxiliary_values(file, temperature, keep)
     return Log(
         samples=rates,
         rate_hz=timing.rate_hz,
         gap_rows=gap_rows,
         temperature_c=None if celsius is None else celsius[:, 0],
-        acceleration_g=_beside(file, acceleration, keep),
+        acceleration_g=_auxiliary_values(file, acceleration, keep),
         rows=None if keep.all() else np.flatnonzero(keep),
         findings=(*table.findings, *file.findings),
     )
 
 
 def _in_dps(file: File, raw: Floats, scale: float, rate_hz: float | None) -> Floats:
-    """Rates of the file's numbers; of increments, the angle of a sample over its step."""
+    """Convert the file's numbers to rates; increments are divided by the step between samples."""
     options = file.options
     if options.signed_bits is not None:
-        raw = signed(file, raw, options.signed_bits)
+        raw = to_signed(file, raw, options.signed_bits)
     if options.offset is not None:
         raw = raw - options.offset
     if not options.increments:
@@ -107,9 +107,9 @@ def _in_dps(file: File, raw: Floats, scale: float, rate_hz: float | None) -> Flo
     return raw * scale * rate_hz
 
 
-def _beside(file: File, beside: Beside, keep: NDArray[np.bool_]) -> Floats | None:
-    """Values (n, k) in °C or g beside the rates, if there are any; no reason to refuse."""
-    numbers, unit = beside
+def _auxiliary_values(file: File, auxiliary: Auxiliary, keep: NDArray[np.bool_]) -> Floats | None:
+    """Temperatures in °C or accelerations in g, (n, k); None if they are missing or not numbers."""
+    numbers, unit = auxiliary
     columns = [file.table.columns[number] for number in numbers]
     if not columns or any(c.dtype.kind != "f" or len(c) != len(keep) for c in columns):
         return None

@@ -1,16 +1,17 @@
 """Sample rate and gaps, from timestamps and packet counters.
 
 A missing sample makes all later stamps late. A sample that is written late, a stall, a burst and
-rounding make only some late. So the lower envelope of ``stamp - row * step``, the least of it among
-the stamps that follow, rises only where samples are missing. In the same way, the upper envelope
+rounding make only some stamps late. So the lower envelope of ``stamp - row * step``, its minimum
+over the following stamps, rises only where samples are missing. In the same way, the upper envelope
 falls only where a row is written twice.
 
-Not seen are losses within the resolution of the stamps or their scatter: single samples of a clock
-that ticks as fast as samples come, a sample beside jitter of a third of a step, some of a burst.
-Nor are a sample in whose place a row is repeated, losses so regular that they look like a slower
-clock, and those beside the last five stamps. Where samples are written twice on a clock that ticks
-as fast as they come, the rate counts them all. A clock whose ticks are no decimal unit and just
-shorter than a step skips one now and then, which looks like a missing sample.
+This method cannot see losses within the resolution or the scatter of the stamps: single samples if
+the clock ticks at the sample rate, a sample among jitter of a third of a step, some samples of a
+burst. It cannot see a sample that is replaced by a repeated row, losses so regular that they look
+like a slower clock, and losses within the last five stamps. If samples are written twice by a clock
+that ticks at the sample rate, all of them count for the rate. A clock whose tick is slightly
+shorter than a step, and not a decimal unit, skips a tick at times, which looks like a missing
+sample.
 """
 
 from dataclasses import dataclass, field
@@ -26,7 +27,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Timing:
-    """What stamps or a counter say: sample rate in Hz, rows behind gaps, and what was noticed."""
+    """Sample rate in Hz, the first rows after gaps, and findings, from stamps or a counter."""
 
     rate_hz: float | None = None
     gap_rows: Rows = field(default_factory=lambda: np.empty(0, np.intp))
@@ -37,35 +38,35 @@ def from_stamps(stamps: Floats, unit_s: float | None, numbers: Rows | None = Non
     """Sample rate and gaps from timestamps.
 
     Args:
-        stamps: (n,), one a row, in any unit; NaN where a row has none.
-        unit_s: Seconds in one unit of them; None: not known, and no rate.
-        numbers: (n,), of the rows in the file, for findings; None: from 0.
+        stamps: (n,), one per row, in any unit; NaN where a row has none.
+        unit_s: Seconds per unit; None if unknown, then no rate is measured.
+        numbers: (n,), numbers of the rows in the file, for findings; None: from 0.
 
     Returns:
-        Rows behind missing samples, and those at which time goes back, are gaps. The rate is that
-        between them; a finding is REJECTED where it changes along the recording.
+        Gaps are the first rows after missing samples, and rows at which time goes back. The rate is
+        measured between gaps; if it changes along the recording, a finding is REJECTED.
     """
     numbers = np.arange(len(stamps)) if numbers is None else numbers
     rows, strays = _without_strays(stamps)
     steps = np.diff(stamps[rows])
     if len(rows) == len(stamps) > 1 and 5 * np.ptp(steps) + 1e-80 < (step := steps.mean()):
-        return Timing(unit_s and 1 / (step * unit_s), findings=_change(stamps, rows))  # as most
+        return Timing(unit_s and 1 / (step * unit_s), findings=_change(stamps, rows))  # most files
     times, wraps, back = _increasing(stamps[rows], unit_s)
     findings = [
-        *_at("timestamps", numbers[strays], "a timestamp is far from those beside it, and ignored"),
-        *_at("wrap-around", numbers[rows[wraps]], "the counter of the timestamps starts anew"),
+        *_at("timestamps", numbers[strays], "a timestamp is far from its neighbours, and ignored"),
+        *_at("wrap-around", numbers[rows[wraps]], "the counter of the timestamps wraps around"),
         *_at("time order", numbers[rows[back]], "time goes back", REPAIRED),
     ]
     usual = _step_over(times, rows, len(rows) / 20) if len(rows) > 1 else 0.0
     if not usual > 0:
         text = "timestamps do not advance: the rate is not measured"
         return Timing(None, rows[back], (*findings, Finding("timestamps", KEPT, text)))
-    # of the rows that share a stamp, the last one is in time
+    # the last of the rows that share a stamp is on time
     first = np.diff(times, prepend=-np.inf) > usual / 10
     last = np.append(first[1:], True)
     step, losses, even = _fit(times[last], rows[last], stamps[rows])
     gaps = rows[first][losses > 0]
-    text = "the timestamp of the row before, as a coarse clock, bursts and doubled rows have it"
+    text = "the timestamp of the previous row, as from a coarse clock, bursts or repeated rows"
     missing = f"samples are missing, about {losses.sum():.0f}"
     findings += [
         *_at("gaps", numbers[gaps], missing, REPAIRED, "before"),
@@ -78,22 +79,22 @@ def from_stamps(stamps: Floats, unit_s: float | None, numbers: Rows | None = Non
 def _fit(
     times: Floats, rows: Rows, stamps: Floats, pause: int = 100
 ) -> tuple[float, Floats, Floats]:
-    """The step from sample to sample, samples missing before each stamp, and times without gaps.
+    """The step between samples, numbers of samples missing before stamps, and times without gaps.
 
     Args:
-        times: (k,), increasing, of the stamps that differ.
-        rows: (k,), the last row with each.
-        stamps: (n,), as written.
-        pause: A gap of so many samples need not last a whole number of steps.
+        times: (k,), increasing, the different stamps.
+        rows: (k,), the last row of each.
+        stamps: (n,), all stamps.
+        pause: Gaps of at least this many samples need not last a whole number of steps.
     """
-    # the mean of steps near a middle one: losses make others longer, and doubled rows shorter
+    # the mean of the steps near the median: losses make others longer, repeated rows shorter
     slopes = np.diff(times) / np.diff(rows)
     middle = _step_over(times, rows, len(rows) / 20), np.quantile(slopes, 0.5, method="lower")
     near = max((np.abs(slopes - step) < 0.45 * step for step in middle), key=np.count_nonzero)
     step = float(slopes[near].mean())
     resolution = _resolution(stamps, np.median(np.diff(times)))
     doubled = np.diff(rows, prepend=rows[0]) > 1
-    for _ in range(4):  # the step shows the gaps, and these the step
+    for _ in range(4):  # gaps depend on the step, and the step on the gaps
         delays = times - step * rows
         scatter = np.ptp(np.quantile(np.diff(delays), [0.15, 0.85]))
         least = max(step / 2, 1.25 * resolution, 2 * scatter)
@@ -106,10 +107,10 @@ def _fit(
 
 
 def _rises(delays: Floats, least: float, step: float, near: int = 50, few: int = 5) -> Floats:
-    """How far the lower envelope of delays (k,) rises before each stamp; 0 if by less than least.
+    """Rise of the lower envelope of delays (k,) at each stamp; 0 if it is below ``least``.
 
-    Before a stamp, the envelope is the median of a few delays. Behind it, it is the least delay of
-    near stamps, if none of later ones is even less: ten stamps may follow for each step of delay.
+    Before a stamp, the envelope is the median of a few delays. After it, it is the least delay of
+    near stamps, unless a later stamp has an even lower one, within ten stamps per step of delay.
     """
     excess = np.diff(delays, prepend=delays[0])
     rows = np.flatnonzero(excess[: len(delays) - few] > least)
@@ -119,28 +120,29 @@ def _rises(delays: Floats, least: float, step: float, near: int = 50, few: int =
         spans = np.stack([rows, np.minimum(rows + near, ends - 1), ends], axis=1).ravel()
         lowest = np.minimum.reduceat(np.append(delays, np.inf), spans)
         before = np.median([delays[np.maximum(rows - n, 0)] for n in range(1, few + 1)], axis=0)
-        for_good = np.minimum(lowest[::3], lowest[1::3]) - before > least
-        rises[rows] = for_good * np.minimum(lowest[::3] - before, excess[rows])
+        lasting = np.minimum(lowest[::3], lowest[1::3]) - before > least
+        rises[rows] = lasting * np.minimum(lowest[::3] - before, excess[rows])
     return rises
 
 
 def _step_over(times: Floats, rows: Rows, stamps: float) -> float:
-    """Median of the steps from row to row over so many stamps, which few gaps do not change."""
+    """Median step per row, measured over a number of stamps, so that few gaps do not affect it."""
     lag = max(int(stamps), 1)
     return float(np.median((times[lag:] - times[:-lag]) / (rows[lag:] - rows[:-lag])))
 
 
 def _resolution(stamps: Floats, step: np.floating) -> float:
-    """The decimal unit that all stamps (n,) are rounded to; 0 if below a hundredth of a step."""
+    """The decimal unit to which all stamps (n,) are rounded; 0 if below a hundredth of a step."""
     units = 10.0 ** (np.ceil(np.log10(step) - 1e-6) - np.arange(3))[:, None]
     errors = np.abs(stamps - units * np.rint(stamps / units)).max(axis=1)
     return max(units[errors <= 4 * np.spacing(np.abs(stamps).max()), 0], default=0.0)
 
 
 def _change(times: Floats, rows: Rows, least: float = 0.02) -> tuple[Finding, ...]:
-    """Whether the step changes along times without gaps: between the means of five parts.
+    """A finding if the step between samples changes along times without gaps, (k,).
 
-    A change is more than a share ``least`` of the step, and than the ten blocks of a part differ.
+    The step changes if the means of five parts differ by more than a share ``least`` of the step,
+    and by more than the ten blocks of each part explain.
     """
     ends = np.linspace(0, len(rows) - 1, 51).astype(np.intp)
     if len(rows) < len(ends):
@@ -159,9 +161,9 @@ def _change(times: Floats, rows: Rows, least: float = 0.02) -> tuple[Finding, ..
 
 
 def _increasing(stamps: Floats, unit_s: float | None) -> tuple[Floats, Rows, Rows]:
-    """Times since the first stamp, where a counter starts anew, and where time goes back.
+    """Times since the first stamp, the positions of wrap-arounds, and those of steps back.
 
-    Counters have 16, 24 or 32 bits, or last a day; unwrapped, the step is an ordinary one.
+    Counters have 16, 24 or 32 bits, or wrap at midnight; unwrapped, the step is an ordinary one.
     """
     steps = np.diff(stamps, prepend=stamps[:1])
     steps[np.abs(steps) <= 4 * np.spacing(np.abs(stamps).max(initial=1e-90))] = 0.0
@@ -176,9 +178,9 @@ def _increasing(stamps: Floats, unit_s: float | None) -> tuple[Floats, Rows, Row
 
 
 def _without_strays(stamps: Floats, far: float = 10.0, largest: float = 1e100) -> tuple[Rows, Rows]:
-    """Rows with a stamp in time, and rows with a stamp far from both neighbours, which are near.
+    """Rows with a valid stamp, and rows whose stamp is far from two neighbours that agree.
 
-    The time of the latter is not known, but their samples may be whole. Infinity is no stamp.
+    The time of the latter is unknown, but their samples may be valid. Infinity is not a stamp.
     """
     rows = np.flatnonzero(np.abs(stamps) < largest)
     if len(rows) < 3 or (np.diff(stamps[rows]) >= 0).all():  # noqa: PLR2004
@@ -194,22 +196,26 @@ def from_counter(counts: Floats, bits: int) -> Timing:
     """Gaps from a packet counter.
 
     Args:
-        counts: (n,), one a row, each one more than the last; NaN where a row has none.
-        bits: It starts anew after ``2**bits``.
+        counts: (n,), one per row, increasing by 1; NaN where a row has none.
+        bits: Width of the counter, which wraps at ``2**bits``.
 
     Returns:
-        Rows at which it does not go on by one are gaps; there is no rate.
+        Gaps are the rows at which the counter does not increase by 1; no rate is measured.
     """
     rows, _ = _without_strays(counts)
     skips = rows[1:][np.mod(np.diff(counts[rows] - rows), 2.0**bits) != 0]
-    text = "the packet counter does not go on by one"
+    text = "the packet counter does not increase by 1"
     return Timing(gap_rows=skips, findings=(*_at("packet counter", skips, text, REPAIRED),))
 
 
-def _at(check: str, rows: Rows, text: str, outcome: str = KEPT, place: str = "at") -> list[Finding]:
-    """How often something is so, and where first; no finding if it never is."""
+def _at(
+    check: str, rows: Rows, text: str, outcome: str = KEPT, preposition: str = "at"
+) -> list[Finding]:
+    """A finding with the number of rows and the first three; none without rows."""
     if not len(rows):
         return []
-    listed = ", ".join(map(str, rows[:3])) + (", …" if len(rows[3:]) else "")
-    count = f"once, {place} row" if len(rows) == 1 else f"{len(rows)} times, {place} rows"
-    return [Finding(check, outcome, f"{text}: {count} {listed}")]
+    first = ", ".join(map(str, rows[:3])) + (", …" if len(rows[3:]) else "")
+    count = (
+        f"once, {preposition} row" if len(rows) == 1 else f"{len(rows)} times, {preposition} rows"
+    )
+    return [Finding(check, outcome, f"{text}: {count} {first}")]

@@ -1,7 +1,7 @@
-"""Values that no gyroscope at rest gives, told from the file's own numbers, with the evidence.
+"""Checks for values that no gyroscope at rest measures.
 
-A recording's values are samples of one device. Each check takes values (n, 3), NaN where there are
-none, and returns a text for a message, empty where nothing is wrong.
+Each check takes values (n, 3), NaN where missing, and returns the evidence for a message, or an
+empty text if the values are plausible.
 """
 
 from collections.abc import Sequence
@@ -16,13 +16,13 @@ Floats = NDArray[np.float64]
 
 
 def contradict_values(file: File, raw: Floats, rates: Floats, are_counts: bool) -> None:
-    """Values that no gyroscope at rest gives, unless the options explain them.
+    """Contradict values that no gyroscope at rest measures, unless the options explain them.
 
     Args:
-        file: Gets the first contradiction.
-        raw: (n, 3), as the file has them.
+        file: Collects the first contradiction.
+        raw: (n, 3), the file's numbers.
         rates: (n, 3), deg/s.
-        are_counts: Whether the file's numbers are known to be counts.
+        are_counts: Whether the file's numbers are counts.
     """
     has_offset, text, start = file.options.offset is not None, "", _finite(raw[:100])
     if (start == np.rint(start)).sum() > 0.9 * start.size:  # noqa: PLR2004 - whole numbers
@@ -35,10 +35,10 @@ def contradict_values(file: File, raw: Floats, rates: Floats, are_counts: bool) 
 
 
 def wrapped(values: Floats, bits: Sequence[int] = (*range(12, 25), 32), compact: float = 8) -> str:
-    """Signed counts that were written as unsigned ones.
+    """Detect signed counts that were written as unsigned ones.
 
-    Nearly all rows are whole numbers without a sign, of which some lie so high that their signed
-    reading is smaller, in range or in size, by the factor ``compact``.
+    Nearly all rows are whole numbers without a sign, and the signed reading of the high ones makes
+    the range or the largest value smaller by at least the factor ``compact``.
     """
     counts = values[((values == np.rint(values)) & (values >= 0)).all(axis=1)]
     for width in bits:
@@ -59,11 +59,11 @@ def wrapped(values: Floats, bits: Sequence[int] = (*range(12, 25), 32), compact:
     return ""
 
 
-def signed(file: File, values: Floats, bits: int) -> Floats:
-    """Signed counts of unsigned ones.
+def to_signed(file: File, values: Floats, bits: int) -> Floats:
+    """Convert unsigned to signed counts.
 
     Raises:
-        InputError: They are not whole numbers of so many bits.
+        InputError: The values are not whole numbers of this many bits.
     """
     finite = values[np.isfinite(values)]
     if (finite != np.rint(finite)).any() or finite.min() < 0 or finite.max() >= 2**bits:
@@ -75,10 +75,10 @@ def signed(file: File, values: Floats, bits: int) -> Floats:
 
 
 def lost_decimal_points(values: Floats, digits: tuple[int, int] = (6, 9), most: float = 0.9) -> str:
-    """Whole numbers of many digits: a spreadsheet took decimal points for separators."""
+    """Detect whole numbers of many digits, as a spreadsheet without decimal points writes them."""
     values = np.abs(_finite(values))
-    many = (values >= 10.0 ** (digits[0] - 1)) & (values < 10.0 ** digits[1])
-    if (many & (values == np.rint(values))).mean() < most:
+    are_long = (values >= 10.0 ** (digits[0] - 1)) & (values < 10.0 ** digits[1])
+    if (are_long & (values == np.rint(values))).mean() < most:
         return ""
     return (
         f"whole numbers of {digits[0]} to {digits[1]} digits, such as {values[0, 0]:.0f}: the "
@@ -87,15 +87,15 @@ def lost_decimal_points(values: Floats, digits: tuple[int, int] = (6, 9), most: 
 
 
 def implausible_level(rates: Floats, most_dps: float = 100.0) -> str:
-    """A level that no MEMS gyroscope at rest has; of rates in deg/s."""
-    if np.count_nonzero(np.abs(rates) > most_dps) < rates.size / 6:  # most recordings, at a glance
+    """Detect a level of rates, in deg/s, that no MEMS gyroscope at rest has."""
+    if np.count_nonzero(np.abs(rates) > most_dps) < rates.size / 6:  # quick, for most recordings
         return ""
     levels = np.median(_finite(rates), axis=0)
     axis = int(np.abs(levels).argmax())
     if not abs(levels[axis]) > most_dps:
         return ""
     return (
-        f"a level of {levels[axis]:.4g} deg/s about {AXES[axis]}, and no MEMS gyroscope at rest "
+        f"a level of {levels[axis]:.4g} deg/s about {AXES[axis]}, but no MEMS gyroscope at rest "
         f"has more than {most_dps:g}; check units and scale_dps, or give offset, the count at rest"
     )
 

@@ -1,4 +1,4 @@
-"""A table, what its names say, the options and the format: all that decides how it is read."""
+"""A table with its headers, its format and the options, which determine how it is read."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ from gyro_pipeline.readers.table import IN_READER, Table
 
 @dataclass
 class File:
-    """Decides by name, and collects what contradicts each other and what is worth a word."""
+    """A table and how to read it; collects contradictions and findings."""
 
     table: Table
     options: ReaderOptions
@@ -29,22 +29,22 @@ class File:
         return ", ".join(repr(self.table.names[n] or f"column {n}") for n in numbers)
 
     def note(self, check: str, text: str, outcome: str = KEPT) -> None:
-        """Something to say, whatever comes of it."""
+        """Add a finding."""
         self.findings.append(Finding(check, outcome, text))
 
     def contradict(self, text: str) -> None:
-        """Something that can be read in two ways, of which only the options can say the right."""
+        """Add a contradiction, which is refused unless the options are trusted."""
         self.contradictions.append(text)
 
     def refusal(self, text: str) -> InputError:
-        """An error that says where, and in which file to type what it asks for."""
+        """An error that names the file, and the place of the options to change."""
         return InputError(f"{self.table.where}: {text} {IN_READER}")
 
     def settle(self) -> None:
-        """Refuse what can be read in two ways, unless the options are trusted, which is then said.
+        """Refuse contradictions, or turn them into findings if the options are trusted.
 
         Raises:
-            InputError: Something contradicts, and the options are not trusted.
+            InputError: A contradiction exists, and the options are not trusted.
         """
         if self.contradictions and self.options.trust is None:
             others = len(self.contradictions) - 1
@@ -55,18 +55,18 @@ class File:
             self.note("trust: options", f"overruled: {text}")
 
     def find(self, column: Column) -> int:
-        """Look up a column by its name, with or without its unit, or by its number from 0.
+        """Find a column by its name, with or without its unit, or by its number from 0.
 
         Raises:
-            InputError: There is no such column, or more than one.
+            InputError: No column or several columns match.
         """
         names = self.table.names
-        alike = [number for number, name in enumerate(names) if column in (number, name)]
-        alike = alike or [n for n, header in enumerate(self.headers) if header.name == column]
-        if len(alike) == 1:
-            return alike[0]
+        matches = [number for number, name in enumerate(names) if column in (number, name)]
+        matches = matches or [n for n, header in enumerate(self.headers) if header.name == column]
+        if len(matches) == 1:
+            return matches[0]
         raise self.refusal(
-            f"expected one column {column!r}, got {len(alike)}, numbers {alike} (from 0), in "
-            f"{len(names)} columns, {self.table.listed()}; correct it, or, of two sensors in one "
-            "file, give numbers in place of names"
+            f"expected one column {column!r}, got {len(matches)}, numbers {matches} (from 0), in "
+            f"{len(names)} columns, {self.table.listed()}; correct it, or, if a file has two "
+            "sensors, give numbers instead of names"
         )

@@ -1,7 +1,7 @@
-"""Vendors' formats, a row of data each.
+"""Vendors' formats, an entry of data each.
 
-A format is claimed only by a header that no other vendor writes, and says only what the file leaves
-open. Loggers whose headers name all units need no row: NGIMU, x-IMU3, phyphox, Shimmer.
+A format is recognised only by a header that no other vendor writes, and adds only what the file
+does not say. Loggers whose headers name all units need no entry: NGIMU, x-IMU3, phyphox, Shimmer.
 """
 
 import re
@@ -14,18 +14,18 @@ from gyro_pipeline.readers.table import IN_READER, Table
 
 @dataclass(frozen=True)
 class Format:
-    """What a vendor's files leave open.
+    """Properties of a vendor's files that the files do not state.
 
     Attributes:
-        source: Where it is documented.
+        source: The documentation.
         rates: Names of the columns of the rates about x, y, z.
-        units: Of the rates.
-        acceleration: Names of the columns along x, y, z.
-        acceleration_units: Of these.
-        mark: Regular expression of what only this vendor writes in the header or above it; nothing
-            where the names of the rates are such.
-        times: Names of columns of time and seconds in one unit of each, the best first.
-        counter: Name and bits of a packet counter.
+        units: Unit of the rates.
+        acceleration: Names of the columns of the acceleration along x, y, z.
+        acceleration_units: Unit of the acceleration.
+        mark: Regular expression for text that only this vendor writes in the header or above it;
+            empty if the names of the rates are unique.
+        times: Names of columns of times with seconds per unit, the best first.
+        counter: Name and width in bits of a packet counter.
     """
 
     source: str
@@ -90,24 +90,24 @@ FORMATS: dict[str, Format] = {
         times=(("timestamp", 1e-6),),
     ),
 }
-"""By the name that ``format`` of the options has."""
+"""Formats by the value of the option ``format``."""
 
 
 def find_all(table: Table, *names: str) -> list[int]:
-    """Numbers of the columns of these names, also within a message: ``field.accel.x``."""
-    return [number for name in names for number in _named(table.names, name)]
+    """Numbers of the columns with these names, also inside a message: ``field.accel.x``."""
+    return [number for name in names for number in _find_name(table.names, name)]
 
 
 @lru_cache(1 << 10)  # a folder's files have the same headers
-def _named(headers: tuple[str, ...], name: str) -> list[int]:
+def _find_name(headers: tuple[str, ...], name: str) -> list[int]:
     return [n for n, header in enumerate(headers) if f".{header}".endswith(f".{name}")]
 
 
 def format_of(table: Table, name: str) -> Format | None:
-    """The format that the options name; ``auto``: the first that claims the table, or None.
+    """The format of a name; for ``auto`` the first format that fits the table, or None.
 
     Raises:
-        InputError: The table lacks columns of the format that is named.
+        InputError: The table lacks columns of the named format.
     """
     text = f"{table.preamble}\n{','.join(table.names)}"
     for key, form in FORMATS.items():
@@ -117,7 +117,7 @@ def format_of(table: Table, name: str) -> Format | None:
                 f"{table.where}: format {name} has a column {missing[0]!r}, got {table.listed()}; "
                 f"correct format {IN_READER}"
             )
-        claimed = not missing and re.search(form.mark, text, re.MULTILINE)
-        if key == name or (name == "auto" and claimed):
+        fits = not missing and re.search(form.mark, text, re.MULTILINE)
+        if key == name or (name == "auto" and fits):
             return form
     return None

@@ -1,11 +1,12 @@
-"""A look through a MATLAB file of version 5 before SciPy reads it.
+"""Checks a MATLAB file of version 5 before SciPy reads it.
 
-SciPy does not check the numbers of types in a file, nor the sizes of its arrays: one damaged byte
-can end the process, or fill the memory (scipy 1.17).
+SciPy checks neither the type numbers in a file nor the sizes of its arrays, so that a damaged byte
+can crash the process or fill the memory (scipy 1.17).
 
-Source: MathWorks, MAT-File Format, chapter 1: a header of 128 bytes, then elements of a tag, which
-has the type and the number of bytes, and of data in whole eights. An array is an element of
-elements, the first of which are its class and its size. A compressed element holds another one.
+Source: MathWorks, MAT-File Format, chapter 1. A header of 128 bytes is followed by elements. Each
+has a tag, with the type and the number of bytes, and data, padded to a multiple of eight bytes. An
+array is an element that contains elements, first its class and its size. A compressed element
+contains another element.
 """
 
 import math
@@ -20,15 +21,15 @@ _DEEPEST = 32
 
 
 def check(data: bytes, check_claim: Callable[[int], None]) -> None:
-    """See that a file is made of whole elements of known types, and arrays of no more than it has.
+    """Check that elements are complete, types are valid, and arrays fit into the file.
 
     Args:
-        data: Of the file.
-        check_claim: Raises an error where so many bytes are too many to unpack.
+        data: Content of the file.
+        check_claim: Raises an error if a number of unpacked bytes is too large.
 
     Raises:
-        ValueError: It is not.
-        zlib.error: What is compressed in it is damaged.
+        ValueError: A check fails.
+        zlib.error: Compressed data is damaged.
     """
     order = {b"IM": "<", b"MI": ">"}[data[126:128]]
     size = 0
@@ -46,17 +47,19 @@ def check(data: bytes, check_claim: Callable[[int], None]) -> None:
 
 
 def _check_array(data: memoryview, order: str, depth: int) -> None:
-    """See that an array has a class, a size that its data can fill, and all of its elements."""
+    """Check that an array has a class, a size that its data can fill, and all of its elements."""
     parts = list(_elements(data, order))
     types = [kind for kind, _ in parts]
     flags = struct.unpack(f"{order}II", parts[0][1])[0] if types[:1] == [_UINT32] else 0
     kind, is_complex = flags & 0xFF, flags >> 11 & 1
-    needed = 4 + 2 * (kind == _SPARSE) + is_complex  # flags, size, name; two of places; values
-    whole = kind not in _VALUES or (len(parts) >= needed and not {_ARRAY, _COMPRESSED} & {*types})
+    needed = 4 + 2 * (kind == _SPARSE) + is_complex  # flags, size, name; two of indices; values
+    complete = kind not in _VALUES or (
+        len(parts) >= needed and not {_ARRAY, _COMPRESSED} & {*types}
+    )
     size = parts[1][1] if types[1:2] in ([_INT32], [_UINT32]) and kind != _SPARSE else b""
     lengths = struct.unpack(f"{order}{len(size) // 4}i", size) or (1,)
     fits = math.prod(lengths) <= len(data) and min(lengths) >= 0
-    if not (0 < kind < 19 and whole and fits and depth <= _DEEPEST):  # noqa: PLR2004
+    if not (0 < kind < 19 and complete and fits and depth <= _DEEPEST):  # noqa: PLR2004
         raise ValueError(f"an array of class {kind}, {lengths}, in {len(data)} bytes")
     for kind, inner in parts:
         if kind == _ARRAY and len(inner):
@@ -64,14 +67,14 @@ def _check_array(data: memoryview, order: str, depth: int) -> None:
 
 
 def _elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
-    """Types and contents."""
-    at = 0
-    while at < len(data):
-        kind, size = struct.unpack_from(f"{order}II", data, at)
-        start, length = at + 8, 8 + size
-        if kind >> 16:  # a short one, of four bytes at most, in the tag itself
-            kind, size, start, length = kind & 0xFFFF, kind >> 16, at + 4, 8
-        if kind not in _TYPES or start + size > min(at + length, len(data)):
+    """The type and the content of each element."""
+    offset = 0
+    while offset < len(data):
+        kind, size = struct.unpack_from(f"{order}II", data, offset)
+        start, length = offset + 8, 8 + size
+        if kind >> 16:  # at most four bytes are stored in the tag itself
+            kind, size, start, length = kind & 0xFFFF, kind >> 16, offset + 4, 8
+        if kind not in _TYPES or start + size > min(offset + length, len(data)):
             raise ValueError(f"data of type {kind} and {size} bytes")
         yield kind, data[start : start + size]
-        at += length if kind == _COMPRESSED else -(-length // 8) * 8
+        offset += length if kind == _COMPRESSED else -(-length // 8) * 8

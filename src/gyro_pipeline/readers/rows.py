@@ -1,8 +1,8 @@
-"""Which rows of a table are samples.
+"""Selects the rows of a table that are samples.
 
-A recording is of one device, and its values are samples. Rows of another device or kind, rows
-without rates and rows that repeat the one before are left out before the time is read, by the
-options or where the rows themselves say so. What could be either is refused.
+A recording is of a single device. Rows of other devices or kinds, rows without rates and rows that
+repeat the previous row are left out before the time is read, by the options or by evidence in the
+rows themselves. Ambiguous files are refused.
 """
 
 import re
@@ -23,7 +23,7 @@ Mask = NDArray[np.bool_]
 Texts = NDArray[Any]
 
 MOST_VALUES = 32
-"""Of a column that says what a row is of; one of more holds measurements or counts."""
+"""Most values of a column that names devices; columns of more hold measurements or counts."""
 
 _DEVICE = re.compile(
     r"(?i)(?:^|[ _.])(?:device|dev|sensor|imu|gyro|gyroscope|board|chip|unit|module|channel|ch|"
@@ -34,53 +34,53 @@ _NUMBER_OR_FLAG = re.compile(r"(?i)[-+.\de]*|inf|-inf|true|false|t|f|yes|no|y|n|
 
 
 def sample_rows(file: File, rates: Floats) -> Mask:
-    """Rows (n,) that are samples; rates (n, 3) are the numbers of the file.
+    """Mask (n,) of the rows that are samples; rates (n, 3) are the numbers of the file.
 
     Raises:
-        InputError: No row has what the options ask for.
+        InputError: No row has the values that the options require.
     """
     keep = np.ones(len(rates), bool)
     for name, value in file.options.rows.items():
         keep &= _with_value(file, file.find(name), value, len(rates))
     _leave_out(file, keep, rates, blank_at_regular_shares, "are blank, at a regular share")
     if file.options.repeats:
-        _leave_out(file, keep, rates, repeated, "repeat the one before")
+        _leave_out(file, keep, rates, repeats_previous, "repeat the previous row")
     return keep
 
 
 def _leave_out(
     file: File, keep: Mask, rates: Floats, no_samples: Callable[[Floats], Mask], text: str
 ) -> None:
-    """Leave out rows (n,) that a check of those that are kept tells to be no samples."""
+    """Remove from the mask ``keep`` (n,) the rows that a check finds not to be samples."""
     out = no_samples(rates if keep.all() else rates[keep])
     if out.any():
-        file.note("rows", f"{out.sum()} of {len(out)} rows {text}: no samples, left out")
+        file.note("rows", f"{out.sum()} of {len(out)} rows {text}: not samples, left out")
         keep[np.flatnonzero(keep)[out]] = False
 
 
 def _with_value(file: File, number: int, value: str | float, count: int) -> Mask:
-    """Rows (count,) with a value in a column."""
+    """Mask (count,) of the rows with a value in a column."""
     codes, texts = _coded(file.table.columns[number])
-    same = np.asarray(texts == _as_text(value))[codes]
-    got = f"{_as_text(value)} in {file.listed([number])}, got {_counted(codes, texts)}"
-    if len(same) != count or not same.any():
+    mask = np.asarray(texts == _as_text(value))[codes]
+    got = f"{_as_text(value)} in {file.listed([number])}, got {_with_counts(codes, texts)}"
+    if len(mask) != count or not mask.any():
         raise file.refusal(f"expected {count} rows, some with {got}; correct rows")
     if Header(_as_text(value)).quantity not in ("", RATE):
         file.contradict(f"rows of the options pick, by its name no angular rate, {got}")
-    return same
+    return mask
 
 
 def blank_at_regular_shares(
     rates: Floats, least_share: float = 0.05, least_runs: int = 10, alike: float = 0.9
 ) -> Mask:
-    """Rows (n,) without rates that come regularly, as where another sensor has a higher rate.
+    """Mask (n,) of regularly blank rows, as in files with another sensor of a higher rate.
 
     Args:
         rates: (n, 3), NaN where blank.
-        least_share: Of the rows; fewer are losses.
-        least_runs: Of blank rows, and of others.
-        alike: Share of the runs of each that are about as long as their median; where rows are lost
-            at random, lengths scatter.
+        least_share: Least share of blank rows; fewer are losses.
+        least_runs: Least number of runs of blank rows, and of other rows.
+        alike: Least share of runs that are about as long as the median run; lengths scatter where
+            rows are lost at random.
     """
     blank = np.isnan(rates[:, 0])
     blank = blank & np.isnan(rates).all(axis=1) if blank.any() else blank
@@ -92,22 +92,22 @@ def blank_at_regular_shares(
     return blank if regular else np.zeros_like(blank)
 
 
-def repeated(rates: Floats) -> Mask:
-    """Rows (n,) whose rates (n, 3) are all those of the row before."""
+def repeats_previous(rates: Floats) -> Mask:
+    """Mask (n,) of the rows whose rates (n, 3) are all equal to those of the previous row."""
     return np.r_[False, (rates[1:] == rates[:-1]).all(axis=1)]
 
 
 def contradict_turns(file: File, used: Collection[int], keep: Mask, rates: Floats) -> None:
-    """Columns that nobody asked for, measure nothing, and say what a row is of.
+    """Contradict unused columns that tell that the rows are of several devices.
 
-    Such a column has few values: texts that come and go, those of a column that is named as a
+    Such a column has few values: texts that alternate, values of a column that is named as a
     device, or numbers with which the rates change.
 
     Args:
-        file: Gets the contradictions.
-        used: Numbers of the columns that have been asked for.
-        keep: (n,), the rows that are left.
-        rates: (m, 3), of these.
+        file: Collects the contradictions.
+        used: Numbers of the columns of measurements.
+        keep: (n,), mask of the remaining rows.
+        rates: (m, 3), rates of the remaining rows.
     """
     for number, (header, column) in enumerate(zip(file.headers, file.table.columns, strict=True)):
         measures = column.dtype.kind == "f" and (header.unit_text or header.names_time)
@@ -124,31 +124,31 @@ def contradict_turns(file: File, used: Collection[int], keep: Mask, rates: Float
             ranked = [text for q in (RATE, "") for text in texts if Header(text).quantity == q]
             pick = next((text for text in ranked if text), "…")
             file.contradict(
-                f"{file.listed([number])} takes turns among {_counted(codes, texts)}, {evidence}, "
-                "but a recording is of one device; pick its rows, such as rows: "
+                f"{file.listed([number])} alternates among {_with_counts(codes, texts)}, "
+                f"{evidence}, but a recording is of one device; pick its rows, such as rows: "
                 f"{{{file.table.names[number] or number}: {pick}}}"
             )
 
 
 def _evidence(name: str, codes: Codes, texts: Texts) -> str:
-    """What tells that the value of a row, by the codes (m,), says what it is of; or nothing."""
-    filled, rows = texts.astype(bool), np.bincount(codes)
+    """Evidence that the values, by the codes (m,) of rows, name devices; or an empty text."""
+    nonblank, rows = texts.astype(bool), np.bincount(codes)
     runs = np.bincount(codes[np.flatnonzero(np.diff(codes, prepend=-1))])
-    words = filled & [not _NUMBER_OR_FLAG.fullmatch(text) for text in texts]
-    if _DEVICE.search(name) and (filled & (rows >= len(codes) / 100)).sum() > 1:
+    words = nonblank & [not _NUMBER_OR_FLAG.fullmatch(text) for text in texts]
+    if _DEVICE.search(name) and (nonblank & (rows >= len(codes) / 100)).sum() > 1:
         return "by its name devices"
     return "which say what a row is" if (words & (runs > 2)).sum() > 1 else ""  # noqa: PLR2004
 
 
 def _change(rates: Floats, codes: Codes, least: float = 0.3, sigmas: float = 8) -> str:
-    """How rates (m, 3) change with the codes (m,) of their rows, for a message; or nothing.
+    """Evidence that rates (m, 3) change with the codes (m,) of their rows; or an empty text.
 
-    Each run of a code is compared with both of its neighbours, which takes off drift. A change is
-    more than ``least`` of the mean size of the noise, and than ``sigmas`` standard errors.
+    Each run of a code is compared with the mean of its neighbours, which removes drift. A change is
+    larger than ``least`` standard deviations of the rates, and than ``sigmas`` standard errors.
     """
     finite = np.isfinite(rates).all(axis=1)
     starts = np.flatnonzero(np.diff(codes[finite], prepend=-1))
-    if len(starts) < 32:  # noqa: PLR2004 - of fewer, a standard error says little
+    if len(starts) < 32:  # noqa: PLR2004 - the standard error of fewer is unreliable
         return ""
     level = np.clip(rates[finite], *np.quantile(rates[finite], [0.01, 0.99], axis=0))  # no spikes
     means = np.add.reduceat(level, starts) / np.diff(starts, append=finite.sum())[:, None]
@@ -164,18 +164,18 @@ def _change(rates: Floats, codes: Codes, least: float = 0.3, sigmas: float = 8) 
 
 
 def _coded(column: NDArray[Any]) -> tuple[Codes, Texts]:
-    """Of each row the number of its value, and the values as texts."""
+    """The code of each row's value, and the values by code, as texts."""
     codes, values = pd.factorize(column, use_na_sentinel=False)
     return codes, np.array([_as_text(value) for value in values], object)
 
 
 def _as_text(value: Any) -> str:
-    """A value as it is typed: 1 of 1.0; an empty text of none."""
+    """A value as a user types it: 1 for 1.0; an empty text for a missing one."""
     return "" if pd.isna(value) else f"{value:.15g}" if isinstance(value, float) else str(value)
 
 
-def _counted(codes: Codes, texts: Texts, most: int = 8) -> str:
-    """Values and how many rows have each, for a message."""
+def _with_counts(codes: Codes, texts: Texts, most: int = 8) -> str:
+    """Values with their numbers of rows, for a message."""
     pairs = zip(texts[:most], np.bincount(codes), strict=False)
-    shown = [f"{text or 'blank'} ({count} rows)" for text, count in pairs]
-    return ", ".join(shown) + (", …" if len(texts) > most else "")
+    values = [f"{text or 'blank'} ({count} rows)" for text, count in pairs]
+    return ", ".join(values) + (", …" if len(texts) > most else "")

@@ -1,7 +1,7 @@
-"""What one unit of the rates is, in deg/s.
+"""Determines the scale of the rates, deg/s per unit.
 
-The options, the header, the lines above it and the format may say so; all that say it must agree. A
-factor that the file states beside them must be that unit in one of its readings.
+The options, the header, the lines above it and the format may state the unit; all statements must
+agree. A factor that the file states as well must agree with the unit in one of its readings.
 """
 
 import re
@@ -15,7 +15,7 @@ from gyro_pipeline.units import Unit, read_unit
 
 RATE_UNITS = "deg/s, rad/s, mdps, deg/h, … or raw (with scale_dps)"
 
-# no part of a name, a date, a time of day or a count of bits
+# not part of a name, a date, a time of day or a number of bits
 _NUMBER = (
     r"(?<![\w.])(?<!\d[-:])([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(?![\w.]*\d|[-:/]\d|\s*-?bit)"
 )
@@ -32,19 +32,19 @@ _FACTOR = re.compile(r"(?i)[*×]\s*\d|\d\s*[*×]|(?<![a-z])x\d+(?![a-z\d])")
 _DPS_PER_RAD = 57.29577951308232
 
 Statement = tuple[str, Unit]
-"""Who says what the unit is, for a message, and the unit."""
+"""A statement of a unit, for a message, and the unit."""
 
 
 def scale_of(file: File, rates: Sequence[int]) -> tuple[float, bool]:
-    """deg/s, or degrees of increments, in one unit of the rates; and whether they are counts.
+    """The scale of the rates, deg/s (or degrees) per unit, and whether they are counts.
 
     Raises:
-        InputError: Nobody says the unit, or the scale of raw counts.
+        InputError: The unit, or the scale of raw counts, is not stated.
     """
     names, by_options, by_format = file.listed(rates), _of_options(file), _of_format(file, rates)
     by_file = [*_of_headers(file, rates), *_of_lines(file)]
     statements, factors = [*by_options, *by_file, *by_format], dict(_stated_factors(file, rates))
-    to_type = "".join(f"; {where}: give {_typed(dps)}" for where, dps in factors.items())
+    to_type = "".join(f"; {where}: give {_options_for(dps)}" for where, dps in factors.items())
     if not statements:
         text = f"expected a unit of the rates, got {names}; give units: {RATE_UNITS}{to_type}"
         raise file.refusal(file.contradictions[0] if file.contradictions else text)
@@ -59,22 +59,24 @@ def scale_of(file: File, rates: Sequence[int]) -> tuple[float, bool]:
             file.contradict(f"{text}; correct units")
     scale, are_counts = unit.factor, unit.quantity == "count"
     if are_counts and not by_options and scale == 1:
-        text = f"{names} are raw counts: give units: raw and scale_dps, deg/s a count{to_type},"
+        text = f"{names} are raw counts: give units: raw and scale_dps, deg/s per count{to_type},"
         raise file.refusal(text)
     for where, readings in factors.items():
-        same = [reading for reading, dps in readings.items() if isclose(dps, scale, rel_tol=1e-3)]
-        if not same:
-            file.contradict(f"{where}, but the scale is {scale:g} deg/s; give {_typed(readings)}")
+        equal = [reading for reading, dps in readings.items() if isclose(dps, scale, rel_tol=1e-3)]
+        if not equal:
+            file.contradict(
+                f"{where}, but the scale is {scale:g} deg/s; give {_options_for(readings)}"
+            )
         elif len(readings) > 1:
-            file.note("scale", f"{where}, which is taken for {same[0]}")
+            file.note("scale", f"{where}, which is taken for {equal[0]}")
     if file.options.scale_dps is None and all(_FACTOR.search(file.table.names[n]) for n in rates):
         text = f"{names} name a factor, and the scale is {scale:g} deg/s"
-        file.contradict(f"{text}; give units: raw and scale_dps, deg/s a count")
+        file.contradict(f"{text}; give units: raw and scale_dps, deg/s per count")
     return scale, are_counts
 
 
 def _agree(first: Unit, second: Unit) -> bool:
-    """Whether units are the same; one of counts may say nothing of their size."""
+    """Whether units are equal; a unit of counts may leave their scale open."""
     of_any_size = first.quantity == "count" and 1 in (first.factor, second.factor)
     alike = of_any_size or isclose(first.factor, second.factor, rel_tol=1e-6)
     return first.quantity == second.quantity and alike
@@ -97,7 +99,7 @@ def _of_format(file: File, rates: Sequence[int]) -> list[Statement]:
 
 
 def _of_headers(file: File, rates: Sequence[int]) -> Iterator[Statement]:
-    """Units in brackets and names; what is in brackets and is no unit of a rate contradicts."""
+    """Units of rates in brackets and names; other texts in brackets are contradictions."""
     headers = [file.headers[number] for number in rates]
     inner = [read_header(header.name) for header in headers if header.unit_text]
     headers += [header for header in inner if header.measures("rate")]  # gx_dps (rad/s)
@@ -114,7 +116,7 @@ def _of_headers(file: File, rates: Sequence[int]) -> Iterator[Statement]:
 
 
 def _of_lines(file: File) -> list[Statement]:
-    """The only unit of angular rate in lines above the header, but for that of a range in dps."""
+    """The only unit of angular rate in the lines above the header, apart from ranges."""
     words = re.findall(r"[^\s,;:=()\[\]\"'#%]+", file.table.preamble)
     units: dict[Unit, str] = {}
     for at, word in enumerate(words):
@@ -126,20 +128,20 @@ def _of_lines(file: File) -> list[Statement]:
             if unit and unit.quantity in ("rate", "count"):
                 units.setdefault(unit, text)
                 break
-    said = [(f"lines above the header say {text}", unit) for unit, text in units.items()]
-    return said if len(said) == 1 else []
+    statements = [(f"lines above the header say {text}", unit) for unit, text in units.items()]
+    return statements if len(statements) == 1 else []
 
 
 def _stated_factors(file: File, rates: Sequence[int]) -> Iterator[tuple[str, dict[str, float]]]:
-    """Factors on the rates that lines above the header and constant columns state.
+    """Factors of the rates in the lines above the header and in constant columns.
 
     Yields:
-        Where each is, and deg/s a count by what the factor may be.
+        The source of the factor, for messages, and deg/s per count for each reading of the factor.
     """
     above = [line[:200].strip() for line in file.table.preamble.splitlines()]
     texts = {f"a line above the header says {line!r}": line for line in above}
     for number, (name, column) in enumerate(zip(file.table.names, file.table.columns, strict=True)):
-        ends_equal = len(column) > 0 and column[0] == column[-1]  # at a glance
+        ends_equal = len(column) > 0 and column[0] == column[-1]  # a quick test
         if number not in rates and ends_equal and (column == column[0]).all():
             texts[f"column {name!r} is {column[0]}"] = f"{name}: {column[0]}"
     for where, text in texts.items():
@@ -150,23 +152,23 @@ def _stated_factors(file: File, rates: Sequence[int]) -> Iterator[tuple[str, dic
             match = None if _OF_OTHERS.search(part) else _SCALE.search(part)
             if match and (factor := abs(float(match[1] or match[2]))):
                 readings = _readings(part, factor)
-                if not isclose(readings.get("deg/s a count", 0), 1, rel_tol=1e-3):
+                if not isclose(readings.get("deg/s per count", 0), 1, rel_tol=1e-3):
                     yield where, readings
 
 
 def _readings(line: str, factor: float) -> dict[str, float]:
-    """What a factor may be, by a unit in its line; a gyroscope's count is less than 1 deg/s."""
+    """Readings of a factor, by the unit in its line; a gyroscope's count is less than 1 deg/s."""
     factor *= 1e-3 if re.search(r"(?i)mdps|m(?:illi)?(?:deg|°)", line) else 1
     in_deg = re.search(r"(?i)dps|deg|°", line)
     in_rad = not in_deg and re.search("(?i)rad", line)
     unit, size = ("rad/s", _DPS_PER_RAD) if in_rad else ("deg/s", 1)
-    readings = {f"{unit} a count": factor * size, f"counts per {unit}": size / factor}
+    readings = {f"{unit} per count": factor * size, f"counts per {unit}": size / factor}
     if not (in_deg or in_rad):
-        readings["rad/s a count"] = factor * _DPS_PER_RAD
+        readings["rad/s per count"] = factor * _DPS_PER_RAD
     return {reading: dps for reading, dps in readings.items() if dps < 1} or readings
 
 
-def _typed(readings: dict[str, float]) -> str:
-    """What to type for a factor."""
+def _options_for(readings: dict[str, float]) -> str:
+    """The options to type for each reading of a factor."""
     texts = (f"{dps:.6g} if it is {reading}" for reading, dps in readings.items())
     return "units: raw, scale_dps: " + ", or ".join(texts)

@@ -1,6 +1,6 @@
-"""The time of the samples: the first column that holds times, told by name, unit and content.
+"""Finds the column of times, by name, unit and content, and measures the sample rate.
 
-What is not known of the time is said in one finding.
+If no column of times is found, or its unit is unknown, a finding says so.
 """
 
 import re
@@ -29,7 +29,7 @@ _UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
 def timing_of(file: File, keep: Mask) -> Timing:
-    """Rate and gaps of the rows (n,) that are kept.
+    """Rate and gaps of the rows in the mask ``keep`` (n,).
 
     Raises:
         InputError: The column that the options name holds no times.
@@ -46,7 +46,7 @@ def timing_of(file: File, keep: Mask) -> Timing:
                 problem = f"{name} holds the time since the last row; give time_is: steps"
             continue
         if stepwise:
-            times = np.cumsum(np.nan_to_num(times))  # of all rows, also of those left out
+            times = np.cumsum(np.nan_to_num(times))  # over all rows, including those left out
         if _increase(times[keep], 0.0 if by_name else 0.95):
             unit_s = _unit_s(file, number, header_s)
             timing = from_stamps(times[keep], unit_s, np.flatnonzero(keep))
@@ -58,13 +58,13 @@ def timing_of(file: File, keep: Mask) -> Timing:
         raise file.refusal(f"{problem}, or correct time_column")
     file.note(
         "timestamps",
-        problem or "no column of times: rate and gaps are unseen; give time_column",
+        problem or "no column of times: rate and gaps are not measured; give time_column",
     )
     return Timing()
 
 
 def _increase(times: Floats, share: float) -> bool:
-    """Whether most times (n,) are there and increase, in more than a share of the rows."""
+    """Whether most times (n,) are valid, and increase in more than a share of the rows."""
     finite = times[np.isfinite(times)]
     if len(finite) < max(len(times) / 2, 2) or finite[-1] <= finite[0]:
         return False
@@ -72,10 +72,10 @@ def _increase(times: Floats, share: float) -> bool:
 
 
 def time_columns(file: File) -> list[tuple[int, float | None, bool]]:
-    """Columns that may be of times: number, seconds in a unit by the file, and whether by name.
+    """Candidates for columns of times: number, seconds per unit by the file, and whether by name.
 
-    The format's go first, then others in the file's order; those with a time's name and a unit
-    that nothing contradicts before the rest. A column without such a name must increase.
+    The format's columns come first, then the others in order; columns with a name of times and an
+    uncontradicted unit come before the rest. A column without such a name must increase.
     """
     times, column = file.form.times if file.form else (), file.options.time_column
     by_format = {n: unit_s for name, unit_s in times for n in find_all(file.table, name)}
@@ -93,13 +93,13 @@ def time_columns(file: File) -> list[tuple[int, float | None, bool]]:
 
 
 def stated_unit_s(file: File) -> float | None:
-    """Seconds in the options' unit of time."""
+    """Seconds per unit of time, by the options."""
     units = file.options.time_units
     return (read_unit(units) or Unit("time")).factor if isinstance(units, str) else units
 
 
 def _unit_s(file: File, number: int, header_s: float | None) -> float | None:
-    """Seconds in a unit of a time column; options, header and a line above it may state it."""
+    """Seconds per unit of a time column, by the options, the header or a line above it."""
     if file.table.columns[number].dtype.kind != "f":
         return 1.0
     name, match = file.listed([number]), _TIME_SCALE.search(file.table.preamble)
@@ -110,7 +110,7 @@ def _unit_s(file: File, number: int, header_s: float | None) -> float | None:
         "a line above the header says": line_s,
     }.items():
         if unit_s and stated_s and not isclose(stated_s, unit_s):
-            text = f"a unit of {stated_s:g} s, but it is read in {unit_s:g} s; correct time_units"
+            text = f"a unit of {stated_s:g} s, but {unit_s:g} s is used; correct time_units"
             file.contradict(f"{where} {text}")
     if not unit_s:
         text = f"{name} has no unit: the rate is not measured; give time_units"
@@ -124,7 +124,7 @@ def _contradict_rate(
     file: File, number: int, hz: float | None, unit_s: float | None,
     slow: float = 0.1, fast: float = 2e4,
 ) -> None:  # fmt: skip
-    """A rate at which no gyroscope is read, and the units that make an ordinary one."""
+    """Contradict an implausible rate, and suggest the units that make a plausible one."""
     if hz and unit_s and not slow <= hz <= fast:
         rates = {u: hz * unit_s / s for u, s in _UNITS_S.items() if 1 <= hz * unit_s / s < fast}
         units = [f"time_units: {unit}, which makes {rate:.6g} Hz" for unit, rate in rates.items()]
@@ -135,7 +135,7 @@ def _contradict_rate(
 
 
 def counted_gaps(file: File, keep: Mask) -> Rows:
-    """Gaps by the packet counter of the options or the format; it counts the rows of the file."""
+    """Gaps by the packet counter of the options or the format, which counts rows of the file."""
     name, bits = file.form.counter if file.form else ("", 16)
     numbers = find_all(file.table, name) if name else []
     if file.options.counter_column is not None:
@@ -151,13 +151,13 @@ def counted_gaps(file: File, keep: Mask) -> Rows:
 
 
 def compare_rates(file: File, rate_hz: float | None, expected_hz: float | None, keep: Mask) -> None:
-    """Rates that differ by more than the tolerance: measured, expected, stated above the header."""
+    """Compare the measured or expected rate with the expected one and with a stated one."""
     tolerance = file.options.rate_tolerance_pct / 100
     if rate_hz and expected_hz and abs(rate_hz / expected_hz - 1) > tolerance:
         got = f"{expected_hz:g} Hz within {100 * tolerance:g} %, got {rate_hz:.6g} Hz"
         advice = "check time_units, and the sensor's rate_hz, or samples and recording_s"
         file.note("sample rate", f"expected {got}; {advice}", REJECTED)
-    # it is stated of the file's rows, not of those that are left of them
+    # a stated rate is that of all rows of the file
     match = _STATED_RATE.search(file.table.preamble) if keep.all() else None
     stated_hz = float(match[1]) * (1e3 if match[2] else 1) if match else None
     hz, source = (rate_hz, "measured") if rate_hz else (expected_hz, "expected")

@@ -1,7 +1,7 @@
-"""Stored arrays and columns as a table: NumPy, MATLAB, HDF5 and Parquet.
+"""Reads arrays and columns of NumPy, MATLAB, HDF5 and Parquet files as a table.
 
-A recording has more samples than columns: the longer side of an array is that of its rows. What
-reads a kind of files is imported with the first of them, as most files are texts.
+A recording has more samples than columns, so the longer side of an array is its rows. Libraries are
+imported where they are used, as most files are texts.
 """
 
 import zipfile
@@ -23,7 +23,7 @@ from gyro_pipeline.readers.table import IN_READER, Reader, Table, column
 def check_claim(path: Path, size: float, options: ReaderOptions) -> None:
     """Refuse a file whose values would take more bytes of memory than the options allow.
 
-    A few bytes can claim any number of values, so this is asked before room is made for them.
+    A small file can claim any number of values, so this is checked before they are read.
     """
     if size > 1e6 * options.largest_mb:
         raise InputError(
@@ -33,7 +33,7 @@ def check_claim(path: Path, size: float, options: ReaderOptions) -> None:
 
 
 def read_parquet(path: Path, options: ReaderOptions) -> Table:
-    """Read columns."""
+    """Read the columns of a Parquet file."""
     import pyarrow as pa  # noqa: PLC0415
     import pyarrow.parquet as pq  # noqa: PLC0415
 
@@ -48,26 +48,26 @@ def read_parquet(path: Path, options: ReaderOptions) -> Table:
 
 
 def read_npy(path: Path, options: ReaderOptions) -> Table:
-    """Read an array, of columns or of named fields."""
-    # maps the file, so that a damaged header cannot ask for more memory than there is
+    """Read the array of a ``.npy`` file, with columns or named fields."""
+    # mapped, so that a damaged header cannot claim more memory than exists
     return _of_arrays(path, {"": np.lib.format.open_memmap(path, mode="r")}, options)
 
 
 def read_zip(path: Path, options: ReaderOptions) -> Table:
-    """Read the named arrays of ``.npz``; those of objects are never unpickled."""
+    """Read the arrays of a ``.npz`` file; objects are never unpickled."""
     with zipfile.ZipFile(path) as archive:
         members = archive.namelist()
         size = sum(member.file_size for member in archive.infolist())
     if "[Content_Types].xml" in members:
         raise InputError(f"{path}: expected a recording, got an Excel workbook; save it as CSV")
     if not members or not all(name.endswith(".npy") for name in members):
-        shown = ", ".join(members[:5])
-        raise InputError(f"{path}: expected a recording, got a zip archive ({shown}); unpack it")
+        files = ", ".join(members[:5])
+        raise InputError(f"{path}: expected a recording, got a zip archive ({files}); unpack it")
     check_claim(path, size, options)
     arrays: dict[str, NDArray[Any]] = {}
     with np.load(path, allow_pickle=False) as stored:
         for name in stored:
-            with suppress(ValueError):  # of objects; damage is a BadZipFile
+            with suppress(ValueError):  # raised for objects; damage raises BadZipFile
                 arrays[name] = stored[name]
     return _of_arrays(path, arrays, options)
 
@@ -83,7 +83,7 @@ def read_mat(path: Path, options: ReaderOptions) -> Table:
 
 
 def read_hdf5(path: Path, options: ReaderOptions) -> Table:
-    """Read HDF5, as MATLAB 7.3 writes it too; groups named ``#…`` are what its cells refer to."""
+    """Read HDF5, also of MATLAB 7.3, whose cells refer to groups named ``#…``."""
     import h5py  # noqa: PLC0415
 
     datasets: list[Any] = []
@@ -98,7 +98,7 @@ def read_hdf5(path: Path, options: ReaderOptions) -> Table:
             if data.external or data.is_virtual:
                 raise InputError(
                     f"{path}: expected a recording, got {data.name}, whose values are in another "
-                    "file, which is not opened; copy them into this one"
+                    "file, which is not opened; copy them into this file"
                 )
         check_claim(path, sum(8.0 * data.size for data in datasets), options)
         arrays = {data.name[1:].replace("/", "."): np.asarray(data[()]) for data in datasets}
@@ -113,13 +113,13 @@ READERS: dict[bytes, Reader] = {
     b"MATLAB 7.3": read_hdf5,
     b"MATLAB ": read_mat,
 }
-"""By the first bytes of a file."""
+"""Readers by the first bytes of a file."""
 
 
 def _of_arrays(path: Path, stored: Mapping[str, Any], options: ReaderOptions) -> Table:
-    """Name columns: ``t`` of a vector, ``gyro.x`` of three columns, ``all.0`` of more.
+    """Name the columns of arrays: ``t`` for a vector, ``gyro.x`` for three columns, else ``all.0``.
 
-    What is in fields of arrays or structures is named by them: ``log.gyro`` is ``gyro`` of ``log``.
+    Fields of arrays and structures are named by their path: ``log.gyro`` is ``gyro`` in ``log``.
     """
     arrays = dict(_arrays_in(stored, ""))
     check_claim(path, sum(8.0 * array.size for array in arrays.values()), options)
@@ -136,16 +136,16 @@ def _of_arrays(path: Path, stored: Mapping[str, Any], options: ReaderOptions) ->
         for label, values in zip(labels, rows.T, strict=True):
             columns[f"{name}.{label}".strip(".")] = column(values)
     if not any(values.dtype == np.float64 for values in columns.values()):
-        shown = ", ".join(f"{a.dtype} {a.shape} {name}".rstrip() for name, a in arrays.items())
+        shapes = ", ".join(f"{a.dtype} {a.shape} {name}".rstrip() for name, a in arrays.items())
         raise InputError(
-            f"{path}: expected arrays of numbers with a row a sample, such as (n, 3), got "
-            f"{shown or 'none'}; arrays of objects are not read: save their columns as arrays"
+            f"{path}: expected arrays of numbers with a row per sample, such as (n, 3), got "
+            f"{shapes or 'none'}; arrays of objects are not read: save their columns as arrays"
         )
     return Table(str(path), tuple(columns), tuple(columns.values()))
 
 
 def _arrays_in(stored: Any, name: str) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Arrays in arrays of fields and in mappings, by the names that lead to them."""
+    """Arrays in arrays of fields and in mappings, with their dotted paths."""
     if isinstance(stored, np.ndarray) and stored.dtype.names is None:
         yield name, stored
     elif isinstance(stored, np.ndarray | Mapping):

@@ -1,6 +1,6 @@
-"""Any file as a table: named columns, of numbers or texts. Nothing here knows of gyroscopes.
+"""Reads any file as a table of named columns of numbers or texts.
 
-A file is a table, or the option ``row`` makes it one. What a file is, its first bytes tell.
+The first bytes of a file determine its type. Nothing here is specific to gyroscopes.
 """
 
 import io
@@ -27,18 +27,18 @@ _NUMBER = r"^[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|(?i:inf|infinity|nan))$"
 
 @dataclass(frozen=True)
 class Table:
-    """A file as named columns, all of them read.
+    """A file as named columns.
 
     Attributes:
-        where: Path of the file, for messages, and what may be wrong with its names.
-        names: The header, with units in brackets where a row of units gives them;
-            an empty string for each column that it says nothing of.
+        where: Path of the file, with a hint if its names may be misread, for messages.
+        names: The header, with units in brackets if the file has a row of units; an empty text for
+            each column without a name.
         columns: Each (n,): float64, with NaN where a value is missing or cannot be read; objects,
-            str or None, of a column of texts; or datetime64[ns] or timedelta64[ns]. The columns of
-            stored arrays are as long as their arrays, which can differ.
+            str or None, for texts; or datetime64[ns] or timedelta64[ns]. The lengths of stored
+            arrays can differ.
         preamble: Lines above the header.
-        findings: Of the reading.
-        place: Where a row is, for messages: ``row 5 (line 12)``, the row from 0.
+        findings: Findings of the reader.
+        position: Position of a row, for messages: ``row 5 (line 12)``, rows count from 0.
     """
 
     where: str
@@ -46,19 +46,19 @@ class Table:
     columns: tuple[NDArray[Any], ...]
     preamble: str = ""
     findings: tuple[Finding, ...] = ()
-    place: Callable[[int], str] = "row {}".format
+    position: Callable[[int], str] = "row {}".format
 
     def listed(self) -> str:
         """The first thirty names, for a message."""
-        shown = ", ".join(repr(name[:40]) for name in self.names[:30])
+        names = ", ".join(repr(name[:40]) for name in self.names[:30])
         more = ", …" * (len(self.names) > 30)  # noqa: PLR2004
-        return shown + more if any(self.names) else "no header"
+        return names + more if any(self.names) else "no header"
 
     def numbers(self, column: int) -> NDArray[np.float64]:
-        """The values of a column, (n,), for whoever needs numbers.
+        """The values of a column of numbers, (n,).
 
         Raises:
-            InputError: The column is of texts or dates; says where the first is.
+            InputError: The column holds texts or dates; the message says where the first is.
         """
         values = self.columns[column]
         if values.dtype == np.float64:
@@ -67,12 +67,12 @@ class Table:
         if values.dtype != object:
             raise InputError(f"{expected}, got {values.dtype}")
         texts = {row: text for row, text in enumerate(values) if text is not None}
-        # where commas are decimal, a point is what makes a text of a number
+        # with decimal commas, numbers with a point are texts
         bad = {n: text for n, text in texts.items() if not re.match(_NUMBER, text)} or texts
         row, text = next(iter(bad.items()))
         raise InputError(
-            f"{expected}, without thousands separators, got {text[:40]!r} in {self.place(row)}, "
-            f"{len(bad)} of {len(values)} rows are like it; export the file anew, or give other "
+            f"{expected}, without thousands separators, got {text[:40]!r} in {self.position(row)}, "
+            f"{len(bad)} of {len(values)} rows are like it; export the file again, or give other "
             f"columns, or `row:` {IN_READER}"
         )
 
@@ -90,30 +90,34 @@ def column(values: NDArray[Any]) -> NDArray[Any]:
 def columns_of(
     names: Sequence[str], texts: Sequence[Any], decimal_point: str = "."
 ) -> tuple[tuple[NDArray[Any], ...], dict[int, str]]:
-    """Columns of Arrow strings or numbers; and what is no number in those of numbers, by row."""
+    """Columns from Arrow strings or numbers, and the texts in columns of numbers, by row."""
     columns, damage = [], dict[int, str]()
     for number, (name, cells) in enumerate(zip(names, texts, strict=True)):
-        values, unread = _of_texts(cells, decimal_point)
+        values, unreadable_cells = _of_texts(cells, decimal_point)
         columns.append(values)
-        damage |= {n: f"{text[:40]!r} in {name or number!r}" for n, text in unread.items()}
+        damage |= {
+            row: f"{text[:40]!r} in {name or number!r}" for row, text in unreadable_cells.items()
+        }
     return tuple(columns), damage
 
 
-def unreadable(damage: dict[int, str], rows: int, place: Callable[[int], str]) -> Iterator[Finding]:
-    """Say which of the rows cannot be read, wholly or in a cell, if any."""
+def unreadable(
+    damage: dict[int, str], rows: int, position: Callable[[int], str]
+) -> Iterator[Finding]:
+    """A finding about the rows that cannot be read, wholly or in a cell, if any."""
     if damage:
-        first = "; ".join(f"{place(row)}: {text}" for row, text in sorted(damage.items())[:3])
+        first = "; ".join(f"{position(row)}: {text}" for row, text in sorted(damage.items())[:3])
         detail = f"{len(damage)} of {rows} rows cannot be read and are NaN, or a cell of them: "
         yield Finding("unreadable rows", KEPT, detail + first + ", …" * (len(damage) > 3))  # noqa: PLR2004
 
 
 def _of_texts(texts: Any, decimal_point: str = ".") -> tuple[NDArray[Any], dict[int, str]]:
-    """Arrow strings as numbers, if almost all of them are, else as texts.
+    """Convert Arrow strings to numbers if almost all are numbers, else to texts.
 
-    Numbers with separators of thousands are texts; so are those with a point beside decimal commas.
+    Numbers with thousands separators, or with a point where commas are decimal, are texts.
 
     Returns:
-        The column, and the texts in a column of numbers, by row, which are NaN in it.
+        The column, and the texts, by row, that are NaN in a column of numbers.
     """
     if not pa.types.is_string(texts.type) or texts.null_count == len(texts):
         return texts.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False), {}
@@ -126,12 +130,12 @@ def _of_texts(texts: Any, decimal_point: str = ".") -> tuple[NDArray[Any], dict[
     if 2 * len(bad) >= len(texts) - texts.null_count > 0 or not few(len(bad), len(texts)):
         return texts.to_numpy(zero_copy_only=False), {}
     values = pc.if_else(good, points, None).cast(pa.float64())
-    unread = dict(zip(bad.tolist(), texts.take(pa.array(bad)).to_pylist(), strict=True))
-    return values.to_numpy(zero_copy_only=False), unread
+    bad_texts = dict(zip(bad.tolist(), texts.take(pa.array(bad)).to_pylist(), strict=True))
+    return values.to_numpy(zero_copy_only=False), bad_texts
 
 
 def few(bad: int, rows: int, least: int = 3, share: float = 0.01) -> bool:
-    """Whether so few rows are damaged that the others are trusted."""
+    """Whether the number of damaged rows is so small that the others are reliable."""
     return bad <= max(least, share * rows)
 
 
@@ -150,13 +154,13 @@ _ADVICE = {
 
 
 def read_table(path: Path, options: ReaderOptions) -> Table:
-    """Read a file, whichever way it is stored.
+    """Read a file of any supported type.
 
     Raises:
-        InputError: It cannot be read, is damaged or empty, is no table, or is of a kind that is
-            not read; says what to do.
+        InputError: The file is unreadable, damaged, empty, not a table, or of an unsupported type;
+            the message says what to do.
     """
-    from gyro_pipeline.readers import stored, text, vehicles  # noqa: PLC0415 - they make tables
+    from gyro_pipeline.readers import stored, text, vehicles  # noqa: PLC0415 - import this module
 
     head, readers = _head(path), stored.READERS | vehicles.READERS
     read = next((read for magic, read in readers.items() if head.startswith(magic)), None)
@@ -171,27 +175,27 @@ def read_table(path: Path, options: ReaderOptions) -> Table:
     except ImportError as error:
         message = f"expected the library {error.name}, which is not installed; type"
         raise InputError(f"{path}: {message} pip install -e '.[logs]'") from error
-    except Exception as error:  # each library has its own ways to fail at damaged bytes
+    except Exception as error:  # libraries raise many exceptions for damaged bytes
         raise InputError(
             f"{path}: is damaged, cut or of an unknown version ({type(error).__name__}: "
-            f"{str(error)[:200]}); copy the file anew, a bag with its metadata.yaml, or save its "
-            "columns of numbers alone"
+            f"{str(error)[:200]}); copy the file again, a bag with its metadata.yaml, or save only "
+            "its columns of numbers"
         ) from error
 
 
 def _head(path: Path) -> bytes:
-    """The first bytes of a file; of a folder that is a bag of ROS 2, those of a bag."""
+    """The first bytes of a file; for a folder that is a bag of ROS 2, those of a bag."""
     try:
         if (path / "metadata.yaml").exists():
             return b"#ROSBAG"
-        if path.exists() and not (path.is_file() or path.is_dir()):  # a pipe may wait for ever
+        if path.exists() and not (path.is_file() or path.is_dir()):  # reading a pipe may hang
             raise InputError(f"{path}: expected a file, got a pipe, a socket or a device")
         with path.open("rb") as file:
             head = file.read(64)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     if not head:
-        raise InputError(f"{path}: expected a recording, got an empty file; copy it anew")
+        raise InputError(f"{path}: expected a recording, got an empty file; copy it again")
     kind = b"RDX" if path.suffix.lower() in (".rda", ".rdata", ".rds") else head  # compressed
     for magic, advice in _ADVICE.items():
         if kind.startswith(magic):

@@ -1,7 +1,7 @@
-"""Columns of times as seconds.
+"""Converts columns of times to seconds.
 
-Time is told by content: under any name, a column is one of times if most of its cells read so, of
-a hundred that are tried.
+Times are recognised by content: a column of texts, whatever its name, is a column of times if most
+of a hundred sampled cells match the form of a time.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-# RE2 is quick with five groups at most, of which no two can match the same text
+# RE2 is fast with at most five groups, no two of which can match the same text
 _S = r"(?P<s>\d\d?(?:[.,:]\d{1,12})?)(?P<tail>\s*[A-Za-z. ]{0,8}(?:[+-]\d[\d:]*)?\s*)$"
 _FORMS = [
     r"^\s*(?P<date>)(?P<h>\d+):(?P<m>\d\d?):" + _S,
@@ -22,15 +22,15 @@ _TAIL = r"^\s*(?:(?P<half>[ap])\.?m)?[^+-]*(?P<h>[+-]\d\d?)?:?(?P<m>\d\d)?"
 
 
 def seconds(column: NDArray, unit_s: float | None) -> NDArray[np.float64] | None:
-    """Read a column as times in seconds, from any origin.
+    """Convert a column to times in seconds from any origin.
 
     Args:
         column: (n,), numbers, texts (None: missing), ``datetime64`` or ``timedelta64``.
-        unit_s: Seconds in one unit of numbers; without it, numbers are no times.
+        unit_s: Seconds per unit of numbers; None: numbers are not times.
 
     Returns:
-        (n,), NaN where a cell is no time; None where most are none, or can be read in two ways. A
-        time of day goes on at midnight, and one of minutes and seconds at the full hour.
+        (n,), NaN where a cell is not a time; None if most cells are not times, or are ambiguous. A
+        time of day continues after midnight, and one of minutes and seconds after the full hour.
     """
     if column.dtype.kind in "fiu":
         return None if unit_s is None else np.asarray(column * unit_s, float)
@@ -50,13 +50,13 @@ def seconds(column: NDArray, unit_s: float | None) -> NDArray[np.float64] | None
 
 
 def are_steps(values: NDArray[np.float64]) -> bool:
-    """Whether a column holds the time since the last row, which falls as often as it rises.
+    """Whether a column holds times since the previous row, which fall as often as they rise.
 
     Args:
         values: (n,), in any unit; NaN: missing.
     """
     values = values[np.isfinite(values)]
-    change = np.diff(values[1:])  # a first row has no last one, so it may hold anything
+    change = np.diff(values[1:])  # the first row has no previous one, so its value is arbitrary
     rises, falls = np.count_nonzero(change > 0), np.count_nonzero(change < 0)
     if not len(change) or rises > 3 * falls or falls > 3 * rises:
         return False
@@ -64,10 +64,10 @@ def are_steps(values: NDArray[np.float64]) -> bool:
 
 
 def _of_parts(parts: dict[str, pa.Array]) -> NDArray[np.float64] | None:
-    """Seconds (n,) of the parts of texts, each (n,); None where they can be read in two ways."""
+    """Seconds (n,) from the parts of texts, each (n,); None if they are ambiguous."""
     hours, minutes = _numbers(parts["h"]), _numbers(parts["m"])
     if np.isnan(hours).all() and not pc.any(pc.match_substring_regex(parts["s"], r"\D")).as_py():
-        return None  # 09:50 may be hours and minutes
+        return None  # 09:50 may be hours and minutes, or minutes and seconds
     period = 3600 if np.isnan(hours).all() else 86_400
     codes, tails = pd.factorize(parts["tail"].to_numpy(False))
     tail = pd.Series(tails, dtype=object).str.lower().str.extract(_TAIL)
@@ -77,17 +77,17 @@ def _of_parts(parts: dict[str, pa.Array]) -> NDArray[np.float64] | None:
     zone_h, zone_m = (tail[name].fillna("0").astype(float).to_numpy()[codes] for name in "hm")
     times -= 3600 * zone_h + 60 * np.copysign(zone_m, zone_h)
     codes, dates = pd.factorize(parts["date"].to_numpy(False))
-    read = np.isfinite(times)
+    valid = np.isfinite(times)
     if len(dates) == 1:
-        times[read] += period * np.cumsum(np.diff(times[read], prepend=0.0) < -period / 2)
+        times[valid] += period * np.cumsum(np.diff(times[valid], prepend=0.0) < -period / 2)
         return times
-    # of day and month, the right order is the one in which the recording is short
+    # the right order of day and month is the one that makes the recording short
     orders = (_days(pd.Series(dates), first)[codes] + times for first in (False, True))
-    return min(orders, key=lambda t: (np.isnan(t).sum(), np.abs(np.diff(t[read])).sum()))
+    return min(orders, key=lambda t: (np.isnan(t).sum(), np.abs(np.diff(t[valid])).sum()))
 
 
 def _decimal(texts: pa.Array) -> NDArray[np.float64]:
-    """Seconds such as 5.02 or 5,02; behind a colon is a count: of varying width, 5 is 005."""
+    """Seconds such as 5.02, 5,02 or 5:02; after a colon, if widths vary, 5 stands for 005."""
     if not pc.any(pc.match_substring(texts, ":")).as_py():
         return _numbers(pc.replace_substring(texts, ",", "."))
     whole, digits = pc.extract_regex(texts, r"^(?P<s>\d+):(?P<count>\d+)$").flatten()
@@ -101,6 +101,6 @@ def _numbers(texts: pa.Array) -> NDArray[np.float64]:
 
 
 def _days(dates: pd.Series, day_first: bool) -> NDArray[np.float64]:
-    """Seconds from the first date to each, NaN where it is none and behind them."""
+    """Seconds from the first date to each, NaN for texts that are not dates, then a NaN."""
     days = pd.to_datetime(dates, errors="coerce", format="mixed", dayfirst=day_first)
     return np.append((days - days.min()).dt.total_seconds().to_numpy(float), np.nan)

@@ -1,7 +1,7 @@
-"""Logs of vehicles as tables: PX4's ULog, ArduPilot's DataFlash, bags of ROS 1 and 2.
+"""Reads logs of vehicles as tables: PX4's ULog, ArduPilot's DataFlash, bags of ROS 1 and 2.
 
-These hold many topics, each perhaps of several devices, and a table is of one. Which one is never
-guessed: where several have angular rates, options pick. The libraries are an extra of the package.
+These logs have many topics, possibly of several devices. If several have angular rates, the options
+must pick one. The libraries are an extra of the package.
 """
 
 import re
@@ -18,10 +18,10 @@ from gyro_pipeline.parameters import ReaderOptions
 from gyro_pipeline.readers.table import IN_READER, Reader, Table
 
 Stream = tuple[str, int | None]
-"""A topic, and the instance of it in formats that number devices."""
+"""A topic, and the number of the device in formats that have one."""
 
 PX4 = ("sensor_gyro", "sensor_combined", "vehicle_angular_velocity")
-"""Topics with rates (https://docs.px4.io/main/en/msg_docs): the first one that is there is read."""
+"""Topics with rates (https://docs.px4.io/main/en/msg_docs); the first in a log is read."""
 NAMES = {
     "time [us]": "timestamp timestamp_sample TimeUS SampleUS",
     "gyro.x [rad/s]": "x gyro_rad[0] xyz[0] GyrX",
@@ -32,11 +32,11 @@ NAMES = {
     "accel.z [m/s^2]": "accelerometer_m_s2[2] AccZ",
     "temperature [degC]": "temperature T",
 }
-"""Columns of a table, and the fields that hold them, of which the last that is there counts."""
+"""Columns of a table, and their fields in logs; the last existing field counts."""
 
 
 def read_px4(path: Path, options: ReaderOptions) -> Table:
-    """Read a ULog."""
+    """Read a ULog of PX4."""
     from pyulog import ULog  # noqa: PLC0415 - an extra
 
     log = ULog(str(path), list(PX4))
@@ -46,7 +46,7 @@ def read_px4(path: Path, options: ReaderOptions) -> Table:
     findings = []
     if stream[0] != PX4[0]:
         text = (
-            f"{stream[0]} holds rates freed of the autopilot's bias; {PX4[0]} is the sensor's own"
+            f"{stream[0]} holds rates minus the autopilot's bias; {PX4[0]} has the sensor's rates"
         )
         findings.append(Finding("corrected rates", KEPT, text))
     if log.file_corruption:
@@ -59,7 +59,7 @@ def read_ardupilot(path: Path, options: ReaderOptions) -> Table:
     from pymavlink.DFReader import DFReader_binary  # noqa: PLC0415 - an extra
 
     class Log(DFReader_binary):
-        init_arrays_fast = DFReader_binary.init_arrays  # what the fast one prints cannot be caught
+        init_arrays_fast = DFReader_binary.init_arrays  # the fast one prints from C
 
     log = Log(str(path))
     streams: dict[Stream, list[dict[str, Any]]] = {}
@@ -67,7 +67,7 @@ def read_ardupilot(path: Path, options: ReaderOptions) -> Table:
     while names and (message := log.recv_match(type=names)):
         fields = message.to_dict()
         streams.setdefault((message.get_type(), fields.get("I", 0)), []).append(fields)
-    text = "the autopilot has taken off the bias that it measured at its start (INS_GYR…OFFS)"
+    text = "the autopilot has subtracted the bias measured at its start (INS_GYR…OFFS)"
     rows = pd.DataFrame(streams[_pick(path, options, streams)])
     return _table(path, rows, [Finding("corrected rates", KEPT, text)])
 
@@ -91,7 +91,7 @@ def read_ros(path: Path, options: ReaderOptions) -> Table:
             rows.append([getattr(vector, axis) for vector in vectors for axis in AXES])
     names, times = list(NAMES)[1:7], np.array(stamps_ns, np.int64)
     values = np.array(rows, float).reshape(len(rows), len(names))
-    since_s = (times - times[:1]) / 1e9  # from the first: float64 would round nanoseconds of today
+    since_s = (times - times[:1]) / 1e9  # relative, as float64 cannot hold today's nanoseconds
     return Table(str(path), ("time [s]", *names), (since_s, *values.T))
 
 
@@ -102,11 +102,11 @@ READERS: dict[bytes, Reader] = {
     b"\x89MCAP": read_ros,
     b"SQLite format 3": read_ros,
 }
-"""By the first bytes of a file."""
+"""Readers by the first bytes of a file."""
 
 
 def _table(path: Path, rows: Any, findings: list[Finding]) -> Table:
-    """The table of the fields that a mapping has, each (n,)."""
+    """The table of all known fields of a mapping, each (n,)."""
     columns = {
         name: np.asarray(rows[field], np.float64)
         for name, fields in NAMES.items()
@@ -120,7 +120,7 @@ def _pick(path: Path, options: ReaderOptions, streams: Iterable[Stream]) -> Stre
     """The only topic and instance with angular rates that the options allow.
 
     Raises:
-        InputError: There is none, or more than one; names them all.
+        InputError: No topic, or more than one, is allowed; the message lists them all.
     """
     topic, instance, allowed, listed = options.topic, options.instance, [], []
     for name, number in streams:

@@ -1,1 +1,1 @@
-"""How estimates are judged: which truth, which error, which figure of merit with which interval."""
+"""Scores of estimates: truths, errors, figures of merit and their intervals."""

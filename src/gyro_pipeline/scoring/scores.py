@@ -1,13 +1,13 @@
-"""From squared errors to RMSE, time saving and accuracy gain, with intervals over recordings.
+"""RMSE, time saving and accuracy gain from squared errors, with intervals over recordings.
 
-Squared errors are pooled over windows, axes and recordings; signed errors are never averaged
-first, which would make even the running mean look several times better.
+Squared errors are pooled over windows, axes and recordings. Signed errors are never averaged
+first, as this would make even the running mean look several times better.
 
-Intervals are jackknife-t intervals (Tukey 1958; Efron & Stein 1981, Annals of Statistics 9): every
-figure is computed again without each recording in turn, since windows and axes of one recording
-share its history, and its standard error follows from how much these differ. Positive figures, such
-as the ratio of two RMSEs, have it in the logarithm. How often they hold the truth:
-benchmarks/coverage.py.
+Intervals are jackknife-t intervals (Tukey 1958; Efron & Stein 1981, Annals of Statistics 9). Every
+figure is computed again without each recording in turn, since the windows and axes of a recording
+share its history; the scatter of these values gives the standard error. Intervals of positive
+figures, such as a ratio of two RMSEs, are computed in the logarithm. benchmarks/coverage.py
+measures how often they contain the truth.
 """
 
 from collections.abc import Sequence
@@ -25,13 +25,13 @@ CONFIDENCE_PCT = 95
 
 @dataclass(frozen=True)
 class SquaredErrors:
-    """Sums of squared errors by recording, and how many squares each sum holds.
+    """Sums of squared errors by recording.
 
     Attributes:
         sums: (deg/s)^2, shape (recordings,) or (recordings, times).
-        counts: Same shape.
-        exact: Whether the truth is; otherwise its own noise was taken off, and sums may be
-            negative.
+        counts: Number of squares in each sum, same shape.
+        exact: Whether the truth is exact; otherwise the variance of its noise was subtracted, and
+            sums may be negative.
     """
 
     sums: np.ndarray
@@ -47,13 +47,13 @@ class SquaredErrors:
         Returns:
             Shape (n,) or (n, times).
         """
-        with np.errstate(invalid="ignore"):  # recordings of which every such window was dropped
+        with np.errstate(invalid="ignore"):  # recordings whose windows were all dropped
             return (weights @ self.sums) / (weights @ self.counts)
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value with its 95 % interval; the ends are None where the data carry no interval."""
+    """A value with its 95 % interval; the ends are None where the data do not allow an interval."""
 
     value: float
     lo: float | None = None
@@ -61,24 +61,24 @@ class Estimate:
 
 
 def clusters(table: pd.DataFrame) -> pd.Series:
-    """What intervals leave out as a whole: recordings, or devices where several are tested.
+    """The units that a jackknife leaves out: recordings, or devices where several are tested.
 
-    Windows of a recording share its history, and recordings of an unseen device its prior.
+    Windows of a recording share its history, and recordings of an unseen device share its prior.
 
     Args:
-        table: Errors or curves; their columns ``recording`` and, if there, ``imu``.
+        table: Errors or curves, with the column ``recording`` and, optionally, ``imu``.
     """
     several = "imu" in table and table.imu.nunique() > 1
     return table.imu if several else table.recording
 
 
 def squared_errors(errors: pd.DataFrame, truth: str, windows: str) -> SquaredErrors:
-    """Squares of the chosen errors by recording (or device, see :func:`clusters`), in order.
+    """Squared errors by recording (or device, see :func:`clusters`), in order.
 
     Args:
         errors: Columns ``recording, window, truth, error_dps, truth_variance``; several runs of
             the same windows (seeds, folds) may be concatenated.
-        truth: One of the truths.
+        truth: Name of the truth.
         windows: ``first`` or ``all``.
     """
     chosen = (errors.truth == truth).to_numpy(bool)
@@ -86,10 +86,10 @@ def squared_errors(errors: pd.DataFrame, truth: str, windows: str) -> SquaredErr
         chosen = chosen & (errors.window.to_numpy() == 0)
     variance = errors.truth_variance.to_numpy()[chosen]
     squares = errors.error_dps.to_numpy()[chosen] ** 2 - variance
-    _, places = np.unique(clusters(errors).to_numpy()[chosen], return_inverse=True)
-    counts = np.bincount(places)
-    # summed like the running-mean curve, which has the same sums at the window
-    sums = [squares[places == place].sum() for place in range(counts.size)]
+    _, cluster = np.unique(clusters(errors).to_numpy()[chosen], return_inverse=True)
+    counts = np.bincount(cluster)
+    # summed in the same order as the running-mean curve, so that both agree at the window
+    sums = [squares[cluster == index].sum() for index in range(counts.size)]
     return SquaredErrors(np.array(sums), counts, exact=not variance.any())
 
 
@@ -99,14 +99,14 @@ class Curve:
 
     Attributes:
         times_s: Shape (times,), increasing, seconds.
-        squares: With shapes (recordings, times).
+        squares: With sums and counts of shape (recordings, times).
     """
 
     times_s: np.ndarray
     squares: SquaredErrors
 
     def of(self, weights: np.ndarray) -> "WeightedCurve":
-        """The curve for each weighting of the recordings, from :func:`leave_one_out`."""
+        """The curve for each weighting of the recordings (:func:`leave_one_out`)."""
         squares = np.maximum(np.nan_to_num(self.squares.mean(weights)), 0.0)
         return WeightedCurve(self.times_s, np.sqrt(squares), self.squares.counts.sum(axis=0))
 
@@ -117,8 +117,8 @@ class WeightedCurve:
 
     Attributes:
         times_s: Shape (times,), increasing, seconds.
-        rmse: Shape (n, times), deg/s; the first row is that of all recordings.
-        counts: Of squares at each time, shape (times,).
+        rmse: Shape (n, times), deg/s; the first row is for all recordings.
+        counts: Number of squares at each time, shape (times,).
     """
 
     times_s: np.ndarray
@@ -127,49 +127,48 @@ class WeightedCurve:
 
     @cached_property
     def falling(self) -> np.ndarray:
-        """RMSE of all recordings, made to fall strictly but for stretches at its ends, (times,).
+        """A monotone fit to the RMSE of all recordings, strictly falling but at its ends, (times,).
 
         A measured curve is rough, and its first crossing of a level may be chance. Neighbours that
-        do not fall are pooled (isotonic regression), and the middles of the pools are joined by
-        lines.
+        do not fall are pooled (isotonic regression), and lines join the centres of the pools.
         """
-        given = self.rmse[0] ** 2, self.counts.astype(float)
-        fit = scipy.optimize.isotonic_regression(given[0], weights=given[1], increasing=False)
-        middles = (fit.blocks[:-1] + fit.blocks[1:] - 1) / 2
-        squares = np.interp(np.arange(given[0].size), middles, fit.x[fit.blocks[:-1]])
+        measured, counts = self.rmse[0] ** 2, self.counts.astype(float)
+        fit = scipy.optimize.isotonic_regression(measured, weights=counts, increasing=False)
+        centres = (fit.blocks[:-1] + fit.blocks[1:] - 1) / 2
+        squares = np.interp(np.arange(measured.size), centres, fit.x[fit.blocks[:-1]])
         return np.asarray(np.sqrt(squares))
 
     def equivalent_time(self, window_s: float, rmse: np.ndarray) -> Estimate:
-        """When the running mean is as good as an estimator (t* of the paper, section IV-C).
+        """Time at which the running mean is as good as an estimator (t* of the paper, IV-C).
 
-        The RMSE is moved by as much as the curve is where it is made to fall, so t* of the running
-        mean itself is T0. The interval holds the times at which both RMSEs may be equal, given how
-        much their ratio at t* depends on single recordings.
+        The RMSE is scaled by the ratio of the monotone to the measured curve at T0, so that t* of
+        the running mean itself is T0. The interval contains the times at which both RMSEs may be
+        equal, given how much their ratio at t* depends on single recordings.
 
         Args:
             window_s: T0, seconds.
-            rmse: Of the estimator for the same weightings, shape (n,), deg/s.
+            rmse: RMSE of the estimator for the same weightings, shape (n,), deg/s.
 
         Returns:
-            Seconds; -inf where the curve starts at or below that level, inf where it never gets
-            there.
+            Seconds; -inf where the curve starts at or below the estimator's level, inf where it
+            never reaches it.
         """
         measured, falling = (
             float(np.interp(window_s, self.times_s, row)) for row in (self.rmse[0], self.falling)
         )
         level = rmse[0] * (falling / measured if measured else 1.0)
-        time_s = self._reached(level)
+        time_s = self._crossing_time(level)
         if not np.isfinite(time_s):
             return Estimate(time_s)
-        at_time = np.array([np.interp(time_s, self.times_s, row) for row in self.rmse])
+        mean_rmse = np.array([np.interp(time_s, self.times_s, row) for row in self.rmse])
         with np.errstate(divide="ignore", invalid="ignore"):  # at the end of a recording both are 0
-            off = with_interval(rmse / at_time, positive=True)
-        if off.lo is None or off.hi is None:
+            ratio = with_interval(rmse / mean_rmse, positive=True)
+        if ratio.lo is None or ratio.hi is None:
             return Estimate(time_s)
-        ends = (self._reached(level * end / off.value) for end in (off.hi, off.lo))
+        ends = (self._crossing_time(level * end / ratio.value) for end in (ratio.hi, ratio.lo))
         return Estimate(time_s, *ends)
 
-    def _reached(self, level: float) -> float:
+    def _crossing_time(self, level: float) -> float:
         if level >= self.falling[0]:
             return -np.inf
         if level < self.falling[-1]:
@@ -178,11 +177,11 @@ class WeightedCurve:
 
 
 def curve_errors(curve: pd.DataFrame, truth: str, windows: str) -> Curve:
-    """The chosen running-mean curve by recording (or device, see :func:`clusters`), in order.
+    """The running-mean curve by recording (or device, see :func:`clusters`), in order.
 
     Args:
         curve: From :func:`gyro_pipeline.scoring.truths.running_mean_curve`, concatenated.
-        truth: One of the truths.
+        truth: Name of the truth.
         windows: ``first`` or ``all``.
     """
     chosen = curve[(curve.truth == truth) & (curve.windows == windows)]
@@ -196,7 +195,7 @@ def leave_one_out(recordings: int) -> np.ndarray:
     """Weights of a jackknife over recordings: all of them, then all but each in turn.
 
     Returns:
-        Shape (1 + recordings, recordings); only the first row for a single recording, which carries
+        Shape (1 + recordings, recordings); only the first row for a single recording, which allows
         no interval.
     """
     plain = np.ones((1, recordings))
@@ -209,12 +208,12 @@ def with_interval(
     """A figure with its jackknife-t interval.
 
     Args:
-        values: Shape (1 + n,): of all recordings, and without each of them (:func:`leave_one_out`).
-        confidence_pct: Another confidence than 95 %.
-        positive: Whether to take the interval in the logarithm, as of a ratio or an RMSE.
+        values: Shape (1 + n,): for all recordings, then without each (:func:`leave_one_out`).
+        confidence_pct: Confidence of the interval, percent.
+        positive: Whether to compute the interval in the logarithm, as for a ratio or an RMSE.
 
     Returns:
-        The ends are None where a value is not finite, or not positive.
+        The first value; the ends are None where a value is not finite, or its logarithm is not.
     """
     value, n = float(values[0]), len(values) - 1
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -244,18 +243,18 @@ def score(
     """The paper's figures of merit, each with its interval over recordings.
 
     Args:
-        errors: Of the estimator judged.
-        mean_errors: Of the running mean on the same windows.
-        curve: Of the running mean, for the same weights.
+        errors: Squared errors of the estimator.
+        mean_errors: Squared errors of the running mean on the same windows.
+        curve: Curve of the running mean, for the same weights.
         window_s: T0, seconds.
         weights: From :func:`leave_one_out`.
 
     Returns:
         ``test_mse_dps2`` always; ``test_rmse_dps``, ``mean_rmse_dps``, ``accuracy_gain_pct``,
-        ``equivalent_time_s`` and ``time_saving_pct`` where their squares are positive. A truth
-        whose own noise was taken off can leave a negative square: it is reported, not clipped.
-        Time and saving are -inf for an estimator worse than the curve's first point, and inf for
-        one that the running mean never reaches.
+        ``equivalent_time_s`` and ``time_saving_pct`` where the mean squares are positive. A mean
+        square can be negative if the variance of the truth was subtracted: it is reported, not
+        clipped. Time and saving are -inf for an estimator worse than the curve's first point, and
+        inf for one that the running mean never reaches.
     """
     mse, mean_mse = errors.mean(weights), mean_errors.mean(weights)
     scores = {"test_mse_dps2": with_interval(mse, positive=errors.exact)}
@@ -263,7 +262,7 @@ def score(
         lowest = with_interval(squares)
         if (lowest.value if lowest.lo is None else lowest.lo) < 0:
             return scores
-    # leaving one out of a truth with its noise taken off may leave no mean to compare with
+    # without one recording, a mean square less the variance of the truth may be negative
     rmse, mean_rmse = (np.sqrt(np.maximum(square, 0.0)) for square in (mse, mean_mse))
     scores["test_rmse_dps"] = with_interval(rmse, positive=True)
     scores["mean_rmse_dps"] = with_interval(mean_rmse, positive=True)
@@ -286,16 +285,16 @@ def paired_difference(
     weights: np.ndarray,
     confidence_pct: float = CONFIDENCE_PCT,
 ) -> Estimate:
-    """Mean square of an estimator less that of a reference on the same windows, (deg/s)^2.
+    """Mean squared error of an estimator minus that of a reference on the same windows.
 
     Args:
-        errors: Of the estimator.
-        reference: Of what it is compared with, for the same recordings.
-        weights: From :func:`leave_one_out`; recordings are left out of both together.
-        confidence_pct: Of the interval.
+        errors: Squared errors of the estimator.
+        reference: Squared errors of the reference, for the same recordings.
+        weights: From :func:`leave_one_out`; a recording is left out of both at once.
+        confidence_pct: Confidence of the interval, percent.
 
     Returns:
-        Negative where the estimator is better, significantly so if the upper end is below 0.
+        (deg/s)^2; negative where the estimator is better, significantly so if both ends are.
     """
     return with_interval(errors.mean(weights) - reference.mean(weights), confidence_pct)
 
@@ -303,15 +302,15 @@ def paired_difference(
 def rmse_difference(
     errors: SquaredErrors, reference: SquaredErrors, weights: np.ndarray
 ) -> Estimate:
-    """RMSE of an estimator less that of another on the same windows, paired over recordings.
+    """RMSE of an estimator minus that of a reference on the same windows, paired over recordings.
 
     Args:
-        errors: Of the estimator; negative differences are in its favour.
-        reference: Of the other one, in the same order of recordings.
+        errors: Squared errors of the estimator.
+        reference: Squared errors of the reference, in the same order of recordings.
         weights: From :func:`leave_one_out`.
 
     Returns:
-        deg/s.
+        deg/s; negative where the estimator is better.
     """
     return with_interval(np.sqrt(errors.mean(weights)) - np.sqrt(reference.mean(weights)))
 
@@ -319,28 +318,28 @@ def rmse_difference(
 def gain_difference(
     errors: SquaredErrors, reference: SquaredErrors, mean: SquaredErrors, weights: np.ndarray
 ) -> Estimate:
-    """By how much A of an estimator exceeds that of another, paired over recordings.
+    """Accuracy gain A of an estimator minus that of a reference, paired over recordings.
 
     Args:
-        errors: Of the estimator, all seeds together.
-        reference: Of the other one on the same windows.
-        mean: Of the running mean on these.
+        errors: Squared errors of the estimator, all seeds together.
+        reference: Squared errors of the reference on the same windows.
+        mean: Squared errors of the running mean on the same windows.
         weights: From :func:`leave_one_out`.
 
     Returns:
         Percentage points.
     """
-    own, other = (np.sqrt(one.mean(weights)) for one in (errors, reference))
-    return with_interval(100 * (other - own) / np.sqrt(mean.mean(weights)))
+    rmse, reference_rmse = (np.sqrt(squares.mean(weights)) for squares in (errors, reference))
+    return with_interval(100 * (reference_rmse - rmse) / np.sqrt(mean.mean(weights)))
 
 
 def coverage(errors: pd.DataFrame, truth: str, sigmas: float) -> float:
-    """Fraction of all windows whose error is within so many stated standard deviations.
+    """Fraction of all windows whose error is within a multiple of the stated standard deviation.
 
     Args:
         errors: Columns ``truth, error_dps, sigma_dps``.
-        truth: One of the truths that are exact; the noise of another would widen the errors.
-        sigmas: How many.
+        truth: Name of an exact truth; the noise of other truths would widen the errors.
+        sigmas: The multiple.
 
     Returns:
         From 0 to 1; NaN where no standard deviation is stated.
@@ -350,36 +349,35 @@ def coverage(errors: pd.DataFrame, truth: str, sigmas: float) -> float:
 
 
 def prior_conflict(trained: np.ndarray, tested: np.ndarray) -> np.ndarray:
-    """How probable the means of tested recordings are, if they are drawn like those that train.
+    """F test of whether tested recordings have the same mean bias as training recordings.
 
-    Both scatter about one mean. The squares of the tested ones about the mean of the others,
-    weighted by what is not known of it, over the others' variance, are an F variate.
+    Under the null hypothesis all means scatter about a common mean. The squared deviations of the
+    tested means from the mean of the training means, weighted by the inverse of their covariance,
+    over the training variance, follow an F distribution.
 
     Args:
-        trained: Means of training recordings, (n, axes), at least 2.
-        tested: Of tested ones, (k, axes).
+        trained: Means of the training recordings, (n, axes), at least 2.
+        tested: Means of the tested recordings, (k, axes).
 
     Returns:
-        p values, (axes,), 1 where n is too small. Small ones say that the prior is wrong: a sensor
-        that was turned, or a bias that moved on.
+        p values, (axes,); 1 where n is too small. Small values say that the prior is wrong, e.g.
+        because the sensor was turned or its bias has drifted.
     """
     n, k = len(trained), len(tested)
     variance = trained.var(axis=0, ddof=1) if n > 1 else np.zeros(trained.shape[1])
     if not variance.all():
         return np.ones(trained.shape[1])
-    off = tested - trained.mean(axis=0)
+    deviations = tested - trained.mean(axis=0)
     # the inverse of I + 1 1' / n is I - 1 1' / (n + k)
-    squares = np.sum(off**2, axis=0) - np.sum(off, axis=0) ** 2 / (n + k)
+    squares = np.sum(deviations**2, axis=0) - np.sum(deviations, axis=0) ** 2 / (n + k)
     return np.asarray(scipy.stats.f.sf(squares / k / variance, k, n - 1))
 
 
 def beats_oracle(errors: SquaredErrors, oracle: SquaredErrors) -> float:
-    """One-sided p value that an estimator is better than the oracle on the same windows.
-
-    Paired over recordings: under the null the mean square of the oracle is not the larger one.
+    """One-sided p value of a t test that an estimator beats the oracle, paired over recordings.
 
     Returns:
-        Small values speak against the evaluation: nothing honest can beat the oracle.
+        Small values cast doubt on the evaluation, since no honest estimator can beat the oracle.
     """
     difference = errors.sums / errors.counts - oracle.sums / oracle.counts
     if np.ptp(difference) == 0:
@@ -388,7 +386,7 @@ def beats_oracle(errors: SquaredErrors, oracle: SquaredErrors) -> float:
 
 
 def holm(p_values: Sequence[float]) -> np.ndarray:
-    """Holm's step-down correction for the number of checks; shape as given."""
+    """Correct p values by Holm's step-down procedure for multiple tests; same shape."""
     p = np.asarray(p_values, dtype=float)
     order = np.argsort(p)
     steps = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))

@@ -1,4 +1,4 @@
-"""The truths an estimate is judged against, and the running mean's error against each."""
+"""The truths that estimates are compared with, and the running mean's error against each."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,21 +18,21 @@ CURVE_STEP_S = 0.25
 """Resolution of the running-mean curve; the equivalent time is interpolated between points."""
 
 LAST_DISJOINT_FRACTION = 0.75
-"""The disjoint curve ends here: what is left of a recording later is too short to be a truth."""
+"""The disjoint curve ends at this fraction of a recording; the rest would be too short a truth."""
 
 
 @dataclass(frozen=True)
 class TestRecording:
-    """One recording of the test IMU, with all that is needed to judge an estimate on it.
+    """A recording of a tested IMU, with its truths.
 
     Attributes:
         number: Recording number.
         samples: Shape (3, n), deg/s; NaN where masked.
         rate_hz: Sample rate, Hz.
-        noise: N, B and K of each axis from training recordings, or as drawn if simulated.
-        true_bias: Drawn bias, shape (3,), deg/s; None on measured data.
-        imu: Whose recording it is.
-        tested: First samples of the windows that test, in order.
+        noise: N, B and K of each axis from training recordings, or the simulated values.
+        true_bias: Simulated bias, shape (3,), deg/s; None for measured data.
+        imu: Number of the IMU.
+        tested: First samples of the test windows, in order.
     """
 
     number: int
@@ -45,18 +45,18 @@ class TestRecording:
 
     @cached_property
     def running_sums(self) -> np.ndarray:
-        """Sum of the measured ones of the first i samples in float64, shape (3, n + 1)."""
+        """Sum of the unmasked ones among the first i samples, float64, shape (3, n + 1)."""
         sums = np.cumsum(np.where(self.masked, 0, self.samples), axis=-1, dtype=np.float64)
         return np.concatenate([np.zeros((len(AXES), 1)), sums], axis=-1)
 
     @cached_property
     def running_counts(self) -> np.ndarray:
-        """How many of the first i samples are measured, shape (n + 1,)."""
+        """Number of unmasked ones among the first i samples, shape (n + 1,)."""
         return np.concatenate([[0], np.cumsum(~self.masked)])
 
     @cached_property
     def masked(self) -> np.ndarray:
-        """Whether a sample holds no measurement, shape (n,)."""
+        """Whether each sample is masked, shape (n,)."""
         return np.isnan(self.samples).any(axis=0)
 
     @property
@@ -65,7 +65,7 @@ class TestRecording:
         return self.running_sums[:, -1] / self.running_counts[-1]
 
     def window_sums(self, starts: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-        """Sums of windows, shape (windows, 3), and counts of their samples, shape (windows, 1)."""
+        """Sums of windows, (windows, 3), and counts of their unmasked samples, (windows, 1)."""
         sums, counts = (
             running[..., starts + size] - running[..., starts]
             for running in (self.running_sums, self.running_counts)
@@ -78,20 +78,20 @@ class TestRecording:
         return sums / counts
 
     def truths(self, starts: np.ndarray, size: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """The truth for every window, with that truth's own averaging variance.
+        """The truths for every window, with the variance of each truth.
 
         ``PAPER``, the mean of the whole recording, counts as exact (the paper's definition).
-        ``DISJOINT``, the mean of the samples outside the window, has an averaging noise of its own,
-        N^2 / (T - T0) if it is white, which is to be taken off the squared error. If noise is
-        coloured, what window and truth share stays in it. ``TRUE`` is the drawn bias of simulated
-        data.
+        ``DISJOINT``, the mean of the samples outside the window, has averaging noise of variance
+        N^2 / (T - T0) if the noise is white. This variance is to be subtracted from the squared
+        error, which still contains the covariance of window and truth if the noise is coloured.
+        ``TRUE`` is the bias of simulated data.
 
         Args:
             starts: First samples of the windows.
             size: Samples per window.
 
         Returns:
-            For each truth its value in deg/s and its variance, both of shape (windows, 3).
+            For each truth its value in deg/s and its variance in (deg/s)^2, both (windows, 3).
         """
         n = self.samples.shape[-1]
         sums, counts = self.window_sums(starts, size)
@@ -101,7 +101,7 @@ class TestRecording:
             white = not any(axis.instability or axis.random_walk for axis in self.noise)
             variance = [
                 [outside_noise(axis, n, self.rate_hz, start, size) for axis in self.noise]
-                for start in (starts[:1] if white else starts).tolist()  # of white all are alike
+                for start in (starts[:1] if white else starts).tolist()  # if white, all are equal
             ] or exact
             outside = (self.running_sums[:, -1] - sums) / (self.running_counts[-1] - counts)
             truths[DISJOINT] = (outside, np.broadcast_to(variance, sums.shape))
@@ -111,7 +111,7 @@ class TestRecording:
 
 
 Columns = Mapping[str, NDArray[Any]]
-"""Equally long arrays by the name of their column."""
+"""Arrays of equal length, by column name."""
 
 
 def error_columns(
@@ -124,15 +124,15 @@ def error_columns(
     """Errors of the estimates on one recording against one truth, a row per window and axis.
 
     Args:
-        recording: What was estimated, in all windows that test.
-        truth: Its name.
+        recording: The recording.
+        truth: Name of the truth.
         value_and_variance: From :meth:`TestRecording.truths`.
-        estimates: Shape (windows, 3), deg/s.
+        estimates: Estimates for all test windows, shape (windows, 3), deg/s.
         sigma: The standard deviations that the estimator states, same shape; NaN for none.
 
     Returns:
         Columns ``imu, recording, window, start, axis, truth, error_dps, truth_variance,
-        sigma_dps``; several such tables are put below one another by :func:`stacked`.
+        sigma_dps``; :func:`stack_columns` concatenates several such results.
     """
     value, variance = value_and_variance
     n = len(estimates)
@@ -150,21 +150,21 @@ def error_columns(
     }
 
 
-def stacked(parts: Sequence[Columns]) -> pd.DataFrame:
-    """Put columns below one another; much faster than making a table of each first."""
-    return pd.DataFrame({name: np.concatenate([one[name] for one in parts]) for name in parts[0]})
+def stack_columns(parts: Sequence[Columns]) -> pd.DataFrame:
+    """Concatenate columns to a table; much faster than concatenating tables."""
+    return pd.DataFrame({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
 
 
 def running_mean_curve(recording: TestRecording, size: int) -> pd.DataFrame:
     """Squared error of the running mean against its length, for one recording.
 
     Args:
-        recording: What is averaged.
-        size: Samples of the study's window; a point of the curve lies exactly there.
+        recording: The recording that is averaged.
+        size: Samples of the study's window; the curve has a point at exactly this length.
 
     Returns:
         Columns ``imu, recording, truth, windows`` (``first`` or ``all``), ``time_s``, ``sum_sq``
-        in (deg/s)^2 with the truth's own variance taken off, and ``count`` of squares in the sum.
+        in (deg/s)^2 less the variance of the truth, and ``count``, the number of squares.
     """
     n = recording.samples.shape[-1]
     step = max(1, round(CURVE_STEP_S * recording.rate_hz))
@@ -178,7 +178,7 @@ def running_mean_curve(recording: TestRecording, size: int) -> pd.DataFrame:
                 continue
             squares = (estimates - value) ** 2 - variance
             for windows, part in ((FIRST, squares[:1]), (ALL, squares)):
-                place = recording.imu, recording.number
-                rows.append((*place, truth, windows, time_s, part.sum(), part.size))
+                labels = recording.imu, recording.number, truth, windows
+                rows.append((*labels, time_s, part.sum(), part.size))
     columns = ["imu", "recording", "truth", "windows", "time_s", "sum_sq", "count"]
     return pd.DataFrame(rows, columns=columns)

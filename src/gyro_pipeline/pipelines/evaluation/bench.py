@@ -47,7 +47,7 @@ from gyro_pipeline.scoring.truths import (
     TestRecording,
     error_columns,
     running_mean_curve,
-    stacked,
+    stack_columns,
 )
 from gyro_pipeline.windows import cut_windows, window_size
 
@@ -141,7 +141,7 @@ class Bench:
                 error_columns(recording, truth, value, *estimates[TARGET_OF[truth]])
                 for truth, value in truths.items()
             ]
-        errors = stacked(parts)
+        errors = stack_columns(parts)
         for number in errors.recording[errors.error_dps.isna()].unique():
             raise InputError(
                 f"{self.recordings.attrs['sensor']} recording {number}: expected an estimate for "
@@ -226,7 +226,7 @@ class Bench:
                 best = self._best(recording, truth)
                 sigma = np.full(best.shape, np.nan)
                 parts.append(error_columns(recording, truth, known, best, sigma))
-        return stacked(parts)
+        return stack_columns(parts)
 
     @cached_property
     def constant_errors(self) -> pd.DataFrame | None:
@@ -242,7 +242,7 @@ class Bench:
                 error_columns(recording, truth, known, constants, none)
                 for truth, known in truths.items()
             ]
-        return stacked(parts)
+        return stack_columns(parts)
 
     @cached_property
     def prior_p(self) -> dict[str, float]:

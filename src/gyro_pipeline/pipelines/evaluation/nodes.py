@@ -29,7 +29,7 @@ from gyro_pipeline.pipelines.evaluation.device import (
     training_labels,
 )
 from gyro_pipeline.scoring.truths import CURVE_STEP_S
-from gyro_pipeline.studies import MEAN, RunSpec, planned
+from gyro_pipeline.studies import MEAN, RunSpec, possible_runs
 from gyro_pipeline.tracking import (
     CURVE,
     ERRORS,
@@ -85,7 +85,7 @@ def evaluate(
         data_hash(allan.allan_variance.load().to_numpy(), None),
     ]
     judged_with = fingerprint([code_hash(__name__), truths])
-    specs, stored = planned(plan), {run.fingerprint: run for run in reversed(runs)}
+    specs, stored = possible_runs(plan), {run.fingerprint: run for run in reversed(runs)}
     benches = Benches(recordings, windows, bias, allan)
     judged = 0
     for key, spec in sorted(specs.items(), key=lambda item: _bench_key(item[1])):

@@ -17,7 +17,7 @@ from gyro_pipeline.physics.allan import (
     mean_variance,
 )
 from gyro_pipeline.physics.bias import settling_time_s
-from gyro_pipeline.recordings import bias_rows, one_by_one
+from gyro_pipeline.recordings import bias_rows, iterate_recordings
 
 logger = logging.getLogger(__name__)
 
@@ -41,7 +41,7 @@ def measure_allan_variance(recordings: xr.Dataset) -> xr.Dataset:
     shape = tuple(len(label) for label in labels.values())
     variance = xr.DataArray(np.full((*shape, len(times_s)), np.nan), labels | {"time_s": times_s})
     differences = xr.zeros_like(variance.isel(axis=0, drop=True), np.int64)
-    for imu, number, samples in one_by_one(recordings):
+    for imu, number, samples in iterate_recordings(recordings):
         place = {"imu": imu, "recording": number}
         axes = [allan_variance(axis, rate_hz, times_s) for axis in samples]
         variance.loc[place] = [values for values, _ in axes]

@@ -54,7 +54,7 @@ def inspect_logs(
         for entry in files.entries
     }
     yield Listing({place: job.key for place, job in jobs.items()})
-    there = {recording.place: recording.key for recording in earlier}
+    there = {recording.labels: recording.key for recording in earlier}
     missing = [job for place, job in jobs.items() if there.get(place) != job.key]
     if len(missing) < len(jobs):
         before = len(jobs) - len(missing)
@@ -135,11 +135,11 @@ def label_recordings(
         # the reader has rejected those whose rate is far from the expected one
         "rate_hz": _rounded(measured.median()) if len(measured) else files.rate_hz,
     }
-    contents = [[*item.place, item.content] for item in inspected if item.place in used.index]
+    contents = [[*item.labels, item.content] for item in inspected if item.labels in used.index]
     attributes["data_hash"] = fingerprint([attributes, contents])
     labels = xr.Dataset({"samples": (("imu", "recording"), samples)}, coordinates, attributes)
-    if files.drawn is not None:
-        labels = labels.assign(files.drawn.sel(imu=imus, recording=numbers).data_vars)
+    if files.truth is not None:
+        labels = labels.assign(files.truth.sel(imu=imus, recording=numbers).data_vars)
     return labels
 
 

@@ -18,7 +18,7 @@ from gyro_pipeline.scoring.scores import (
     score,
     squared_errors,
 )
-from gyro_pipeline.studies import CONSTANT, MEAN, RunSpec, planned
+from gyro_pipeline.studies import CONSTANT, MEAN, RunSpec, possible_runs
 from gyro_pipeline.tracking import CURVE, SCORES, StoredRun
 
 DETECTOR_PCT = 99
@@ -51,7 +51,7 @@ def pool_leakage(
     rows = []
     for sensor in [name.removesuffix("_plan") for name in stored if name.endswith("_plan")]:
         runs = {run.fingerprint: run for run in reversed(stored[f"{sensor}_runs"])}
-        made = [(spec, runs[key]) for key, spec in planned(stored[f"{sensor}_plan"]).items()]
+        made = [(spec, runs[key]) for key, spec in possible_runs(stored[f"{sensor}_plan"]).items()]
         rate_hz = Sensor(**sensors[sensor]).rate_hz
         hop_s = np.nan if rate_hz is None else study.training_of(training).hop / rate_hz
         for stride_s in dict.fromkeys(spec.window_stride_s for spec, _ in made):

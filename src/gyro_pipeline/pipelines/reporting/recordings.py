@@ -17,7 +17,7 @@ from gyro_pipeline.physics.bias import fill_masked, settling_time_s
 from gyro_pipeline.physics.ceiling import turn_on_spread
 from gyro_pipeline.physics.recording_model import block_edges, block_means
 from gyro_pipeline.physics.warm_up import LAST, fit_common_warm_up, settling
-from gyro_pipeline.recordings import one_by_one, tested_imu
+from gyro_pipeline.recordings import iterate_recordings, tested_imu
 
 SIGMAS_MDPS = (1.0, 0.5)
 """The accuracy of the bias for which the times of a start-up are given."""
@@ -97,7 +97,7 @@ def drift(recordings: xr.Dataset) -> tuple[pd.DataFrame, dict[str, float]]:
     edges = block_edges(length, round(rate_hz))
     means = np.stack([
         block_means(fill_masked(samples[:, :length].astype(float)), edges)
-        for _, _, samples in one_by_one(recordings)
+        for _, _, samples in iterate_recordings(recordings)
         if samples.shape[-1] >= length
     ])  # fmt: skip
     blocks_hz = means.shape[-1] * rate_hz / length

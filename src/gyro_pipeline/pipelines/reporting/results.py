@@ -29,7 +29,7 @@ from gyro_pipeline.scoring.scores import (
     squared_errors,
     with_interval,
 )
-from gyro_pipeline.studies import CNN, CONSTANT, LEFT_OUT, MEAN, RunSpec, planned, run_spec
+from gyro_pipeline.studies import CNN, CONSTANT, LEFT_OUT, MEAN, RunSpec, possible_runs, run_spec
 from gyro_pipeline.studies import study_rows as rows_of_study
 from gyro_pipeline.tracking import CURVE, ERRORS, SCORES, StoredRun
 
@@ -129,7 +129,7 @@ class Finder:
     """
 
     def __init__(self, plan: pd.DataFrame, runs: Sequence[StoredRun], unseen_devices: bool) -> None:
-        self._keys = {spec: key for key, spec in planned(plan).items()}
+        self._keys = {spec: key for key, spec in possible_runs(plan).items()}
         self._left_out = {
             RunSpec(**{name: row[name] for name in RunSpec.names()}): str(row[LEFT_OUT])
             for row in plan[plan[LEFT_OUT].notna()].to_dict("records")

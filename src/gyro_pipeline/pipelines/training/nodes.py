@@ -36,7 +36,7 @@ from gyro_pipeline.physics.bias import fill_masked
 from gyro_pipeline.studies import (
     LEFT_OUT,
     RunSpec,
-    planned,
+    possible_runs,
     run_params,
     run_specs,
     study_rows,
@@ -273,7 +273,7 @@ def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
         InputError: The plan is not of these recordings, windows and settings.
     """
     sets, settings = TrainingSets(windows, recordings, virtual), study.training_of(training)
-    specs = planned(plan)
+    specs = possible_runs(plan)
     _check_plan(specs, sets, settings)
     here = {run.fingerprint: run for run in reversed(tracked) if run.study == study.experiment}
     elsewhere = {run.fingerprint: run for run in reversed(tracked) if run.trained}

@@ -30,8 +30,8 @@ from gyro_pipeline.pipelines.windowed_splits.protocols import (
 from gyro_pipeline.recordings import (
     bias_rows,
     common_length,
-    cut,
-    one_by_one,
+    cut_to_length,
+    iterate_recordings,
     tested_imu,
 )
 from gyro_pipeline.studies import study_rows
@@ -82,7 +82,7 @@ def cut_to_common_length(
     """
     length, lengths = common_length(recordings), recordings["samples"].to_numpy()
     lengths, rate_hz = lengths[lengths > 0], recordings.attrs["rate_hz"]
-    alike = cut(recordings, length)
+    alike = cut_to_length(recordings, length)
     if (lengths != length).any():
         _log_lengths(recordings.attrs["sensor"], quality, length, rate_hz)
         bias = bias_rows(alike)
@@ -92,7 +92,7 @@ def cut_to_common_length(
     alike = alike.assign(recording_mean=means.reindex_like(alike[[*_PLACE, "axis"]]))
     rows: list[tuple[Any, ...]] = []
     starts = []
-    for imu, number, rates in one_by_one(alike):
+    for imu, number, rates in iterate_recordings(alike):
         rows.append((imu, number, np.flatnonzero(np.isnan(rates).any(axis=0)), []))
         starts.append(rates[:, :COMPARED])
     for pair in near_copies(np.stack(starts)):
