@@ -26,11 +26,6 @@ def past(*means, variance=1e-6, **more):
     return [Calibration((m * 1e-3,) * 3, (variance,) * 3, **more) for m in means]
 
 
-def test_without_calibrations_there_is_no_prior():
-    prior = prior_of([], kind(), DECLARED)
-    assert np.isinf(prior.narrow).all()
-
-
 def test_one_calibration_adds_tau_twice_and_its_own_variance():
     prior = prior_of(past(5.0), kind(), DECLARED)
     np.testing.assert_allclose(prior.mean, 5e-3)
@@ -55,12 +50,6 @@ def test_a_walk_follows_the_latest_and_grows_with_age():
         prior = prior_of(made, kinds, now)
         np.testing.assert_allclose(prior.mean, 9e-3, rtol=1e-3)
         np.testing.assert_allclose(prior.narrow, age * 1e-6, rtol=1e-2)
-
-
-def test_a_calibration_of_unknown_age_is_a_day_old():
-    kinds = kind(turn_on_mdps=0.001, walk_mdps_per_rtday=1.0)
-    prior = prior_of(past(0.0, variance=1e-14), kinds, DECLARED)
-    np.testing.assert_allclose(prior.narrow, 1e-6, rtol=1e-2)
 
 
 def test_the_fitted_tau_lies_between_the_types_and_the_scatter():
@@ -109,25 +98,12 @@ def test_a_device_on_its_side_is_corrected_for_the_earths_vertical_rate():
     assert {reason.code for reason in prior.reasons} == {"attitude"}
 
 
-def test_where_attitudes_differ_the_larger_of_tau_and_the_earth_counts():
-    ups = [np.array([0.0, 0, 1]), np.array([0.0, 0.2, 0.98])]
-    made = [
-        past(m, variance=1e-12, gravity=tuple(u / np.linalg.norm(u)))[0]
-        for m, u in zip((0, 1), ups, strict=True)
-    ]
-    large = kind(turn_on_mdps=10.0)
-    prior = prior_of(made, large, Circumstances(up=ups[0]))
-    np.testing.assert_allclose(prior.narrow, 1e-4 * 1.5, rtol=0.02)
-
-
 @pytest.mark.parametrize(
     ("dropped", "means", "members"),
     [
-        ("....", (0, 0, 0, 0), [0, 1, 2, 3]),
         ("..x.", (0, 0, 50, 0), [0, 1, 3]),
         ("..xx", (0, 0, 50, 51), [2, 3]),
         ("..xx", (0, 0, 50, -50), [0, 1]),
-        ("..xx.", (0, 0, 50, 51, 50), [2, 3, 4]),
     ],
 )
 def test_two_at_a_new_level_restart_the_level(dropped, means, members):
