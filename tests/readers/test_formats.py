@@ -77,11 +77,6 @@ def test_a_format_that_is_contradicted_or_wrong_is_refused(options, words, read)
         read(LOGGERS[0][1], *LOGGERS[0][2], **options)
 
 
-def test_a_header_with_a_unit_needs_no_word_of_the_format(read):
-    header = f"{XSENS.removesuffix('Gyr_X,Gyr_Y,Gyr_Z')}{axes('Gyr_{} (rad/s)', 'XYZ')},Euler_X"
-    np.testing.assert_allclose(read(header, K, S * 1e6, ACC, X * RAD, S).samples, X)
-
-
 def test_a_packet_counter_tells_gaps(read, details):
     log = read(XSENS, np.where(K < 300, K, K + 5), S * np.nan, ACC, X, units="deg/s")
     assert not len(log.gap_rows)  # whose counter it is, is not known
