@@ -23,7 +23,7 @@ WARMING = RecordingModel(
     np.diag([TAU**2, (5 * MDPS) ** 2]),
     time_constant_s=30.0,
 )
-TESTED = 40
+TESTED = 60
 
 
 class Oracle:
@@ -62,13 +62,12 @@ def ratios_to_the_oracle(simulate, judged, training_set, model, names, training,
     return np.array(rows)
 
 
-@pytest.mark.parametrize(("training", "bar"), [(80, 1.04), (10, 1.08)])
-def test_on_white_noise_they_are_as_good_as_the_oracle(
-    simulate, judged, training, bar, training_set
+def test_on_white_noise_ten_recordings_make_them_nearly_as_good_as_the_oracle(
+    simulate, judged, training_set
 ):
     names = ["empirical_bayes", "best_linear"]
-    ratios = ratios_to_the_oracle(simulate, judged, training_set, WHITE, names, training, seeds=4)
-    assert (ratios.mean(axis=0) <= bar).all(), ratios
+    ratios = ratios_to_the_oracle(simulate, judged, training_set, WHITE, names, 10, seeds=6)
+    assert (ratios.mean(axis=0) <= 1.08).all(), ratios
     assert (ratios.mean(axis=0) > 0.99).all(), ratios
 
 
