@@ -1,6 +1,5 @@
 """No honest network beats the oracle on white noise, and one with a leak is found out."""
 
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -144,13 +143,6 @@ def test_the_mean_has_the_rmse_of_the_closed_form_and_the_oracle_that_of_the_cei
         assert rmse_of(bench.mean_errors, truth, ALL) == pytest.approx(expected, rel=0.04)
         ceiling = bench.ceilings.of(truth, ALL)["ceiling_rmse_dps"].value
         assert rmse_of(bench.oracle_errors, truth, ALL) == pytest.approx(ceiling, rel=0.06)
-
-
-def test_the_check_sees_a_tenth_of_a_gain(benches):
-    """It has the power to: errors a tenth smaller than the oracle's are a defect."""
-    oracle = squared_errors(benches[10.0].oracle_errors, PAPER, ALL)
-    assert beats_oracle(oracle, oracle) == 1
-    assert beats_oracle(replace(oracle, sums=oracle.sums * 0.9**2), oracle) < 1e-9
 
 
 def test_a_network_with_its_own_centre_comes_near_the_ceiling(benches, plain):

@@ -52,6 +52,12 @@ def test_a_walk_follows_the_latest_and_grows_with_age():
         np.testing.assert_allclose(prior.narrow, age * 1e-6, rtol=1e-2)
 
 
+def test_a_calibration_of_unknown_age_is_a_day_old():
+    kinds = kind(turn_on_mdps=0.001, walk_mdps_per_rtday=1.0)
+    prior = prior_of(past(0.0, variance=1e-14), kinds, DECLARED)
+    np.testing.assert_allclose(prior.narrow, 1e-6, rtol=1e-2)
+
+
 def test_the_fitted_tau_lies_between_the_types_and_the_scatter():
     rng = np.random.default_rng(1)
     made = past(*rng.normal(0, 4, 30), variance=1e-8)
@@ -96,6 +102,17 @@ def test_a_device_on_its_side_is_corrected_for_the_earths_vertical_rate():
     prior = prior_of(past(0.0, gravity=up), kind(), now)
     np.testing.assert_allclose(prior.mean, [EARTH_DPS, 0, -EARTH_DPS], atol=1e-12)
     assert {reason.code for reason in prior.reasons} == {"attitude"}
+
+
+def test_where_attitudes_differ_the_larger_of_tau_and_the_earth_counts():
+    ups = [np.array([0.0, 0, 1]), np.array([0.0, 0.2, 0.98])]
+    made = [
+        past(m, variance=1e-12, gravity=tuple(u / np.linalg.norm(u)))[0]
+        for m, u in zip((0, 1), ups, strict=True)
+    ]
+    large = kind(turn_on_mdps=10.0)
+    prior = prior_of(made, large, Circumstances(up=ups[0]))
+    np.testing.assert_allclose(prior.narrow, 1e-4 * 1.5, rtol=0.02)
 
 
 @pytest.mark.parametrize(

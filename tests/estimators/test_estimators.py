@@ -5,11 +5,12 @@ import pytest
 from scipy import stats
 
 from gyro_pipeline.conventions import BIAS, MDPS, PAPER, RECORDING_MEAN, TRUE, InputError
-from gyro_pipeline.estimators import ESTIMATORS, estimator_class, make_estimator
+from gyro_pipeline.estimators import DEFAULT, ESTIMATORS, estimator_class, make_estimator
 from gyro_pipeline.estimators.averages import RunningMean
 from gyro_pipeline.estimators.shrinkage import (
     EmpiricalBayes,
     LastCalibration,
+    PooledEmpiricalBayes,
 )
 from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.ceiling import oracle, running_mean_rmse
@@ -71,6 +72,14 @@ def test_a_shift_of_all_recordings_shifts_the_estimates(
 def test_an_unknown_target_is_refused(fitted, windows, name="mean"):
     with pytest.raises(InputError, match="expected 'recording_mean' or 'bias', got 'mean'"):
         fitted[name].estimate(windows, "mean")
+
+
+def test_some_are_recommended_and_the_default_is_one_of_them(fitted):
+    recommended = {name for name, estimator in fitted.items() if estimator.recommended}
+    assert DEFAULT in recommended
+    assert {"empirical_bayes", "best_linear", "residual_network"} <= recommended
+    others = {"mean", "ridge", "empirical_bayes_pooled", "best_linear_allan", "window_mean_network"}
+    assert not recommended & others
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -146,6 +155,14 @@ def test_empirical_bayes_is_the_oracle_with_what_it_learned(
     m = windows.mean(axis=-1, dtype=np.float64)
     expected = oracle(m, labels.mean(axis=0), prior, noise, SIZE / RATE, recording_s, truth)
     np.testing.assert_allclose(estimator.estimate(windows, target)[0], expected, atol=1e-12)
+
+
+def test_pooled_empirical_bayes_has_one_spread(recordings, training_set):
+    pooled = PooledEmpiricalBayes().fit(training_set(recordings))
+    own = pooled._noise**2 / (SAMPLES / RATE)
+    tau = np.sqrt((pooled._prior - own / 12) / (1 + 1 / 12))
+    np.testing.assert_allclose(tau, tau[0])
+    assert tau[0] == pytest.approx(TAU, rel=0.3)
 
 
 def test_masked_samples_hardly_matter_to_anyone(recordings, windows, training_set):

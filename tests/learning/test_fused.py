@@ -218,6 +218,11 @@ def test_without_a_compiler_it_is_said_once_and_training_goes_on(monkeypatch, ca
         FusedEngine(network(TINY), *examples(TINY), 64)
 
 
+def test_a_compiler_that_was_asked_for_is_not_replaced(monkeypatch, caplog):
+    monkeypatch.setenv("CC", "no-such-compiler -O1")
+    assert "no C compiler: no-such-compiler -O1 not found" in refusal(caplog)
+
+
 def test_a_source_that_does_not_compile_is_no_error(monkeypatch, caplog, tmp_path):
     broken = 'case "$*" in *-dM*) exit 0;; esac; echo "error: what is a vector" >&2; exit 1'
     monkeypatch.setenv("CC", program(tmp_path / "cc", broken))
@@ -230,6 +235,13 @@ def test_a_source_that_does_not_compile_is_no_error(monkeypatch, caplog, tmp_pat
 def test_a_step_that_computes_something_else_is_not_used(monkeypatch, caplog):
     monkeypatch.setenv("CC", " ".join([*fused._compiler(), "-Dsqrtf=fabsf"]))
     assert "differs from PyTorch's" in refusal(caplog)
+
+
+@needs_compiler
+def test_a_cache_that_cannot_be_written_is_no_error(monkeypatch, caplog, tmp_path):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("GYRO_PIPELINE_CACHE", str(tmp_path / "file" / "folder"))
+    assert "Not a directory" in refusal(caplog)
 
 
 @needs_compiler

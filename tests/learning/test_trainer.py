@@ -125,14 +125,6 @@ def test_history_has_a_row_per_epoch_and_the_rate_falls_on_the_clock():
     assert len(called) == 5
 
 
-def test_the_training_loss_weighs_every_example_equally():
-    """At a learning rate of next to nothing it is the loss of the initial network on all."""
-    _, examples = drawn(37)  # batches of 16, 16 and 5
-    initial = {name: value.clone() for name, value in network().state_dict().items()}
-    history = trained(examples, epochs=2, learning_rate=1e-12).history
-    assert history.train_loss.tolist() == pytest.approx([loss_of(initial, examples)] * 2, rel=1e-5)
-
-
 def test_best_weights_are_those_of_the_lowest_validation_loss():
     _, examples = drawn(24)
     _, validation = drawn(200, seed=1)

@@ -33,6 +33,12 @@ def test_samples_are_correlated_over_one_period_only(lag1):
     assert noise.std() == pytest.approx(sigma, rel=0.005)
 
 
+def test_the_first_sample_is_like_all_others():
+    noise = simulate_noise(np.random.default_rng(3), (50_000, 2), RATE, N, -0.4).astype(np.float64)
+    assert noise[:, 0].std() == pytest.approx(noise[:, 1].std(), rel=0.02)
+    assert lag_correlation(noise, 1) == pytest.approx(-0.4, abs=0.02)
+
+
 def test_every_axis_has_its_own_n():
     per_axis = np.array([1.0, 2.0, 0.0]) * MDPS
     noise = simulate_noise(np.random.default_rng(4), (2, 5, 3, 5000), RATE, per_axis)
@@ -59,6 +65,14 @@ def test_the_flicker_floor_is_flat_at_0664_b(rate):
     floor = np.sqrt(FLICKER_FLOOR) * b
     np.testing.assert_allclose(np.sqrt(variance), floor, rtol=0.1)
     assert np.sqrt(variance[:6]).mean() == pytest.approx(floor, rel=0.02)
+
+
+def test_a_flicker_recording_does_not_end_where_it_began():
+    noise = simulate_noise(np.random.default_rng(8), (500, 4000), RATE, 0.0, flicker_dps=1.0)
+    blocks = noise.reshape(500, 40, 100).mean(axis=-1)
+    to_last = np.std(blocks[:, -1] - blocks[:, 0])
+    to_next = np.std(blocks[:, 1] - blocks[:, 0])
+    assert to_last > 1.5 * to_next
 
 
 @pytest.mark.parametrize("flicker", [0.0, 3 * MDPS])
