@@ -105,11 +105,9 @@ T, G = "time (s)", "gx (deg/s),gy (deg/s),gz (deg/s)"
 DEG, TRUSTED = {"units": "deg/s"}, {"trust": "options"}
 BY_NUMBER: dict[str, Any] = DEG | {"columns": [1, 2, 3]}
 RAW: dict[str, Any] = {"units": "raw", "scale_dps": 0.01}
-XSENS = "PacketCounter,SampleTimeFine,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z"
 STAMPS = np.char.mod("%d", 1_700_000_000_000_000_000 + (S * 1e9).astype(int))
 GYROFLOW = "GYROFLOW IMU LOG\nversion,1.3\norientation,YxZ\ntscale,0.001\ngscale,0.00106423\n"
 ARRAYS = ",".join(["dt,scale,samples", *(f"{axis}[{k}]" for axis in "xyz" for k in range(8))])
-SIDE_BY_SIDE = ",".join(f"{chip}_g{axis}" for chip in ("icm", "asm") for axis in "xyz")
 SWITCH = 0.01 * np.random.default_rng(0).choice([1, 2], N)
 FLAGS = "temp (degC),sync,hundredths,status"
 WARMTH = 25 + 0.1 * np.random.default_rng(0).integers(0, 2, N)
@@ -117,17 +115,11 @@ SWING = X + [0, 20, 0] * np.sin(2 * np.pi * S / 3)[:, None]
 DEAD = np.where(np.abs(dead := still(bias=(0.04, -0.02, 0.01))) < 0.05, 0, dead)
 LEVEL = np.array([0.3, -0.2, 0.1])
 FREED = still(bias=(0, 0, 0))
-UNSIGNED = np.rint(still(bias=(0.0, -0.9, 0.4)) / 0.01).astype(int) & 0xFFFF
 STEPS = np.random.default_rng(0).normal(10, 0.3, N)
 
 KINDS: dict[str, tuple[str, list[Any], list[tuple[dict[str, Any], Ending]]]] = {
     "1 columns that say nothing of a row": (f"{T},{FLAGS},{G}",
         [S, WARMTH, K % 10 == 0, K % 100, K * 0 + 1, X], [({}, Kept())]),
-    "2 a header of two vendors": (XSENS, [K, [""] * N, ACC, X * RAD],
-        [({}, Refused("units.*reader")), ({"units": "rad/s"}, Kept())]),
-    "4 axes out of order": (f"{T},gz,gy,gx", [S, X[:, ::-1]],
-        [(DEG, Kept()), (BY_NUMBER, Refused("gz.*trust: options")),
-         (BY_NUMBER | TRUSTED, Kept(TRUTH[::-1]))]),
     **{f"4 no rates {names}": (f"{T},{names}", [S, X],
         [(DEG, Refused("columns|rate")), (BY_NUMBER, Refused(f"{names[:2]}.*trust"))])
        for names in ("ax,ay,az", "roll,pitch,yaw")},
@@ -135,50 +127,29 @@ KINDS: dict[str, tuple[str, list[Any], list[tuple[dict[str, Any], Ending]]]] = {
         [(RAW, Refused("offset")), (RAW | {"offset": 32768}, Kept())]),
     "5 a level of 130 deg/s": (f"{T},{G}", [S, X + 130],
         [({}, Refused("trust: options")), (TRUSTED, Kept(np.array(TRUTH) + 130))]),
-    "6 header and option": (f"{T},gx (rad/s),gy (rad/s),gz (rad/s),temp (°C)",
-        [S, blank(X, K == 0), S], [(BY_NUMBER, Refused("deg/s.*rad/s.*trust")),
-                                   (BY_NUMBER | TRUSTED, Kept())]),
     "7 rad/s called deg/s": (f"{T},{G}", [S, X * RAD],
         [({}, Kept(np.array(TRUTH) * RAD, "less noise.*unit"))]),
     "10 steps of 10 or 20 ms": (f"{T},{G}", [np.cumsum(SWITCH + STEPS * 3e-5), X], [({}, Kept())]),
     "16 Sensor Logger": ("time,seconds_elapsed,z,y,x", [STAMPS, S, X[:, ::-1] * RAD],
         [({}, Refused("unit")), ({"units": "rad/s"}, Kept(rate_hz=100))]),
-    "17 another unit of time": (f"time (ms),{G}", [S, X],
-        [({"time_units": "s"}, Refused("0.001 s.*trust: options")),
-         ({"time_units": "s"} | TRUSTED, Kept(rate_hz=100)),
-         ({}, Refused("100000 Hz.*time_units: s, which makes 100 Hz.*trust"))]),
     "23 a large swing": (f"{T},{G}", [S, SWING], [({}, Rejected("^(?!.*check the unit).*motion"))]),
     "24 a drift that does not settle": (f"{T},{G}", [S, X + np.linspace(0, 0.2, N)[:, None]],
         [({}, Kept(np.array(TRUTH) + 0.1, "^(?!.*warm-up)(?!.*1e.04).*drift"))]),
-    "26 unsigned counts": (f"{T},gx,gy,gz", [S, UNSIGNED],
-        [(RAW, Refused("signed_bits: 16")), (RAW | {"signed_bits": 16}, Kept((0, -0.9, 0.4)))]),
     "27 a dead band": (f"{T},{G}", [S, DEAD], [({}, Rejected("dead band.*0.05"))]),
     **{f"28 blank but in {k}": (f"{T},ax (g),ay (g),az (g),{G}", [S / 2, ACC, blank(X, K % k > 0)],
         [({}, Kept(rate_hz=200 / k))]) for k in (2, 4)},
-    "29 a scale above": (f"{GYROFLOW}t,gx,gy,gz", [K * 10, np.rint(X * RAD / 0.00106423)],
-        [(DEG, Refused("gscale.*scale_dps: 0.0010.*0.06")), ({}, Refused("gscale")),
-         ({"units": "raw", "scale_dps": 0.0609759}, Kept(rate_hz=100, within=0.03))]),
     **{f"30 a unit of something else {unit}": (f"{T},gx ({unit}),gy ({unit}),gz ({unit})", [S, X],
         [(DEG, Refused(f"{re.escape(unit)}.*trust: options"))])
        for unit in ("rad", "m/s^2", "1/s")},
     **{f"14, 30 {unit}": (f"{T},gx [{unit}],gy [{unit}],gz [{unit}]", [S, X / dps], [({}, Kept())])
        for unit, dps in {"rpm": 6, "deg/h": 1 / 3600, "mrad/s": RAD**-1 / 1e3, "°/sec": 1,
                          "rad s^-1": 1 / RAD, "mdps": 1e-3}.items()},
-    "30 increments": (f"{T},gx (rad),gy (rad),gz (rad)", [S, X * RAD / 100],
-        [({}, Refused("increments: true")), ({"increments": True}, Kept())]),
-    "31 a browser's z first": (f"{T},rotationRate.alpha,rotationRate.beta,rotationRate.gamma",
-        [S, X[:, [2, 0, 1]]], [(DEG, Kept()), (BY_NUMBER, Refused("alpha.*trust"))]),
     "33 a level that settles to zero": (f"{T},{G}", [S, FREED + LEVEL * np.exp(-S / 0.6)[:, None]],
         [({}, Rejected("zero|taken off"))]),
     "33 a name of Core Motion": (",".join([T, *(f"motionRotationRate{a}(rad/s)" for a in "XYZ")]),
         [S, FREED * RAD], [({}, Kept((0, 0, 0), "bias"))]),
-    "35 steps as time": (f"dt (ms),{G}", [STEPS, X],
-        [({}, Kept(words="time_is: steps")),
-         ({"time_column": "dt (ms)"}, Refused("time_is: steps")),
-         ({"time_column": "dt (ms)", "time_is": "steps"}, Kept(rate_hz=100))]),
     "36 lost decimal points": (f"{T},{G}", [S, np.rint(X * 1e8)],
         [({}, Refused("decimal point.*export"))]),
-    "38 minutes": (f"Time (min),{G}", [S / 60, X], [({}, Kept(rate_hz=100))]),
     **{f"38 ticks of {tick}": (f"ticks,{G}", [S / tick, X],
         [({"time_column": "ticks", "time_units": tick}, Kept(rate_hz=100))])
        for tick in (1e-7, 25e-6)},
@@ -186,9 +157,6 @@ KINDS: dict[str, tuple[str, list[Any], list[tuple[dict[str, Any], Ending]]]] = {
                                         np.repeat(X[:800], 8, axis=1)],
         [(DEG, Refused("row")),
          (DEG | {"columns": ["x[0]", "y[0]", "z[0]"]}, Refused("8 samples"))]),
-    "40 two sensors side by side": (f"{T},{SIDE_BY_SIDE}", [S, X, X + 1],
-        [(DEG, Refused("icm.*asm.*columns")),
-         (DEG | {"columns": ["asm_gx", "asm_gy", "asm_gz"]}, Kept(np.array(TRUTH) + 1))]),
 }  # fmt: skip
 
 
@@ -202,36 +170,11 @@ def test_each_kind_ends_in_advice_or_with_the_right_bias(path: Path, kind: str) 
 
 # -- a recording is of one device, and its values are samples ---------------------------------
 
-DEVICES = np.array([(1, -0.5, 0.25), (-0.3, 0.7, 0.1), (0.2, 0.1, -0.6)])
-ROWS = np.arange(9000)
-ORDERS = {
-    "two in turn": ROWS % 2,
-    "in bursts": ROWS // 50 % 3,
-    "at random": np.random.default_rng(3).integers(0, 3, 9000),
-}
 
-
-@pytest.mark.parametrize("name", ORDERS)
-def test_kind_1_devices_that_take_turns_are_refused_and_rows_picks(path: Path, name: str) -> None:
-    order = ORDERS[name]
-    rates = DEVICES[order] + np.random.default_rng(1).normal(0, 0.05, (9000, 3))
-    text(path, f"{T},sensor,{G}", ROWS / 300, order + 1, rates)
-    check(path, Refused("'sensor'.*rows:.*reader"))
-    # what a device measures in bursts has gaps
-    picked = Rejected("too short") if name == "in bursts" else Kept(DEVICES[0])
-    check(path, picked, rows={"sensor": 1})
-    text(path, f"{T},kind,{G}", ROWS / 300, np.array(["gyr", "acc", "mag"])[order], rates)
-    check(path, Refused("kind.*gyr.*rows: {kind: gyr}"))
-    text(path, G, rates)  # nothing says so but the values
-    check(path, Rejected("mixed rows|motion"))
-
-
-@pytest.mark.parametrize("k", [10])
-def test_kind_3_samples_written_several_times_say_their_true_share(path: Path, k: int) -> None:
-    text(path, f"{T},{G}", np.arange(60_000) / 1000, np.repeat(still(60_000 // k), k, axis=0))
-    check(path, Rejected(rf"{100 - 100 / k:g}(\.0)?%.*repeats: drop"))
-    if k == 10:
-        check(path, Kept(rate_hz=100), repeats="drop")
+def test_kind_3_samples_written_ten_times_say_their_true_share(path: Path) -> None:
+    text(path, f"{T},{G}", np.arange(60_000) / 1000, np.repeat(still(6000), 10, axis=0))
+    check(path, Rejected(r"90(\.0)?%.*repeats: drop"))
+    check(path, Kept(rate_hz=100), repeats="drop")
 
 
 @pytest.mark.parametrize(("rate_hz", "hours"), [(5, 2)])
@@ -264,25 +207,10 @@ def test_kind_34_a_start_of_some_rows_is_cut(path: Path) -> None:
 # -- a file is a table, or `row:` makes it so -------------------------------------------------
 
 
-@pytest.mark.parametrize("header", ["", "t gx gy gz"])
-@pytest.mark.parametrize("fmt", ["%.18e", "%10.5f"])
-def test_kind_11_savetxt(path: Path, header: str, fmt: str) -> None:
-    np.savetxt(path, np.column_stack([S, X]), header=header, fmt=fmt)
-    columns = {} if header else {"columns": [1, 2, 3], "time_column": 0}
-    check(path, Kept(), time_units="s", **DEG, **columns)
-
-
 # -- time is told by content ------------------------------------------------------------------
 
 
 # -- what is no log, and what stands beside the rates ---------------------------------------------
-
-
-def test_kind_37_a_header_in_another_encoding(path: Path) -> None:
-    text(path, "时间(s),角速度X(°/s),角速度Y(°/s),角速度Z(°/s)", S, X)
-    path.write_bytes(path.read_text().encode("gbk"))
-    check(path, Refused("encoding"))
-    check(path, Kept(), encoding="gbk")
 
 
 def test_kind_23_files_that_are_no_logs_get_advice(tmp_path: Path) -> None:

@@ -133,21 +133,6 @@ def test_any_numbers_of_imus_and_recordings(make):
     check(project.run_here("ground_truth", "mine"), [(2, 1), (2, 2), (3, 1)])
 
 
-def test_one_short_recording_of_a_sensor_with_studies_that_ask_for_more(make):
-    files = ENVIRONMENT["catalog"].replace("device", "dot")
-    project = make(
-        "1.csv",
-        seconds=20,
-        globals="source: mine\nsensors: {dot: {imus: 1, samples: 2000, recording_s: 20}}\n",
-        parameters="only: {sensor: dot}\n",
-        catalog=files + "  sensors: ${globals:sensors}\n",
-    )
-    check(project.run_here("ground_truth", "mine"), [(1, 1)], seconds=20)
-    refused = project.run_here("real2real", "mine")
-    assert refused.code == 1
-    assert "studies.real2real.dot: 12 real gyroscopes asked, dot has 3" in refused.output
-
-
 def test_without_times_the_rate_is_asked_for_and_taken(make):
     names = {
         "sensors": "  sensors: ${globals:sensors}\n",
@@ -162,16 +147,6 @@ def test_without_times_the_rate_is_asked_for_and_taken(make):
     known = f"source: mine\nsensors: {{device: {{rate_hz: {RATE_HZ}}}}}\n"
     (project.folder / "conf/mine/globals.yml").write_text(known)
     check(project.run_here("ground_truth", "mine"), [(1, 1)])
-
-
-def test_a_sensor_without_files_is_not_simulated_from_nothing(make):
-    project = make("1.csv", catalog="{}\n")
-    done = project.run_here("ground_truth", "mine")
-    assert done.code == 1
-    assert (
-        "device has no files: an entry device.raw_logs.files in conf/<env>/catalog" in done.output
-    )
-    assert "imus, recordings, train_recordings, samples, recording_s, simulated" in done.output
 
 
 def documented_options():

@@ -158,6 +158,15 @@ def test_ridge_regression_solves_its_normal_equations():
     np.testing.assert_allclose(weights, [1.0, -1.0, 0.5, 0.0], atol=0.1)
 
 
+def test_ridge_returns_the_constant_where_windows_tell_nothing(simulate, training_set):
+    flat = model_of(SAMPLES, RATE, NoiseFigures(N, 0, 0), 0.0, 0.0)
+    recordings = simulate(flat, 60, seed=5)
+    windows = recordings.angular_rate.to_numpy()[0, :, :, :SIZE]
+    bias, _ = Ridge().fit(training_set(recordings)).estimate(windows)
+    constant = recordings.angular_rate.to_numpy()[0].mean(axis=(0, 2), dtype=np.float64)
+    assert rms(bias - constant) < 0.2 * N / np.sqrt(SIZE / RATE)
+
+
 def test_ridge_of_the_same_time_copes_with_a_warm_up(simulate, judged, training_set):
     model = RecordingModel(
         SAMPLES, RATE, WHITE.noise, np.array([0.0, 20 * MDPS]), np.diag([TAU**2, TAU**2]), 15.0

@@ -35,7 +35,7 @@ def test_how_blocks_are_dealt_to_calls_changes_no_bit():
 @pytest.mark.parametrize("known", [False, True])
 def test_a_change_and_raised_noise_are_told_on_their_axis_and_at_once(known):
     means, variances = moments(np.random.default_rng(2), 120)
-    means[60:, 1] += 0.15
+    means[60:, 1] -= 0.15
     variances[90:92, 2] *= 9
     noise = {"noise_dps": [SIGMA] * 3} if known else {}
     moved, noisier = detector(**noise).update(means, variances)
