@@ -73,9 +73,7 @@ def refused(project, words, pipeline="real2real", env="mine", run=None, **params
     ("pipeline", "params", "words"),
     [
         ("real2real", {"trainin": {"epochs": 3}}, ["trainin: unknown key", "conf/base"]),
-        ("real2real", {"windows_s": [10, 60]}, ["windows_s", "60 s", "longer", "memsense, 52 s"]),
         ("augmentation", {"only": {"real_gyros": 6}}, ["matches nothing", "real_gyros"]),
-        ("input_channels", {"only": {"seed": 1}}, ["matches nothing", "seed"]),
     ],
 )
 def test_parameters(new_project, pipeline, params, words):
@@ -86,7 +84,6 @@ def test_parameters(new_project, pipeline, params, words):
     ("entry", "words"),
     [
         ({"patern": "*.npy"}, ["unexpected keyword argument 'patern'", FILES]),
-        ({"files": None}, ["missing 1 required positional argument: 'files'"]),
     ],
 )
 def test_keys_of_a_catalog_entry(mine, entry, words):
@@ -98,11 +95,10 @@ def test_keys_of_a_catalog_entry(mine, entry, words):
     [
         (good()[0], ["along 3 axes", "got float32 of shape (3, 1300)"]),
         (with_one((6, 2), 0.25), ["IMU 1 recording 7", "mine.npy recording 7", "stuck", "axis z"]),
-        (good()[:, :2], ["(7, 2, 1300)", "gyroscopes in threes"]),
         (good()[..., :200], ["0 of 7 recordings", "too short", "8 s", "quality.least_s"]),
         (good()[..., :300], ["window of 30 s is 750 samples", "has 300", "windows_s"]),
     ],
-    ids=["rank", "constant", "gyroscopes", "short", "window"],
+    ids=["rank", "constant", "short", "window"],
 )
 def test_files(mine, array, words):
     refused(mine(array), ["memsense", *words])
@@ -125,13 +121,13 @@ def test_what_is_not_there(mine):
     refused(mine(real_gyros=6), words)
 
 
-@pytest.mark.parametrize("place", ["data/01_raw", "data/05_model_input", "mlruns"])
+@pytest.mark.parametrize("place", ["data/05_model_input", "mlruns"])
 def test_a_file_in_place_of_a_folder(new_project, place):
     project = new_project()
     (project.folder / place).write_text("in the way")
     words = [f"{place} is a file where a folder is needed; move it away"]
     refused(project, words, env="smoke", only={"sensor": "ng"})
-    if place == "data/05_model_input":  # 01_raw is written before runs are planned
+    if place == "data/05_model_input":
         assert set(project.files()) == {place}
 
 
@@ -158,11 +154,10 @@ def of_another_version(store):
     ("spoil", "words"),
     [
         (damage, ["malformed", "move it away"]),
-        (lambda store: store.write_text("not a database" * 99), ["not a database", "move it away"]),
         (foreign, ["expected an MLflow store", "tables books", "move it away"]),
         (of_another_version, ["mlflow db upgrade"]),
     ],
-    ids=["damaged", "text", "foreign", "version"],
+    ids=["damaged", "foreign", "version"],
 )
 def test_run_stores(mine, spoil, words):
     project = mine()

@@ -6,7 +6,6 @@ import sqlite3
 import sys
 from concurrent.futures.process import BrokenProcessPool
 
-import numpy as np
 import pytest
 from kedro.config import OmegaConfigLoader
 from kedro.io import DatasetError
@@ -33,12 +32,9 @@ def raised(error, cause=None):
     [
         (InputError("bias.csv: type make"), ["bias.csv: type make"]),
         (OSError(errno.ENOSPC, "No space left on device", "a.nc"), ["write a.nc", "free some"]),
-        (OSError("flush failed (errno = 28, error message = 'No space')"), ["cannot write"]),
-        (OSError(errno.EROFS, "Read-only file system", "a.nc"), ["a.nc", "writable"]),
         (PermissionError(errno.EACCES, "Permission denied", "x.db"), ["x.db", "readable"]),
         (FileNotFoundError(errno.ENOENT, "No such file", "log.csv"), ["log.csv", "no such file"]),
         (BrokenProcessPool("terminated abruptly"), ["memory", "execution.workers"]),
-        (np.exceptions.AxisError("no"), None),
         (MemoryError(), ["memory ran out"]),
         (sqlite3.OperationalError("database or disk is full"), ["run store", "disk is full"]),
         (MlflowException("http://u:secret@h failed"), ["run store", "http://u:***@h failed"]),
@@ -61,8 +57,6 @@ def test_what_others_throw_becomes_a_line_and_a_defect_of_ours_does_not(tmp_path
         (b"a: 1\nb: 2\na: 3\n", "line 3: found duplicate key a"),
         ("a: 1\nb: gr\xf6\xdfe\n".encode("latin-1"), "line 2: not UTF-8"),
         (b"a: 1\nb: [1,\n", "line 3: "),
-        (b"- a\n- b\n", "line 1: expected keys and their values, got a list"),
-        (b"a: \x00\n", "broken.yml: "),
     ],
 )
 def test_a_fault_in_the_configuration_is_named_by_file_and_line(tmp_path, content, words):

@@ -6,9 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-import yaml
 
-from gyro_pipeline.datasets.file_logs import FileLogs
 from gyro_pipeline.datasets.recordings import open_recordings
 from gyro_pipeline.parameters import ReaderOptions
 from gyro_pipeline.physics.bias import recording_mean
@@ -99,49 +97,3 @@ def test_biases_and_noise_are_those_of_numpy_over_unmasked_rows_to_ten_digits(ra
     for imu, _, samples in iterate_recordings(cut_to_length(recordings, STOP - START)):
         means = rows[imu][START:STOP].mean(axis=0)
         np.testing.assert_allclose(recording_mean(samples), means, rtol=5e-11)
-
-
-def as_rad_per_s(table, path):
-    rates = {f"Gyroscope {axis} (rad/s)": np.deg2rad(table[f"w_{axis.lower()}"]) for axis in "XYZ"}
-    pd.DataFrame({"Time (s)": table.Time, **rates}).to_csv(path, index=False, na_rep="NaN")
-
-
-def as_artemis(table, path):
-    """Times of day in hundredths of a second, as that logger writes them."""
-    times = pd.Timestamp("2024-05-06 12:00") + pd.to_timedelta(table.Time, unit="s")
-    written = {
-        "rtcDate": times.dt.strftime("%m/%d/%Y"),
-        "rtcTime": times.dt.strftime("%H:%M:%S.%f").str[:-4],
-        **{f"a{axis}": table[f"f_{axis.lower()}"] * 1000 for axis in "XYZ"},
-        **{f"g{axis}": table[f"w_{axis.lower()}"] for axis in "XYZ"},
-        "imu_degC": 25.5,
-        "output_Hz": RATE_HZ,
-    }
-    pd.DataFrame(written).to_csv(path, index=False, na_rep="NaN")
-
-
-@pytest.mark.parametrize(
-    ("write", "name"), [(as_rad_per_s, "rad_{imu}.csv"), (as_artemis, "artemis_{imu}.csv")]
-)
-def test_copies_in_other_formats_and_units_give_the_same_biases(
-    folder, bias, parameters, read_logs, tmp_path, write, name
-):
-    for imu in IMUS:
-        table = pd.read_csv(
-            folder / f"dot_x_stat_{imu}.csv", index_col=False, skipinitialspace=True
-        )
-        write(table, tmp_path / name.format(imu=imu))
-    sensors = yaml.safe_load((Path(__file__).parents[1] / "conf/base/globals.yml").read_text())
-    source = FileLogs(
-        "dot",
-        *("copies", str(tmp_path)),
-        sensors={"dot": sensors["sensors"]["dot"] | {"samples": 14448, "recording_s": 120.4}},
-        pattern=name,
-    )
-    asked = parameters("dot_real").quality
-    recordings, table = read_logs(source.load(), asked, tmp_path)
-    assert table.outcome.tolist() == ["repaired", "kept", "kept", "kept", "kept"]
-    assert recordings.attrs["rate_hz"] == pytest.approx(RATE_HZ, rel=1e-3)
-    means = [recording_mean(samples) for _, _, samples in iterate_recordings(recordings)]
-    expected = bias.bias_dps.to_numpy().reshape(5, 3)
-    np.testing.assert_allclose(means, expected, rtol=0, atol=1e-6)

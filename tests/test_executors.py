@@ -23,7 +23,7 @@ from joblib.externals.loky import get_reusable_executor
 
 from gyro_pipeline import executors
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.executors import available_cores, run_jobs
+from gyro_pipeline.executors import run_jobs
 from gyro_pipeline.parameters import Execution
 
 SERIAL = Execution(executor="serial", workers=None)
@@ -128,18 +128,6 @@ def test_lines_tell_how_much_of_the_work_is_done_and_a_terminal_gets_a_bar(monke
     list(run_jobs([Job("a", 5.0), Job("b", 7.0)], lambda job: None, SERIAL, "study"))
     assert "study 100%" in terminal.getvalue()
     assert " left" not in caplog.text
-
-
-def test_available_cores_are_those_this_process_may_use():
-    if not hasattr(os, "sched_setaffinity"):
-        pytest.skip("this system cannot bind a process to cores")
-    mine = os.sched_getaffinity(0)
-    assert available_cores() == len(mine)
-    os.sched_setaffinity(0, {min(mine)})
-    try:
-        assert available_cores() == 1
-    finally:
-        os.sched_setaffinity(0, mine)
 
 
 @pytest.mark.parametrize("execution", [SERIAL, PAIR], ids=["serial", "processes"])

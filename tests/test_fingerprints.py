@@ -62,15 +62,11 @@ def forget():
     ("old", "new"),
     [
         ("    # pi r squared\n", ""),
-        ("LIMIT = 3\n", "LIMIT = 3  # at most\n"),
         ('"""A module."""\n', ""),
         ('    """A box."""\n', '    """Another box.\n\n    With a story.\n    """\n'),
-        ('        """Divide."""\n', ""),
         ('    """Of a disc."""\n', "    'Of a circle.'\n"),
         ('"""Of something."""\n', '"""Of something else."""\n'),
-        ('"""Of something."""\n', ""),
         ("math.pi * radius**2", "(\n        math.pi * radius ** 2\n    )"),
-        ("LIMIT = 3", "\n\n\nLIMIT  =  3"),
     ],
 )
 def test_comments_docstrings_and_layout_do_not_count(hash_of, old, new):
@@ -83,11 +79,8 @@ def test_comments_docstrings_and_layout_do_not_count(hash_of, old, new):
     [
         ("LIMIT = 3", "LIMIT = 4"),
         ("radius**2", "radius**3"),
-        ("math.pi * radius", "math.pi + radius"),
         ("x: float = 2.0", "x: float = 2.5"),
-        ("size = 1", "width = 1"),
         ("return x / self.size", "print(x)\n        return x / self.size"),
-        ("return math.pi", "return 'pi' and math.pi"),
     ],
 )
 def test_code_counts(hash_of, old, new):
@@ -175,10 +168,6 @@ def test_what_is_not_imported_does_not_count(counting):
     assert "gyro_pipeline/estimators/linear.py" not in counting
 
 
-def test_a_package_counts_with_all_its_modules():
-    assert code_hash("gyro_pipeline.physics") != code_hash("gyro_pipeline.physics.bias")
-
-
 def test_a_module_that_is_not_there_is_refused():
     with pytest.raises(ModuleNotFoundError, match="no module 'not_there'"):
         code_hash("not_there:Mine")
@@ -209,10 +198,8 @@ def changed(index, value):
         changed((1, 2, 3), np.nextafter(np.float32(23), np.float32(24))),
         changed((0, 0, 0), -0.0),
         ARRAY.astype(np.float64),
-        ARRAY.view(np.int32),
         ARRAY.reshape(3, 2, 4),
         ARRAY[:, ::-1],
-        ARRAY[:1],
     ],
 )
 def test_data_hash_sees_values_shape_and_type(other):

@@ -25,12 +25,6 @@ def test_settings_of_a_command_name_the_folder_of_its_report(given, name):
     assert settings_in_words(given) == name
 
 
-def test_long_settings_are_cut_and_still_told_apart():
-    names = [settings_in_words({"seeds": [*range(100), last]}) for last in (1, 2)]
-    assert names[0] != names[1]
-    assert max(map(len, names)) < 100
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [

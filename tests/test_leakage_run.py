@@ -19,14 +19,12 @@ WAYS = {
 }
 
 
-def test_each_way_of_training_is_one_run_made_once_and_shares_nothing_with_another_study(
-    new_project,
-):
+def test_each_way_of_training_is_one_run_made_once(new_project):
     project = new_project()
 
-    def run(pipeline="leakage", study=FEW, **params):
-        given = {"execution": {"executor": "serial"}}
-        return project.run_here(pipeline, "smoke", studies={"leakage": study}, **given | params)
+    def run(study=FEW, **params):
+        given = {"execution": {"executor": "serial"}, "studies": {"leakage": study}}
+        return project.run_here("leakage", "smoke", **given | params)
 
     refused = run(only={"sensor": "dot"})
     assert refused.code != 0
@@ -56,10 +54,3 @@ def test_each_way_of_training_is_one_run_made_once_and_shares_nothing_with_anoth
     paths = (project.folder / REPORT).rglob("tables/leakage_results.csv")
     table = pd.read_csv(max(paths, key=lambda path: path.stat().st_mtime))
     assert table["Window stride s"].tolist() == [10, 20]
-
-    only = {"sensor": "memsense", "real_gyros": 3, "window_s": 10}
-    other = run("real2real", only=only, training={"epochs": 2})
-    assert other.code == 0, other.output
-    assert "5 runs planned, 0 skipped (made before), 0 shared with another study" in other.output
-    (page,) = [path for path in project.files(REPORT) if "only" in path and path.endswith("t.md")]
-    assert "on purpose" not in project.files(REPORT)[page].decode()

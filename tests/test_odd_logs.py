@@ -105,11 +105,9 @@ T, G = "time (s)", "gx (deg/s),gy (deg/s),gz (deg/s)"
 DEG, TRUSTED = {"units": "deg/s"}, {"trust": "options"}
 BY_NUMBER: dict[str, Any] = DEG | {"columns": [1, 2, 3]}
 RAW: dict[str, Any] = {"units": "raw", "scale_dps": 0.01}
-XSENS = "PacketCounter,SampleTimeFine,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z"
 STAMPS = np.char.mod("%d", 1_700_000_000_000_000_000 + (S * 1e9).astype(int))
 GYROFLOW = "GYROFLOW IMU LOG\nversion,1.3\norientation,YxZ\ntscale,0.001\ngscale,0.00106423\n"
 ARRAYS = ",".join(["dt,scale,samples", *(f"{axis}[{k}]" for axis in "xyz" for k in range(8))])
-SIDE_BY_SIDE = ",".join(f"{chip}_g{axis}" for chip in ("icm", "asm") for axis in "xyz")
 SWITCH = 0.01 * np.random.default_rng(0).choice([1, 2], N)
 FLAGS = "temp (degC),sync,hundredths,status"
 WARMTH = 25 + 0.1 * np.random.default_rng(0).integers(0, 2, N)
@@ -117,78 +115,41 @@ SWING = X + [0, 20, 0] * np.sin(2 * np.pi * S / 3)[:, None]
 DEAD = np.where(np.abs(dead := still(bias=(0.04, -0.02, 0.01))) < 0.05, 0, dead)
 LEVEL = np.array([0.3, -0.2, 0.1])
 FREED = still(bias=(0, 0, 0))
-UNSIGNED = np.rint(still(bias=(0.0, -0.9, 0.4)) / 0.01).astype(int) & 0xFFFF
 STEPS = np.random.default_rng(0).normal(10, 0.3, N)
 
 KINDS: dict[str, tuple[str, list[Any], list[tuple[dict[str, Any], Ending]]]] = {
     "1 columns that say nothing of a row": (f"{T},{FLAGS},{G}",
         [S, WARMTH, K % 10 == 0, K % 100, K * 0 + 1, X], [({}, Kept())]),
-    "2 a header of two vendors": (XSENS, [K, [""] * N, ACC, X * RAD],
-        [({}, Refused("units.*reader")), ({"units": "rad/s"}, Kept())]),
-    "2 one more column": (f"{XSENS},Quat_q0", [K, [""] * N, ACC, X * RAD, S],
-        [({}, Refused("units.*reader")), ({"units": "rad/s"}, Kept())]),
-    "4 axes out of order": (f"{T},gz,gy,gx", [S, X[:, ::-1]],
-        [(DEG, Kept()), (BY_NUMBER, Refused("gz.*trust: options")),
-         (BY_NUMBER | TRUSTED, Kept(TRUTH[::-1]))]),
     **{f"4 no rates {names}": (f"{T},{names}", [S, X],
         [(DEG, Refused("columns|rate")), (BY_NUMBER, Refused(f"{names[:2]}.*trust"))])
-       for names in ("ax,ay,az", "roll,pitch,yaw", "mx,my,mz", "accX,accY,accZ")},
+       for names in ("ax,ay,az", "roll,pitch,yaw")},
     "5 counts about an offset": (f"{T},gx,gy,gz", [S, np.rint(32768 + X / 0.01)],
         [(RAW, Refused("offset")), (RAW | {"offset": 32768}, Kept())]),
     "5 a level of 130 deg/s": (f"{T},{G}", [S, X + 130],
         [({}, Refused("trust: options")), (TRUSTED, Kept(np.array(TRUTH) + 130))]),
-    "6 header and option": (f"{T},gx (rad/s),gy (rad/s),gz (rad/s),temp (°C)",
-        [S, blank(X, K == 0), S], [(BY_NUMBER, Refused("deg/s.*rad/s.*trust")),
-                                   (BY_NUMBER | TRUSTED, Kept())]),
     "7 rad/s called deg/s": (f"{T},{G}", [S, X * RAD],
         [({}, Kept(np.array(TRUTH) * RAD, "less noise.*unit"))]),
     "10 steps of 10 or 20 ms": (f"{T},{G}", [np.cumsum(SWITCH + STEPS * 3e-5), X], [({}, Kept())]),
-    "15 two header rows": ("Time (s),IMU Acceleration,,,IMU Gyroscope (rad/s),,\n,X,Y,Z,X,Y,Z",
-        [S, ACC, X * RAD], [({}, Kept())]),
     "16 Sensor Logger": ("time,seconds_elapsed,z,y,x", [STAMPS, S, X[:, ::-1] * RAD],
         [({}, Refused("unit")), ({"units": "rad/s"}, Kept(rate_hz=100))]),
-    "17 another unit of time": (f"time (ms),{G}", [S, X],
-        [({"time_units": "s"}, Refused("0.001 s.*trust: options")),
-         ({"time_units": "s"} | TRUSTED, Kept(rate_hz=100)),
-         ({}, Refused("100000 Hz.*time_units: s, which makes 100 Hz.*trust"))]),
     "23 a large swing": (f"{T},{G}", [S, SWING], [({}, Rejected("^(?!.*check the unit).*motion"))]),
     "24 a drift that does not settle": (f"{T},{G}", [S, X + np.linspace(0, 0.2, N)[:, None]],
         [({}, Kept(np.array(TRUTH) + 0.1, "^(?!.*warm-up)(?!.*1e.04).*drift"))]),
-    "26 unsigned counts": (f"{T},gx,gy,gz", [S, UNSIGNED],
-        [(RAW, Refused("signed_bits: 16")), (RAW | {"signed_bits": 16}, Kept((0, -0.9, 0.4)))]),
     "27 a dead band": (f"{T},{G}", [S, DEAD], [({}, Rejected("dead band.*0.05"))]),
     **{f"28 blank but in {k}": (f"{T},ax (g),ay (g),az (g),{G}", [S / 2, ACC, blank(X, K % k > 0)],
         [({}, Kept(rate_hz=200 / k))]) for k in (2, 4)},
-    "29 a scale above": (f"{GYROFLOW}t,gx,gy,gz", [K * 10, np.rint(X * RAD / 0.00106423)],
-        [(DEG, Refused("gscale.*scale_dps: 0.0010.*0.06")), ({}, Refused("gscale")),
-         ({"units": "raw", "scale_dps": 0.0609759}, Kept(rate_hz=100, within=0.03))]),
     **{f"30 a unit of something else {unit}": (f"{T},gx ({unit}),gy ({unit}),gz ({unit})", [S, X],
         [(DEG, Refused(f"{re.escape(unit)}.*trust: options"))])
-       for unit in ("rad", "deg", "m/s^2", "g", "uT", "Hz", "1/s", "V")},
+       for unit in ("rad", "m/s^2", "1/s")},
     **{f"14, 30 {unit}": (f"{T},gx [{unit}],gy [{unit}],gz [{unit}]", [S, X / dps], [({}, Kept())])
-       for unit, dps in {"rpm": 6, "rev/s": 360, "deg/h": 1 / 3600, "mrad/s": RAD**-1 / 1e3,
-                         "°/sec": 1, "deg_per_s": 1, "rad_per_s": 1 / RAD, "rads/s": 1 / RAD,
-                         "millidegrees/s": 1e-3, "deg·s⁻¹": 1, "rad s^-1": 1 / RAD, "dps": 1,
-                         "mdps": 1e-3}.items()},
-    "30 increments": (f"{T},gx (rad),gy (rad),gz (rad)", [S, X * RAD / 100],
-        [({}, Refused("increments: true")), ({"increments": True}, Kept())]),
-    "31 a browser's z first": (f"{T},rotationRate.alpha,rotationRate.beta,rotationRate.gamma",
-        [S, X[:, [2, 0, 1]]], [(DEG, Kept()), (BY_NUMBER, Refused("alpha.*trust"))]),
+       for unit, dps in {"rpm": 6, "deg/h": 1 / 3600, "mrad/s": RAD**-1 / 1e3, "°/sec": 1,
+                         "rad s^-1": 1 / RAD, "mdps": 1e-3}.items()},
     "33 a level that settles to zero": (f"{T},{G}", [S, FREED + LEVEL * np.exp(-S / 0.6)[:, None]],
-        [({}, Rejected("zero|taken off"))]),
-    "33 a level that jumps to zero": (f"{T},{G}", [S, FREED + LEVEL * (K < 2000)[:, None]],
         [({}, Rejected("zero|taken off"))]),
     "33 a name of Core Motion": (",".join([T, *(f"motionRotationRate{a}(rad/s)" for a in "XYZ")]),
         [S, FREED * RAD], [({}, Kept((0, 0, 0), "bias"))]),
-    "33 a name of Betaflight": (",".join([T, *(f"gyroADC[{a}] (deg/s)" for a in range(3))]),
-        [S, FREED], [({}, Kept((0, 0, 0), "bias"))]),
-    "35 steps as time": (f"dt (ms),{G}", [STEPS, X],
-        [({}, Kept(words="time_is: steps")),
-         ({"time_column": "dt (ms)"}, Refused("time_is: steps")),
-         ({"time_column": "dt (ms)", "time_is": "steps"}, Kept(rate_hz=100))]),
     "36 lost decimal points": (f"{T},{G}", [S, np.rint(X * 1e8)],
         [({}, Refused("decimal point.*export"))]),
-    "38 minutes": (f"Time (min),{G}", [S / 60, X], [({}, Kept(rate_hz=100))]),
     **{f"38 ticks of {tick}": (f"ticks,{G}", [S / tick, X],
         [({"time_column": "ticks", "time_units": tick}, Kept(rate_hz=100))])
        for tick in (1e-7, 25e-6)},
@@ -196,9 +157,6 @@ KINDS: dict[str, tuple[str, list[Any], list[tuple[dict[str, Any], Ending]]]] = {
                                         np.repeat(X[:800], 8, axis=1)],
         [(DEG, Refused("row")),
          (DEG | {"columns": ["x[0]", "y[0]", "z[0]"]}, Refused("8 samples"))]),
-    "40 two sensors side by side": (f"{T},{SIDE_BY_SIDE}", [S, X, X + 1],
-        [(DEG, Refused("icm.*asm.*columns")),
-         (DEG | {"columns": ["asm_gx", "asm_gy", "asm_gz"]}, Kept(np.array(TRUTH) + 1))]),
 }  # fmt: skip
 
 
@@ -212,44 +170,17 @@ def test_each_kind_ends_in_advice_or_with_the_right_bias(path: Path, kind: str) 
 
 # -- a recording is of one device, and its values are samples ---------------------------------
 
-DEVICES = np.array([(1, -0.5, 0.25), (-0.3, 0.7, 0.1), (0.2, 0.1, -0.6)])
-ROWS = np.arange(9000)
-ORDERS = {
-    "three in turn": ROWS % 3,
-    "two in turn": ROWS % 2,
-    "in bursts": ROWS // 50 % 3,
-    "at random": np.random.default_rng(3).integers(0, 3, 9000),
-    "phase slips": (ROWS + np.searchsorted([1000, 3501, 7002], ROWS, "right")) % 2,
-}
+
+def test_kind_3_samples_written_ten_times_say_their_true_share(path: Path) -> None:
+    text(path, f"{T},{G}", np.arange(60_000) / 1000, np.repeat(still(6000), 10, axis=0))
+    check(path, Rejected(r"90(\.0)?%.*repeats: drop"))
+    check(path, Kept(rate_hz=100), repeats="drop")
 
 
-@pytest.mark.parametrize("name", ORDERS)
-def test_kind_1_devices_that_take_turns_are_refused_and_rows_picks(path: Path, name: str) -> None:
-    order = ORDERS[name]
-    rates = DEVICES[order] + np.random.default_rng(1).normal(0, 0.05, (9000, 3))
-    text(path, f"{T},sensor,{G}", ROWS / 300, order + 1, rates)
-    check(path, Refused("'sensor'.*rows:.*reader"))
-    # what a device measures in bursts has gaps
-    picked = Rejected("too short") if name == "in bursts" else Kept(DEVICES[0])
-    check(path, picked, rows={"sensor": 1})
-    text(path, f"{T},kind,{G}", ROWS / 300, np.array(["gyr", "acc", "mag"])[order], rates)
-    check(path, Refused("kind.*gyr.*rows: {kind: gyr}"))
-    text(path, G, rates)  # nothing says so but the values
-    check(path, Rejected("mixed rows|motion"))
-
-
-@pytest.mark.parametrize("k", [2, 10, 40])
-def test_kind_3_samples_written_several_times_say_their_true_share(path: Path, k: int) -> None:
-    text(path, f"{T},{G}", np.arange(60_000) / 1000, np.repeat(still(60_000 // k), k, axis=0))
-    check(path, Rejected(rf"{100 - 100 / k:g}(\.0)?%.*repeats: drop"))
-    if k == 10:
-        check(path, Kept(rate_hz=100), repeats="drop")
-
-
-@pytest.mark.parametrize(("rate_hz", "hours"), [(10, 1), (5, 2)])
+@pytest.mark.parametrize(("rate_hz", "hours"), [(5, 2)])
 def test_kind_8_long_recordings_of_a_low_rate(path: Path, rate_hz: float, hours: float) -> None:
     n = int(3600 * rate_hz * hours)
-    for seed in range(3):
+    for seed in range(1):
         text(path, f"{T},{G}", np.arange(n) / rate_hz, still(n, seed=seed), digits=5)
         check(path, Kept())
 
@@ -276,101 +207,10 @@ def test_kind_34_a_start_of_some_rows_is_cut(path: Path) -> None:
 # -- a file is a table, or `row:` makes it so -------------------------------------------------
 
 
-@pytest.mark.parametrize("header", ["", "t gx gy gz"])
-@pytest.mark.parametrize("fmt", ["%.18e", "%10.5f"])
-def test_kind_11_savetxt(path: Path, header: str, fmt: str) -> None:
-    np.savetxt(path, np.column_stack([S, X]), header=header, fmt=fmt)
-    columns = {} if header else {"columns": [1, 2, 3], "time_column": 0}
-    check(path, Kept(), time_units="s", **DEG, **columns)
-
-
-def test_kind_11_sixty_columns(path: Path) -> None:
-    table = np.random.default_rng(5).normal(0, 1, (3000, 60))
-    table[:, 7:10] = still(3000)
-    np.savetxt(path, table)
-    check(path, Kept(), columns=[7, 8, 9], **DEG)
-
-
-@pytest.mark.parametrize("between", ["\n", "\n  \n"])
-@pytest.mark.parametrize("end", ["", "\n"])
-def test_kind_12_blank_lines_and_a_last_line_without_end(
-    path: Path, between: str, end: str
-) -> None:
-    text(path, f"{T},{G}", S[:3000], X[:3000])
-    path.write_text(path.read_text().strip().replace("\n", between) + end)
-    log = read_log(path, ReaderOptions())
-    assert len(log.samples) == 3000 and not log.findings
-
-
-LINES = {  # how a line is written, an expression that reads it, and what the file says without
-    "vectornav": ("$VNYMR,+010.1,+001.2,-000.3,{x:+.6f},{y:+.6f},{z:+.6f}*{k}",
-                  r"(?P<gx>[-+.\d]+),(?P<gy>[-+.\d]+),(?P<gz>[-+.\d]+)\*"),
-    "console": ("12:00:{t:09.6f} -> {x},{y},{z}",
-                r"(?P<time>[\d:.]+) -> (?P<gx>[^,]+),(?P<gy>[^,]+),(?P<gz>[^,]+)"),
-    "tuple": ("gyro=({x}, {y}, {z})", r"gyro=\((?P<gx>[^,]+), (?P<gy>[^,]+), (?P<gz>[^)]+)\)"),
-    "labels": ("X: {x}   Y: {y}   Z: {z}", r"X: (?P<gx>\S+)\s+Y: (?P<gy>\S+)\s+Z: (?P<gz>\S+)"),
-    "json": ('{{"t": {t}, "gx": {x}, "gy": {y}, "gz": {z}}}',
-             r'"gx": (?P<gx>[^,]+), "gy": (?P<gy>[^,]+), "gz": (?P<gz>[^}]+)}'),
-    "boot": ("I ({k}) imu: {x} {y} {z}", r"imu: (?P<gx>\S+) (?P<gy>\S+) (?P<gz>\S+)"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("kind", LINES)
-def test_kind_32_lines_that_are_no_table(path: Path, kind: str) -> None:
-    form, row = LINES[kind]
-    rows = [
-        form.format(k=k, t=k / 100, x=x, y=y, z=z)
-        for k, (x, y, z) in enumerate(X.round(6).tolist())
-    ]
-    rows[::500] = ["wifi: connected"] * 12 if kind == "boot" else rows[::500]
-    path.write_text("\n".join(rows) + "\n")
-    check(path, Refused("row: '"), **DEG)
-    check(path, Kept(), row=row, **DEG)
-
-
 # -- time is told by content ------------------------------------------------------------------
-
-CLOCKS = [
-    "50:{s:05.2f}",
-    "09:50:{whole:02}:{part:03}",
-    "09:50:{s:05.2f}",
-    "2023/05/04 10:50:{s:06.3f}",
-    "04.05.2023 10:50:{s:05.2f}",
-    "2019-09-27T10.50.{s:06.3f}",
-    "2019-09-27T10:50:{s:05.2f}Z",
-    "2019-09-27 10:50:{s:05.2f} UTC",
-    "5/4/2023 9:50:{s:05.2f} AM",
-    "2019-09-27T10:50:{s:05.2f}+02:00",
-]
-
-
-def clock(form: str) -> list[str]:
-    return [form.format(s=k / 100, whole=k // 100, part=k % 100 * 10) for k in range(N)]
-
-
-@pytest.mark.parametrize("name", ["timestamp", "date", "Zeit"])
-@pytest.mark.parametrize("form", CLOCKS)
-def test_kind_38_times_are_told_by_content(path: Path, form: str, name: str) -> None:
-    text(path, f"{name},{G}", clock(form), X)
-    check(path, Kept(rate_hz=100))
-
-
-def test_kind_13_the_first_time_column_that_can_be_parsed(path: Path) -> None:
-    names = ",".join(f"{axis}-axis (deg/s)" for axis in "xyz")
-    epoch = np.char.mod("%d", 1_569_604_353_000 + 10 * K)
-    stamps = clock("2019-09-27T10.12.{s:06.3f}")
-    text(path, f"epoc (ms),timestamp (-0700),elapsed (s),{names}", epoch, stamps, S, X)
-    check(path, Kept(rate_hz=100))
 
 
 # -- what is no log, and what stands beside the rates ---------------------------------------------
-
-
-def test_kind_37_a_header_in_another_encoding(path: Path) -> None:
-    text(path, "时间(s),角速度X(°/s),角速度Y(°/s),角速度Z(°/s)", S, X)
-    path.write_bytes(path.read_text().encode("gbk"))
-    check(path, Refused("encoding"))
-    check(path, Kept(), encoding="gbk")
 
 
 def test_kind_23_files_that_are_no_logs_get_advice(tmp_path: Path) -> None:
@@ -380,12 +220,3 @@ def test_kind_23_files_that_are_no_logs_get_advice(tmp_path: Path) -> None:
     ):
         (tmp_path / name).write_bytes(content)
         check(tmp_path / name, Refused(words))
-
-
-def test_kind_25_accelerations_and_a_temperature_are_kept(path: Path) -> None:
-    header = f"{T},ax (m/s^2),ay (m/s^2),az (m/s^2),{G},temp (°F)"
-    text(path, header, S, ACC, X, np.full(N, 77.0))
-    log = read_log(path, ReaderOptions())
-    assert log.acceleration_g is not None and log.temperature_c is not None
-    np.testing.assert_allclose(log.acceleration_g.mean(axis=0), (0, 0, 1), atol=1e-3)
-    np.testing.assert_allclose(log.temperature_c, 25, atol=1e-9)

@@ -87,7 +87,7 @@ THREE = ("still_1.csv", "still_2.csv", "still_10.csv")
 def test_eight_lines_and_one_command_are_enough(make):
     assert sum(len(text.splitlines()) for text in ENVIRONMENT.values()) <= 8
     project = make(*THREE)
-    done = project.kedro_run("--pipeline=ground_truth", "--env=mine")
+    done = project.command("--pipeline=ground_truth", "--env=mine")
     check(done, [(1, 1), (1, 2), (1, 3)])
     assert "still_1.csv is 1, still_2.csv is 2, still_10.csv is 3" in done.output
     assert "data/03_primary/mine/device/bias.csv" in done.output
@@ -115,8 +115,6 @@ def test_one_line_is_enough(make):
             {"reader": {"unit": "deg/s"}},
             ["reader.unit: unknown key; expected one of format"],
         ),
-        ("logs", {"log": FOLDER}, ["log: unknown key"]),
-        ("logs", {"logs": "nowhere"}, ["nowhere: no such folder"]),
         (
             "mine",
             {"only": {"sensor": "devise"}},
@@ -133,32 +131,10 @@ def test_what_is_typed_wrong_is_said_in_one_message(make, env, params, words):
         assert word in done.output
 
 
-@pytest.mark.parametrize(
-    ("names", "recordings"),
-    [
-        (["1/a.csv"], [(1, 1)]),
-        (["2/a.csv", "2/b.csv", "3/a.csv"], [(2, 1), (2, 2), (3, 1)]),
-    ],
-)
-def test_any_numbers_of_imus_and_recordings(make, names, recordings):
+def test_any_numbers_of_imus_and_recordings(make):
     pattern = '  pattern: "{imu}/*.csv"\n'
-    project = make(*names, catalog=ENVIRONMENT["catalog"] + pattern)
-    check(project.run_here("ground_truth", "mine"), recordings)
-
-
-def test_one_short_recording_of_a_sensor_with_studies_that_ask_for_more(make):
-    files = ENVIRONMENT["catalog"].replace("device", "dot")
-    project = make(
-        "1.csv",
-        seconds=20,
-        globals="source: mine\nsensors: {dot: {imus: 1, samples: 2000, recording_s: 20}}\n",
-        parameters="only: {sensor: dot}\n",
-        catalog=files + "  sensors: ${globals:sensors}\n",
-    )
-    check(project.run_here("ground_truth", "mine"), [(1, 1)], seconds=20)
-    refused = project.run_here("real2real", "mine")
-    assert refused.code == 1
-    assert "studies.real2real.dot: 12 real gyroscopes needed, dot has 3" in refused.output
+    project = make("2/a.csv", "2/b.csv", "3/a.csv", catalog=ENVIRONMENT["catalog"] + pattern)
+    check(project.run_here("ground_truth", "mine"), [(2, 1), (2, 2), (3, 1)])
 
 
 def test_without_times_the_rate_is_asked_for_and_taken(make):
@@ -175,16 +151,6 @@ def test_without_times_the_rate_is_asked_for_and_taken(make):
     known = f"source: mine\nsensors: {{device: {{rate_hz: {RATE_HZ}}}}}\n"
     (project.folder / "conf/mine/globals.yml").write_text(known)
     check(project.run_here("ground_truth", "mine"), [(1, 1)])
-
-
-def test_a_sensor_without_files_is_not_simulated_from_nothing(make):
-    project = make("1.csv", catalog="{}\n")
-    done = project.run_here("ground_truth", "mine")
-    assert done.code == 1
-    assert (
-        "device has no files: an entry device.raw_logs.files in conf/<env>/catalog" in done.output
-    )
-    assert "imus, recordings, train_recordings, samples, recording_s, simulated" in done.output
 
 
 def documented_options():

@@ -10,7 +10,6 @@ from gyro_pipeline.session import parse_parameters
 from gyro_pipeline.settings import CONFIG_LOADER_ARGS
 from gyro_pipeline.studies import check_possible
 
-ONE_DOT = {"sensor": "dot", "real_gyros": 3}
 CONF = str(Path(__file__).parents[1] / "conf")
 
 
@@ -42,22 +41,15 @@ def of_study(name, **changes):
 
 REFUSED = [
     ({"epoch": 5}, "epoch:", "unknown key; see conf/base"),
-    ({"training": {"epoch": 5}}, "training.epoch:", "unknown key"),
     (
         {"sensors": {"dot": {"simulated": {"colour": 1}}}},
         "sensors.dot.simulated.colour:",
         "unknown",
     ),
-    ({"only": {"fold": 3}}, "only.fold:", "unknown key"),
     ({"training": {"epochs": 0}}, "training.epochs:", "greater than or equal to 1"),
-    ({"training": {"centring": "none"}}, "training.centring:", "'per_device' or 'global'"),
-    ({"splits": {"test_fraction": 1.0}}, "splits.test_fraction:", "less than 1"),
-    ({"splits": {"training_windows": "some"}}, "splits.training_windows.", "'all' or 'first'"),
     ({"source": "My Files"}, "source:", "match pattern"),
     ({"only": {"real_gyros": 4}}, "only.real_gyros:", "multiple of 3"),
-    ({"only": {"sensor": "bosch"}}, "only.sensor:", "sparkfun, dot, ng, memsense"),
     ({"windows_s": []}, "windows_s:", "at least 1 item"),
-    ({"windows_s": [0]}, "windows_s.0:", "greater than 0"),
     (
         of_study("input_channels", sensors={"sparkfun": {"virtual_gyros": [12]}}),
         "studies.input_channels.sensors.sparkfun:",
@@ -74,22 +66,18 @@ REFUSED = [
         "studies.estimators:",
         "estimators: expected different values, got one of them twice in ['mean', 'mean']",
     ),
-    (of_study("leakage", strides_s=[1, 0]), "studies.leakage.strides_s.1:", "greater than 0"),
     (of_study("leakage", strides_s=[1, 1]), "studies.leakage:", "got one of them twice"),
     (
         of_study("leakage", also={"leave_one_device_out": ["mean"]}),
         "studies.leakage:",
         "also: leave_one_device_out is a study's only protocol",
     ),
-    (of_study("leakage", protocol="peek"), "studies.leakage.protocol:", "'by_recording'"),
     (
         {"sensors": {"ng": {"train_recordings": 100}}},
         "sensors.ng:",
         "train_recordings must leave at least one recording for testing",
     ),
-    ({"training": {"learning_rate": 2.0}}, "training.learning_rate:", "less than or equal to 1"),
     ({"training": {"stop_below": 5}}, "training:", "stop_below: 5 leaves no epoch to train"),
-    ({"seeds": [-1]}, "seeds.0:", "greater than or equal to 0"),
     ({"reader": {"unit": "deg/s"}}, "reader.unit:", "unknown key; expected one of format, "),
 ]
 
@@ -150,16 +138,6 @@ ASKED = {
         "real2real",
         "studies.real2real.dot: 30 s windows needed, longer than a recording of dot, 20 s",
     ),
-    "leaking windows": (
-        {"studies": {"leakage": {"windows_s": [53]}}},
-        "leakage",
-        "studies.leakage.memsense: 53 s windows needed, longer than a recording of memsense, 52 s",
-    ),
-    "estimator": (
-        {"studies": {"real2real": {"estimators": ["kalman"]}}},
-        "real2real",
-        "unknown estimator 'kalman'; there are mean, median",
-    ),
     "nothing": (
         {"only": {"sensor": "ng"}},
         "augmentation",
@@ -184,7 +162,10 @@ def test_a_study_without_a_name_is_checked_like_one_with_it(loaded):
     parameters = Parameters(**loaded(sensors={"dot": {"imus": 1}}))
     with pytest.raises(InputError, match="12 real gyroscopes"):
         check_possible(parameters, ["__default__"])
-    check_possible(Parameters(**loaded(sensors={"dot": {"imus": 1}}, only=ONE_DOT)), ["real2real"])
+    check_possible(
+        Parameters(**loaded(sensors={"dot": {"imus": 1}}, only={"sensor": "dot", "real_gyros": 3})),
+        ["real2real"],
+    )
 
 
 @pytest.mark.parametrize(
@@ -193,7 +174,6 @@ def test_a_study_without_a_name_is_checked_like_one_with_it(loaded):
         ({}, None),
         ({"rate_hz": 100}, 100),
         ({"samples": 1000, "recording_s": 20}, 50),
-        ({"samples": 1000, "recording_s": 20, "rate_hz": 100}, 100),
         ({"samples": 1000}, None),
     ],
 )
@@ -207,12 +187,6 @@ def test_all_problems_are_told_at_once(loaded):
     message = refusal(loaded(training={"epochs": 0, "stride": 0}, nonsense=1))
     for place in ("training.epochs:", "training.stride:", "nonsense:"):
         assert place in message
-
-
-def test_a_missing_key_is_refused(loaded):
-    parameters = loaded()
-    del parameters["splits"]["split_seed"]
-    assert "splits.split_seed: Field required" in refusal(parameters)
 
 
 def test_groups_cannot_be_changed_after_loading(parameters):

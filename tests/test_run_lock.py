@@ -78,7 +78,7 @@ def test_an_interrupt_that_python_could_not_raise_ends_the_run_at_the_next_resul
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-@pytest.mark.parametrize("name", ["a?b", "x[1]", "%41", "a{1}", "c#"])
+@pytest.mark.parametrize("name", ["a?b", "%41", "a{1}"])
 def test_a_folder_that_others_would_misread_is_refused(tmp_path, name):
     check_folder(tmp_path / "blanks and 'quotes' and ü")
     with pytest.raises(InputError, match="move the project to a folder whose path has no such"):

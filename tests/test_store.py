@@ -69,14 +69,6 @@ def test_what_a_store_holds_is_printed(moved, smoke, capsys):
     assert " MB" in printed.splitlines()[-1]
 
 
-def test_a_deleted_study_is_shown_as_such(moved):
-    client = MlflowClient(f"sqlite:///{moved / 'mlflow.db'}")
-    client.delete_experiment(client.get_experiment_by_name("augmentation").experiment_id)
-    table = describe(moved / "mlflow.db").set_index("study")
-    assert table.loc["augmentation (deleted)", "runs"] == 0
-    assert table.loc["augmentation (deleted)", "deleted"] > 0
-
-
 def test_without_a_store_there_is_an_error_and_no_new_store(tmp_path):
     with pytest.raises(SystemExit, match="no such file; type --store FILE"):
         main(["--store", str(tmp_path / "mlflow.db")])

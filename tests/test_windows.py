@@ -16,11 +16,8 @@ from gyro_pipeline.windows import (
     ("sensor", "window_s", "size", "count"),
     [
         ("sparkfun", 10, 1494, 8),
-        ("sparkfun", 30, 4483, 2),
         ("dot", 10, 1083, 12),
-        ("ng", 30, 6000, 2),
         ("memsense", 10, 2500, 5),
-        ("memsense", 30, 7500, 1),
     ],
 )
 def test_the_papers_windows(parameters, sensor, window_s, size, count):
@@ -37,15 +34,6 @@ def test_windows_are_non_overlapping_slices_from_the_start_without_a_copy():
         np.testing.assert_array_equal(windows[:, :, k], samples[:, :, 5 * k : 5 * k + 5])
     assert np.shares_memory(windows, samples)
     assert cut_windows(samples, 23).shape == (2, 3, 1, 23)
-
-
-def test_windows_that_overlap_are_named_by_their_starts():
-    samples, starts = np.arange(2 * 23).reshape(2, 23), np.array([0, 3, 18])
-    windows = cut_windows(samples, 5, starts)
-    assert windows.shape == (2, 3, 5)
-    for k, start in enumerate(starts):
-        np.testing.assert_array_equal(windows[:, k], samples[:, start : start + 5])
-    assert cut_windows(samples, 5, starts[:0]).shape == (2, 0, 5)
 
 
 def test_masked_samples_are_the_mean_of_their_window_which_is_dropped_if_it_lost_too_many():

@@ -106,7 +106,10 @@ class ChangedNodesRunner(SequentialRunner):
             return True
         if node.outputs and not stored:
             return False  # it runs if another node needs its outputs
-        before, states = self._completed.get(_key(node, self._catalog)), _states(node, self._catalog)
+        before, states = (
+            self._completed.get(_key(node, self._catalog)),
+            _states(node, self._catalog),
+        )
         if before is not None and before[0] == self._fingerprints[node.name]:
             for name, earlier, now in zip(stored, before[1], states, strict=True):
                 if isinstance(earlier, str) and now != earlier:  # a file; run stores grow

@@ -8,11 +8,10 @@ from gyro_pipeline.physics.recording_model import noise_covariances, profiles
 
 RATE, BLOCK = 100, 50
 BLOCK_S = BLOCK / RATE
-SECONDS = (1, 3, 10, 30)
+SECONDS = (1, 10, 30)
 WORLDS = {  # N, B, K in mdps and s; warm-up's mean, spread, time constant
     "white": (3.3, 0, 0, None),
     "flicker": (3.3, 3, 0, None),
-    "much flicker": (1.0, 5, 0, None),
     "walk": (3.3, 0, 1.0, None),
     "warm-up": (3.3, 0, 0, (5.0, 2.0, 20.0)),
     "all": (3.3, 3, 0.5, (5.0, 2.0, 20.0)),
@@ -103,14 +102,3 @@ def test_a_gap_lets_the_flicker_be_forgotten():
     one = Filter.start(noise, BLOCK_S).update(block)[0].estimate().variance
     np.testing.assert_allclose(apart.estimate().variance, one / 2, rtol=1e-6)
     assert np.all(together.estimate().variance > 1.2 * apart.estimate().variance)
-
-
-def test_the_variance_ahead_is_the_one_that_comes():
-    rng = np.random.default_rng(3)
-    filter_ = Filter.start(noise_of(*WORLDS["all"]), BLOCK_S, None)
-    for mean in rng.normal(0, 5e-3, (6, 3)):
-        filter_, _ = filter_.update(mean)
-    ahead = filter_.ahead(10)[1].estimate().variance
-    for mean, variance in zip(rng.normal(0, 5e-3, (10, 3)), ahead, strict=True):
-        filter_, _ = filter_.update(mean)
-        np.testing.assert_allclose(filter_.estimate().variance, variance, rtol=1e-12)

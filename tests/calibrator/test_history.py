@@ -26,11 +26,6 @@ def past(*means, variance=1e-6, **more):
     return [Calibration((m * 1e-3,) * 3, (variance,) * 3, **more) for m in means]
 
 
-def test_without_calibrations_there_is_no_prior():
-    prior = prior_of([], kind(), DECLARED)
-    assert np.isinf(prior.narrow).all()
-
-
 def test_one_calibration_adds_tau_twice_and_its_own_variance():
     prior = prior_of(past(5.0), kind(), DECLARED)
     np.testing.assert_allclose(prior.mean, 5e-3)
@@ -123,11 +118,9 @@ def test_where_attitudes_differ_the_larger_of_tau_and_the_earth_counts():
 @pytest.mark.parametrize(
     ("dropped", "means", "members"),
     [
-        ("....", (0, 0, 0, 0), [0, 1, 2, 3]),
         ("..x.", (0, 0, 50, 0), [0, 1, 3]),
         ("..xx", (0, 0, 50, 51), [2, 3]),
         ("..xx", (0, 0, 50, -50), [0, 1]),
-        ("..xx.", (0, 0, 50, 51, 50), [2, 3, 4]),
     ],
 )
 def test_two_at_a_new_level_restart_the_level(dropped, means, members):

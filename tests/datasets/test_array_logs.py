@@ -97,7 +97,6 @@ def test_an_ambiguous_shape_is_settled_by_the_other_file_or_axes_order(tmp_path)
     [
         ((50, 3, 60), None, "none"),
         ((5, 3, 200), ["sample", "gyroscope", "recording"], "[recording, gyroscope, sample]"),
-        ((5, 4, 200), LAYOUT, "none"),
     ],
 )
 def test_an_order_that_the_shape_contradicts_is_refused(tmp_path, shape, order, shown):
@@ -111,9 +110,8 @@ def test_an_order_that_the_shape_contradicts_is_refused(tmp_path, shape, order, 
 
 @pytest.mark.parametrize(
     ("shape", "dtype"),
-    [((5, 3, 200), "complex64"), ((5, 3, 200), "U3"), ((5, 3, 200), [("x", "f4")]),
-     ((2, 600), "f8"), ((0, 3, 200), "f8")],
-)  # fmt: skip
+    [((5, 3, 200), "complex64"), ((5, 3, 200), "U3"), ((2, 600), "f8"), ((0, 3, 200), "f8")],
+)
 def test_what_is_no_array_of_rates_is_refused(tmp_path, shape, dtype):
     np.save(tmp_path / "all.npy", np.zeros(shape, dtype))
     assert refusal(array_logs(tmp_path)) == (
@@ -141,10 +139,8 @@ def test_damaged_files_and_pickles_are_refused_by_name_and_nothing_is_unpickled(
     ("options", "said"),
     [
         ({"sensor": "memsens"}, "unknown sensor 'memsens'; expected one of memsense"),
-        ({"sensors": {"memsense": SENSORS["memsense"] | {"imus": 0}}}, "imus"),
         ({"files": {"train": "a.npy"}}, "expected train and test, two different files"),
         ({"files": {"train": "a.npy", "test": "a.npy"}}, "two different files"),
-        ({"axes_order": ["recording", "sample"]}, "expected recording, gyroscope, sample"),
     ],
 )
 def test_a_wrong_entry_is_refused_before_anything_is_read(tmp_path, options, said):

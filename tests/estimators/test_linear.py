@@ -70,18 +70,6 @@ def test_on_white_noise_it_is_empirical_bayes(simulate, judged, training_set):
     np.testing.assert_allclose(sigma, other_sigma, rtol=0.08)
 
 
-def test_noise_from_the_allan_fit_does_as_well(simulate, judged, training_set):
-    recordings = simulate(COLOURED, 80, seed=2)
-    training, tested = (
-        recordings.isel(recording=slice(40)),
-        recordings.isel(recording=slice(40, 80)),
-    )
-    reml, allan = (
-        BestLinear(noise=noise).fit(training_set(training)) for noise in ("reml", "allan")
-    )
-    assert rms(judged(allan, tested, 10)[0]) < 1.1 * rms(judged(reml, tested, 10)[0])
-
-
 def test_each_place_of_a_window_has_its_own_weights(simulate, training_set):
     model = RecordingModel(
         SAMPLES, RATE, WHITE.noise, np.array([0.0, 20 * MDPS]), np.diag([TAU**2, TAU**2]), 15.0
@@ -99,7 +87,7 @@ def test_each_place_of_a_window_has_its_own_weights(simulate, training_set):
 
 def test_history_follows_a_bias_that_walks(simulate, judged, training_set):
     errors = {BestLinear: [], LastCalibration: [], TrainingMean: [], EmpiricalBayes: []}
-    for seed in range(6):
+    for seed in range(4):
         recordings = simulate(WHITE, 40, seed)
         walk = np.random.default_rng(seed).normal(0, 2 * MDPS, (1, 40, 3)).cumsum(axis=1)
         recordings["angular_rate"] = recordings.angular_rate + walk[..., None]

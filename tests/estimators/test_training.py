@@ -139,15 +139,6 @@ def test_folds_share_what_is_read_and_worked_out(filed, monkeypatch):
     np.testing.assert_array_equal(again.rates, drawn().angular_rate.to_numpy()[0, 1:])
 
 
-def test_what_is_remembered_is_bounded(filed, monkeypatch):
-    one = drawn().angular_rate[0, 0].nbytes
-    monkeypatch.setattr(module, "_REMEMBERED_BYTES", 3 * one)
-    windows = table((TRAIN, ORIGIN_REAL, 1, range(1, 7), [0]))
-    rates = TrainingSet(filed, None, windows, SIZE, 1).rates
-    np.testing.assert_array_equal(rates, drawn().angular_rate.to_numpy()[0])
-    assert module._OF_FILES._bytes <= 3 * one
-
-
 def test_recordings_of_a_file_go_to_a_worker_as_references(filed):
     training = TrainingSet(filed, None, table((TRAIN, ORIGIN_REAL, 1, [1, 2], [0])), SIZE, 1)
     assert training.rates.any()  # read, but not kept

@@ -14,10 +14,8 @@ from gyro_pipeline.learning.packing import Layout, pack, packed_shape
 
 # gyroscopes, window, kernel, stride, pool; 5 channels and 7 hidden units
 SIZES = [
-    (3, 120, 10, 10, 4),  # everything a multiple of the stride
     (3, 123, 12, 5, 3),  # kernel and window are no multiples of the stride
     (6, 100, 3, 7, 2),  # kernel shorter than the stride: samples are skipped
-    (12, 60, 7, 1, 5),  # stride one
     (3, 25, 25, 4, 1),  # the kernel is the window
     (3, 43, 4, 10, 1),  # the last block is cut short by the window's end
 ]

@@ -104,8 +104,9 @@ def test_validation_and_test_recordings_do_not_reach_the_weights(make, recorded)
 
 
 @BOTH
-@pytest.mark.parametrize("centring", ["per_device", "global"])
-def test_a_stored_network_estimates_its_outputs_scaled_back(make, recorded, imus, centring):
+def test_a_stored_network_estimates_its_outputs_scaled_back(
+    make, recorded, imus, centring="global"
+):
     rates, bias = recorded()
     over_fitting = {"train": range(1, 5), "epochs": 40, "learning_rate": 3e-2, "decay_every": 40}
     job = make((rates, bias), imus, centring=centring, **over_fitting)
@@ -124,22 +125,6 @@ def test_a_stored_network_estimates_its_outputs_scaled_back(make, recorded, imus
         estimates = StoredNetwork(artifact, which).biases(windows)
         assert np.abs(expected - centre).max() > 100 * 2e-5 * scaling.target_scale
         np.testing.assert_allclose(estimates, expected, atol=2e-5 * scaling.target_scale)
-
-
-@BOTH
-def test_a_network_learns_what_is_easy_to_learn(make, recorded, imus):
-    """Windows that tell the bias well: far better than the training mean, which knows nothing."""
-    rates, bias = recorded(recordings=110)
-    easy = {"channels": 16, "hidden": 32, "epochs": 60, "learning_rate": 1e-2, "decay_every": 40}
-    trained = run_training(make((rates, bias), imus, range(1, 81), (), **easy))
-    network = StoredNetwork(trained.artifact, "last")
-    truth = bias.sel(imu=list(imus[0])).transpose("recording", "imu", "axis").to_numpy()
-    truth = truth.reshape(110, -1)
-    tested = rates.sel(imu=list(imus[0])).to_numpy()[:, 80:].swapaxes(0, 1)
-    errors = network.biases(tested.reshape(30, -1, rates.shape[-1])[..., :WINDOW]) - truth[80:]
-    constant = np.sqrt(np.mean((truth[80:] - truth[:80].mean(axis=0)) ** 2))
-    assert constant == pytest.approx(1.0, rel=0.3)
-    assert np.sqrt(np.mean(np.square(errors))) < 0.25 * constant
 
 
 def grid(make, recorded, path=PAPER):

@@ -39,13 +39,6 @@ def test_the_prior_is_that_of_a_kalman_filter(step, deviation):
     assert (later.mean[0], later.covariance[0, 0]) == pytest.approx(kalman(history, 3))
 
 
-def test_without_a_walk_it_is_the_mean_of_the_labels():
-    numbers, labels = walked(10, 0.0, 1.0)
-    prior = BiasHistory(numbers, labels, AVERAGING, 0.0, 1.0).prior(MODEL, None)
-    assert prior.mean[0] == pytest.approx(labels.mean())
-    assert prior.covariance[0, 0] == pytest.approx(1 + (1 + AVERAGING) / 10)
-
-
 def test_only_what_came_before_counts():
     numbers, labels = walked(12, 1.0, 0.5)
     history = BiasHistory(numbers, labels, AVERAGING, 1.0, 0.5)

@@ -25,23 +25,6 @@ def test_axes_that_speak_for_the_history_do_not_suffer_from_one_that_does_not():
     np.testing.assert_allclose(found.mean[0], 9 * 25 / 26, rtol=1e-2)
 
 
-def test_without_data_it_is_the_prior():
-    found = mixture_posterior(np.nan, [np.inf] * 3, [1.0, 2.0, 3.0], 0.1, 25.0)
-    np.testing.assert_array_equal(found.mean, [1.0, 2.0, 3.0])
-    np.testing.assert_allclose(found.charged, 0.1)
-    np.testing.assert_array_equal(log_e(log_ratios(np.nan, np.array([np.inf] * 3), 0.1, 25.0)), 0.0)
-
-
-def test_rows_are_judged_one_by_one():
-    rng = np.random.default_rng(1)
-    estimates, variances = rng.normal(0, 3, (5, 3)), rng.uniform(0.1, 2, (5, 3))
-    together = mixture_posterior(estimates, variances, 0.0, 0.1, 25.0)
-    for row in range(5):
-        alone = mixture_posterior(estimates[row], variances[row], 0.0, 0.1, 25.0)
-        np.testing.assert_array_equal(together.mean[row], alone.mean)
-        np.testing.assert_array_equal(together.charged[row], alone.charged)
-
-
 @pytest.mark.parametrize(("narrow", "least", "most"), [(0.31, 0.945, 0.97), (0.6, 0.945, 0.97)])
 def test_the_charged_variance_covers_where_the_history_is_right(narrow, least, most):
     rng = np.random.default_rng(2)

@@ -49,7 +49,7 @@ def test_every_axis_has_its_own_n():
     )
 
 
-@pytest.mark.parametrize("lag1", [-0.5, 0.5, 0.7])
+@pytest.mark.parametrize("lag1", [-0.5, 0.5])
 def test_an_impossible_lag1_correlation_is_refused(lag1):
     with pytest.raises(InputError, match="lag1_correlation"):
         simulate_noise(np.random.default_rng(5), (10,), RATE, N, lag1)

@@ -44,13 +44,3 @@ def test_counts_come_first_then_what_is_not_simply_kept_the_worst_first(five):
             "zero rows: row 0, cut",
         ],
     }
-
-
-def test_of_many_the_first_are_listed_and_the_others_counted():
-    table = recording_quality(quality(*[("rejected", "motion")] * 33))
-    assert len(table) == 1 + 20 + 1
-    assert table.iloc[0]["Rows used"] == "none"
-    assert table.iloc[-1].dropna().to_dict() == {
-        "Sensor": "dot",
-        "Findings": "in 13 further recordings",
-    }

@@ -135,21 +135,6 @@ def test_masked_samples_are_nan_and_counted(inspected, monkeypatch):
     assert table.stop.dropna().tolist() == [1610] * 3
 
 
-def test_what_no_imu_has_is_left_out(inspected):
-    recordings, table = inspected(listed(four(log_21=DEAD)))
-    assert recordings["samples"].values.tolist() == [[SAMPLES] * 2, [0, SAMPLES]]
-    assert int(np.isnan(recordings.angular_rate).sum()) == 3 * SAMPLES
-    recordings, table = inspected(listed(four(log_11=DEAD, log_21=DEAD)))
-    assert recordings.recording.values.tolist() == [2]
-    assert not np.isnan(recordings.angular_rate).any()
-    assert len(table) == 4
-    logs = four(log_21=DEAD)
-    del logs[2, 2]
-    recordings, table = inspected(listed(logs))
-    assert recordings.imu.values.tolist() == [1]
-    assert len(table) == 3
-
-
 def test_a_file_that_cannot_be_read_is_a_rejected_recording_and_other_errors_are_raised(inspected):
     _, table = inspected(listed(four(log_12=InputError("1_2.csv: expected text, got a zip"))))
     assert table.loc[1, 2].outcome == REJECTED
@@ -158,7 +143,7 @@ def test_a_file_that_cannot_be_read_is_a_rejected_recording_and_other_errors_are
         inspected(listed(four(log_12=ZeroDivisionError())))
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300])  # 1e300 overflows float32
+@pytest.mark.parametrize("value", [np.inf, 1e300])  # 1e300 overflows float32
 def test_what_is_no_number_in_float32_is_masked(inspected, value):
     samples = noise(7)
     samples[200, 1] = value
@@ -346,16 +331,6 @@ def row(imu, recording, outcome=KEPT, findings=None):
 
 def checked(rows, needed_pct, quality):
     require_enough(pd.DataFrame(rows), quality.model_copy(update={"needed_pct": needed_pct}))
-
-
-def test_counts_are_said_and_enough_recordings_go_on(quality, caplog):
-    rows = [row(1, 1), row(1, 2, REPAIRED), row(1, 3), row(2, 1, REJECTED, "is a zip")]
-    with caplog.at_level(logging.INFO, "gyro_pipeline"):
-        checked(rows, 75.0, quality)
-    assert caplog.messages == [
-        "dot: 4 recordings, 2 kept, 1 repaired, 1 rejected",
-        "dot: no recording is left of IMU 2",
-    ]
 
 
 def test_too_few_recordings_stop_and_the_same_reason_is_given_once(quality):

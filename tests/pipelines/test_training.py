@@ -133,20 +133,6 @@ def test_every_row_is_fitted_to_exactly_the_training_set_that_it_names(strange):
         assert (params["real_gyros"], params["virtual_gyros"]) == (3 * real, 3 * virtual)
 
 
-def test_the_device_comes_first_and_imus_may_have_any_numbers(strange):
-    raw = strange.raw.assign_coords(imu=[2, 3])
-    bias = strange.raw_bias.assign(imu=strange.raw_bias.imu + 1)
-    renumbered = replace(strange, raw=raw, raw_bias=bias)
-    for fit in renumbered.train():
-        if fit.run.params["estimator"].endswith(":All"):
-            real = fit.run.params["real_gyros"] // 3
-            given = {(origin, imu) for _, origin, imu, *_ in fit.estimator.given}
-            assert {imu for origin, imu in given if origin == ORIGIN_REAL} == set(
-                range(2, 2 + real)
-            )
-            assert fit.estimator.device == 2
-
-
 def test_of_unseen_devices_every_fold_trains_on_all_others(strange, stranger, make_study):
     study = make_study("some", [stranger[1][1]], real_gyros=[3])
     unseen = replace(strange, study=study.model_copy(update={"protocol": "leave_one_device_out"}))
@@ -232,7 +218,7 @@ def test_folds_are_fits_of_one_run_and_a_kill_loses_only_what_was_running(few, a
     for fit in whole.values():
         assert (fit.run.folds, fit.run.params["folds"]) == (tuple(names), 5)
         assert fit.is_model == (fit.fold == ALL_RECORDINGS)
-    for stop in (1, 8, 17):
+    for stop in (1, 8):
         stored = as_stored(list(whole.values())[:stop])
         caplog.clear()
         with caplog.at_level("INFO", "gyro_pipeline"):
@@ -252,7 +238,7 @@ def bits(fit, weights="last"):
     return {name: w.numpy().tobytes() for name, w in fit.estimator._artifact[weights].items()}
 
 
-@pytest.mark.parametrize("count", [2, 3, 4])
+@pytest.mark.parametrize("count", [2, 3])
 def test_of_few_recordings_what_cannot_be_fitted_is_left_out_and_named_first(few, count, caplog):
     world = few(count, list(ESTIMATORS))
     plan = world.plan.set_index("estimator")[LEFT_OUT]
@@ -300,7 +286,7 @@ def test_a_fingerprint_knows_no_study_and_changes_with_no_narrowing(varied, make
     assert len(set(varied.fingerprints.values())) == len(varied.fingerprints) == 1 + 1 + 1 + 2 + 4
 
 
-@pytest.mark.parametrize("change", [{"hidden": 5}, {"epochs": 4}, {"steps": 9}])
+@pytest.mark.parametrize("change", [{"hidden": 5}, {"steps": 9}])
 def test_networks_alone_change_with_a_hyper_parameter(varied, change):
     found = changed(varied, training=varied.training.model_copy(update=change))
     assert found == {key for key in varied.fingerprints if key[0] == CNN}
@@ -421,14 +407,6 @@ def test_runs_carry_what_they_are_and_an_example_of_their_windows(world, fitted)
         assert np.isfinite(bias).all()
     notes = {fit.run.params["virtual_gyros"]: fit.run.note for fit in fitted}
     assert "and 50 windows of 10 virtual recordings (" in notes[6]
-
-
-def test_an_example_is_of_a_recording_that_the_device_has(world):
-    raw = world.raw.copy(deep=True)
-    raw["samples"][0, 0], raw.angular_rate[0, 0] = 0, np.nan
-    study = world.study.model_copy(update={"estimators": ["median"]})
-    for fit in replace(world, raw=raw, study=study).train():
-        assert np.isfinite(fit.example).all()
 
 
 def test_training_all_at_once_gives_the_same_runs(world, fitted):

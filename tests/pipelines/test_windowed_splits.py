@@ -97,9 +97,7 @@ def test_the_seed_chooses_validation_recordings_and_no_test_ones(parameters):
     assert all(first[n] == other[n] == TEST for n in range(80, 100))
 
 
-@pytest.mark.parametrize(
-    ("count", "folds", "validation"), [(4, 4, 0), (5, 5, 2), (20, 20, 2), (21, 5, 2), (49, 5, 2)]
-)
+@pytest.mark.parametrize(("count", "folds", "validation"), [(4, 4, 0), (20, 20, 2), (21, 5, 2)])
 def test_few_recordings_make_a_k_fold_that_tests_each_once(
     make, table_of, count, folds, validation
 ):
@@ -113,12 +111,6 @@ def test_few_recordings_make_a_k_fold_that_tests_each_once(
     assert set(of_model.role) == {TRAIN, VALIDATION}
     assert len(numbers(of_model, VALIDATION, ALL_RECORDINGS)) == 2
     assert of_model.recording.nunique() == count
-
-
-def test_two_recordings_are_enough_for_a_table(make, table_of):
-    table = table_of(make(2))
-    assert numbers(table, TRAIN, "fold 0") == [2]
-    assert numbers(table, VALIDATION, "fold 0") == []
 
 
 def test_in_a_k_fold_recordings_that_the_tested_imu_lacks_train_in_every_fold(make, table_of):
@@ -198,11 +190,6 @@ def test_the_leak_studys_windows_test_once_each(make, table_of, protocol):
             assert places[0].to_numpy().tolist() == places[1].to_numpy().tolist()
 
 
-def test_all_windows_train_and_test_where_the_test_set_is_in_training(make, table_of):
-    table = table_of(make(100), protocol="test_in_training", recordings=6, folds=3)
-    assert numbers(table, TRAIN) == numbers(table, TEST) == list(range(1, 7))
-
-
 # what is refused
 
 
@@ -210,9 +197,7 @@ KINDS = {
     "exact": lambda rates: rates,
     "a little noise": lambda rates: rates + np.random.default_rng(3).normal(0, 1e-5, rates.shape),
     "an offset": lambda rates: rates + 0.1,
-    "a shift": lambda rates: np.roll(rates, 1, axis=-1),
     "resampled": lambda rates: (rates + np.roll(rates, 1, axis=-1)) / 2,
-    "a factor": lambda rates: rates * (1 + 1e-9),
 }
 
 
@@ -334,16 +319,3 @@ def test_recordings_are_cut_to_the_length_that_keeps_most(uneven, make_bias, mak
         assert float(cut.recording_mean.sel(place)) == row.bias_dps
     assert contents.masked[0].tolist() == [3, 4, 900, 901]
     assert uneven["samples"].values.tolist() == [[1200, 700, 1000], [1200, 0, 1000]]
-
-
-def test_recordings_of_one_length_stay_as_they_are(
-    make_recordings, make_bias, make_quality, caplog
-):
-    alike = make_recordings(np.zeros((1, 2, 3)), 1200, RATE_HZ, 0.005)
-    bias = make_bias(alike, measure_allan_variance(alike))
-    with caplog.at_level("INFO", "gyro_pipeline"):
-        cut, same, _ = cut_to_common_length(alike, bias, make_quality(alike))
-    assert cut.angular_rate.identical(alike.angular_rate)
-    assert cut.attrs["data_hash"] == alike.attrs["data_hash"]
-    assert same is bias
-    assert caplog.messages == ["sparkfun: all recordings are 60.0 s"]

@@ -3,7 +3,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import signal
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED, Finding, Log
@@ -79,11 +78,6 @@ def held_in_turn(x):
     return np.stack([x[np.maximum((ROW - 3 * i) // 10 * 10 + 3 * i, 0), i] for i in range(3)], 1)
 
 
-def held_thrice(x):
-    x[:, 1] = x[ROW // 3 * 3, 1]
-    return x
-
-
 def blanked(x):
     """A twentieth of the rows as zeros, about biases of two sigma."""
     x = (x - BIAS) + [0.1, -0.1, 0.1]
@@ -126,43 +120,33 @@ FEW, SOME = RANDOM.random(ROWS) < 0.02, RANDOM.random(ROWS) < 0.1
     [
         (lambda x: x, {}, []),
         (add(700, np.nan), {"non-finite values": REPAIRED}, ["axes x, y, z, row 700, "]),
-        (add(200, 1e300), {"non-finite values": REPAIRED}, ["row 200, masked"]),
         (held, {"stuck values": REPAIRED}, ["axis y, rows 100 to 399"]),
         (add(77, [0, 9 * SIGMA, 0]), {"spikes": REPAIRED}, ["axis y, row 77, masked"]),
         (add(FEW, [0, 20 * SIGMA, 0]), {"spikes": REPAIRED}, ["axis y"]),
         (add(slice(500, 504), [8, -5, 2]), {"shocks": REPAIRED}, ["rows 450 to 553"]),
         (lambda x: x + decay(0.5, 0.4), {"start": REPAIRED}, ["rows 0 to 99"]),
-        (lambda x: x + decay(0.5, 1), {"start": REPAIRED, "warm-up": KEPT}, []),
         (lambda x: x + decay(0.3, 8), {"warm-up": KEPT}, ["axis x by 2", "settled"]),
-        (lambda x: x + decay(0.2, 3) + decay(0.3, 40), {"warm-up": KEPT}, []),
         (lambda x: x + 0.3 * (SECONDS[:, None] / 60) ** 2, {"drift": KEPT}, ["not settled"]),
         (lambda x: x + SECONDS[:, None] / 20, {"motion": REJECTED}, ["3 deg/s", "largest_drift"]),
         (add(ROW % 300 < 10, 5), {"start": REPAIRED, "shocks": REPAIRED,
          "too short": REJECTED}, ["and 14 more", "quality.least_share"]),
         (touched, {"motion": REJECTED}, ["axis y, rows 9", ", rows 29", ", rows 49"]),
-        (add(slice(2500, None), [0.1, 0, 0]), {"motion": REJECTED}, ["axis x", "least_change_dps"]),
         (add(slice(2500, None), [0.5, 0, 0]), {"motion": REJECTED}, ["axis x, rows 0 to 2499"]),
         (louder, {"motion": REJECTED}, ["the noise rises"]),
         (swaying(0.5, 2), {"motion": REJECTED}, ["axis z"]),
-        (swaying(1, 80), {"motion": REJECTED}, ["axis z"]),
         (lambda x: np.minimum(x, BIAS + 2 * SIGMA), {"saturation": REJECTED}, ["cut off at 0.8 "]),
         (blanked, {"dropouts": REPAIRED}, ["zero on all axes, row"]),
         (near_zero(zeroed), {"dropouts": REPAIRED}, ["zero on all axes, row 700, masked"]),
         (dead(0.03), {"dead band": REJECTED}, ["axis x, ± 0.03 deg/s"]),
-        (dead(0.12), {"zero rows": KEPT, "dead band": REJECTED}, ["axis x, ± 0.12 deg/s"]),
-        (cut_to(0.0175), {"dead band": REJECTED}, ["axis y, counts cut to zero?"]),
         (cut_to(0.035), {"dead band": REJECTED}, ["axis y, counts cut to zero?"]),
         (coded, {"saturation": REJECTED}, ["axis y is cut off at -0.6 deg/s"]),
         (lambda x: coded(rounded(0.01)(x), -0.46), {"frequent value": REJECTED}, ["at -0.46 deg"]),
         (lambda x: np.round(rounded(0.0091)(x), 2), {}, []),
-        (rounded(0.3 * SIGMA), {}, []),
         (rounded(1.3 * SIGMA), {"coarse quantisation": KEPT}, []),
         (rounded(3 * SIGMA), {"coarse quantisation": REJECTED}, ["quality.largest_step"]),
         (thrice, {"repeated rows": KEPT}, ["6.7%"]),
         (held_in_turn, {"repeated values": REJECTED}, ["axis x repeats 90%", "axis z repeats 90%"]),
-        (held_thrice, {"repeated values": REJECTED}, ["axis y repeats 67%"]),
         (lambda x: x[:, [1, 1, 2]], {"equal axes": REJECTED}, ["axes x and y", "`columns`"]),
-        (lambda x: rounded(SIGMA)(x[:, [0, 0, 0]]), {"equal axes": REJECTED}, ["axes y and z"]),
         (lambda x: x * 20, {"noise level": REJECTED}, ["quality.largest_noise_dps"]),
     ],
 )  # fmt: skip
@@ -178,11 +162,8 @@ def test_each_oddity_has_its_finding(still, quality, change, expected, words):
 
 @pytest.mark.parametrize(
     ("rows", "sigmas"),
-    [(ROW % 2 == 0, 1), (ROW % 3 == 0, 1), (ROW % 4 < 2, 1), (ROW % 5 == 0, 1),
-     (ROW % 7 == 0, 1.2), (ROW % 11 < 4, 1), (ROW % 13 == 0, 1.3),
-     ((ROW + ROW // 611) % 2 == 0, 6), (RANDOM.random(ROWS) < 0.5, 12), (SOME, 12)],
-    ids=["2 in turn", "3 in turn", "4 in turn", "5 in turn", "7 in turn", "11 in turn",
-         "13 in turn", "slips", "random", "few at random"],
+    [(ROW % 2 == 0, 1), (ROW % 13 == 0, 1.3), ((ROW + ROW // 611) % 2 == 0, 6), (SOME, 12)],
+    ids=["2 in turn", "13 in turn", "slips", "few at random"],
 )  # fmt: skip
 def test_rows_of_two_devices_are_rejected_in_any_order(still, quality, rows, sigmas):
     still[rows] += [0, sigmas * SIGMA, 0]
@@ -192,7 +173,7 @@ def test_rows_of_two_devices_are_rejected_in_any_order(still, quality, rows, sig
     assert "Split it by device" in detail(inspected, "mixed rows")
 
 
-@pytest.mark.parametrize("step", [0, 0.4, 1, 1.9])
+@pytest.mark.parametrize("step", [0, 1.9])
 def test_neither_a_vibration_nor_a_coarse_step_is_of_several_devices(still, quality, step):
     for hz in (11, 15, 24, 50):
         wave = 5 * SIGMA * np.sin(2 * np.pi * hz * SECONDS + 1)[:, None] * (hz < RATE_HZ / 2)
@@ -200,7 +181,7 @@ def test_neither_a_vibration_nor_a_coarse_step_is_of_several_devices(still, qual
         assert inspect(Log(rates), RATE_HZ, quality).outcome == KEPT
 
 
-@pytest.mark.parametrize("step", [0.05, 0.3, 1, 1.9])
+@pytest.mark.parametrize("step", [0.05, 1])
 def test_noise_on_a_coarse_grid_has_no_frequent_value(quality, step):
     """A few of each here; a thousand were tried at steps of 0.05 to 1.95 sigma."""
     for seed in range(6):
@@ -236,7 +217,7 @@ def test_what_is_masked_at_the_ends_is_cut(still, quality):
     assert detail(inspected, "zero rows") == "rows 0 to 2, row 5999, cut"
 
 
-@pytest.mark.parametrize("value", [np.nan, 0.0, 1.5, 1e300])
+@pytest.mark.parametrize("value", [np.nan, 1.5])
 def test_a_recording_of_one_value_has_no_rows(quality, value):
     inspected = inspect(Log(np.full((ROWS, 3), value)), RATE_HZ, quality)
     assert (inspected.outcome, inspected.start) == (REJECTED, inspected.stop)
@@ -245,8 +226,8 @@ def test_a_recording_of_one_value_has_no_rows(quality, value):
 
 @pytest.mark.parametrize(
     ("rows", "lost", "outcome"),
-    [(0, 0, REJECTED), (1, 0, REJECTED), (999, 0, REJECTED), (1000, 0, KEPT), (1000, 1, REJECTED),
-     (ROWS, 1150, REPAIRED), (ROWS, 1250, REJECTED)],
+    [(0, 0, REJECTED), (999, 0, REJECTED), (1000, 0, KEPT), (ROWS, 1150, REPAIRED),
+     (ROWS, 1250, REJECTED)],
 )  # fmt: skip
 def test_too_few_rows_or_too_small_a_share_reject(still, quality, rows, lost, outcome):
     still[300 : 300 + lost] = np.nan
@@ -262,7 +243,7 @@ def test_what_cannot_be_judged_is_refused(quality):
         Quality(**quality.model_dump() | {"block_s": 2.0})
 
 
-@pytest.mark.parametrize(("rate_hz", "minutes"), [(5, 1 / 6), (5, 120), (108, 2), (1000, 0.5)])
+@pytest.mark.parametrize(("rate_hz", "minutes"), [(5, 1 / 6), (5, 120), (1000, 0.5)])
 @pytest.mark.parametrize(
     "noise",
     [{"lag1_correlation": -0.15}, {"flicker_dps": 3e-3}, {"random_walk_dps_rts": 1e-4}],
@@ -275,12 +256,6 @@ def test_at_rest_is_kept_at_any_rate_and_length(quality, rate_hz, minutes, noise
         inspected = inspect(Log(rates.T + BIAS), rate_hz, quality)
         assert inspected.outcome == KEPT
         assert checks(inspected).keys() <= {"warm-up", "drift"}
-
-
-def test_a_sensor_behind_a_narrow_low_pass_filter_is_at_rest(quality):
-    noise = np.random.default_rng(0).normal(0, 0.55, (60_000, 3))
-    rates = signal.sosfilt(signal.butter(2, 5, fs=1000, output="sos"), noise, 0)[5000:] + BIAS
-    assert inspect(Log(rounded(0.001)(rates)), 1000, quality).outcome == KEPT
 
 
 @pytest.mark.skipif(REAL_DATA is None, reason="GYRO_PIPELINE_REAL_DATA names no folder")

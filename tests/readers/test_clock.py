@@ -11,8 +11,8 @@ from gyro_pipeline.readers.clock import from_counter, from_stamps
 
 N = 6000
 EVEN = np.arange(N) / 120
-PLAIN = [5, 50, 70.3, 98, 99.9, 100, 104, 120, 250, 454, 833, 1000, 2000]
-TICKS = [0, 1e-6, 1e-3, 1e-2, 0.1]
+PLAIN = [5, 99.9, 104, 250, 2000]
+TICKS = [0, 1e-3, 1e-2, 0.1]
 
 
 def checks(timing):
@@ -42,7 +42,6 @@ WHOLE = {
     "late": late,
     "one or two steps": lambda rate, draws: np.cumsum(draws.choice([2 / 3, 4 / 3], N)) / rate,
     "stalls": stalls,
-    "bursts": bursts,
     "the last one late": lambda rate, draws: (np.arange(N) + 0.9 * (np.arange(N) == N - 1)) / rate,
 }
 
@@ -89,19 +88,16 @@ def test_coarse_clocks_and_doubled_rows_make_no_gaps(rate, stamps, rel, said):
     [
         [100, 101, 500],
         np.flatnonzero(np.random.default_rng(0).random(N - 20) < 0.1),
-        np.arange(511, N - 20, 512),
         np.arange(3000, 3200, 2),
         np.arange(1000, 1400),
     ],
-    ids=["some", "a tenth", "regular", "every other", "a block"],
+    ids=["some", "a tenth", "every other", "a block"],
 )
-@pytest.mark.parametrize("clock", ["jitter", "unix time", "ms", "us"])
+@pytest.mark.parametrize("clock", ["unix time", "ms"])
 def test_lost_samples_are_gaps_and_do_not_change_the_rate(lost, clock):
-    stamps = np.arange(N) / 120 + {"unix time": 1.7e9}.get(clock, 3.3)
-    if clock in ("jitter", "unix time"):
-        stamps += np.random.default_rng(1).uniform(-5e-4, 5e-4, N)
-    else:
-        stamps = np.round(stamps, {"ms": 3, "us": 6}[clock])
+    stamps = np.arange(N) / 120 + (1.7e9 if clock == "unix time" else 3.3)
+    jitter = np.random.default_rng(1).uniform(-5e-4, 5e-4, N)
+    stamps = stamps + jitter if clock == "unix time" else np.round(stamps, 3)
     kept = np.setdiff1d(np.arange(N), lost)
     timing = from_stamps(stamps[kept], 1.0)
     np.testing.assert_array_equal(timing.gap_rows, np.flatnonzero(np.diff(kept) > 1) + 1)
@@ -113,17 +109,13 @@ def test_lost_samples_are_gaps_and_do_not_change_the_rate(lost, clock):
 
 BURSTS = np.ceil((np.arange(N) + 1) / 10) * 10 / 250 + 2.0 * (np.arange(N) >= 500)
 SWAPPED = np.r_[EVEN[:400], EVEN[401], EVEN[400], EVEN[402:]]
-ROUNDED = 1.7e9 + np.repeat(EVEN, 2) + np.tile([0, -2e-7], N)
 BACK, STILL = "time order", "timestamps"
 ODD = {  # stamps, their unit, the rate, gaps, findings
     "a hole in bursts": (BURSTS, 1.0, 250, [500], ["gaps", STILL]),
     "time that goes back": (np.r_[EVEN, EVEN], 1.0, 120, [N], [BACK]),
     "two rows swapped": (SWAPPED, 1.0, 120, [400, 401, 402], [BACK, "gaps"]),
-    "steps back that floats make": (ROUNDED, 1.0, 240, [], [STILL]),
     "no unit": (np.delete(np.r_[EVEN, EVEN], 100) * 7.3, None, None, [100, N - 1], [BACK, "gaps"]),
-    "equal": (np.zeros(9), 1.0, None, [], [STILL]),
     "missing": (np.full(9, np.nan), 1.0, None, [], [STILL]),
-    "backwards": (np.arange(9.0)[::-1], 1.0, None, list(range(1, 9)), [BACK, STILL]),
 }
 
 
@@ -135,8 +127,8 @@ def test_gaps_and_findings_of_odd_stamps(stamps, unit_s, rate, gaps, findings):
     assert checks(timing) == findings
 
 
-@pytest.mark.parametrize(("unit_s", "scale"), [(1.0, 1.0), (1e-3, 1e3), (1e-6, 1e6), (1e-9, 1e9)])
-@pytest.mark.parametrize(("rate", "tick"), [(1000, 1e-3), (120, 1e-2), (97, 0.1), (250, 1e-6)])
+@pytest.mark.parametrize(("unit_s", "scale"), [(1.0, 1.0), (1e-9, 1e9)])
+@pytest.mark.parametrize(("rate", "tick"), [(120, 1e-2), (250, 1e-6)])
 def test_jumps_and_strays_do_not_spoil_the_rate_in_any_unit(rate, tick, unit_s, scale):
     clock = np.floor((1000 + np.arange(N) / rate) / tick + 1e-6) * tick
     for jump, gap in (((0, 1), 1), ((3000, N), 3000), ((700, 701), None)):
@@ -155,9 +147,7 @@ def test_jumps_and_strays_do_not_spoil_the_rate_in_any_unit(rate, tick, unit_s, 
     ("period", "step", "unit_s", "burst"),
     [
         (2**32, 8333, 1e-6, 1),
-        (2**16, 10, 1e-3, 1),
         (2**16, 10, 1e-3, 5),
-        (2**24, 100, 1e-6, 1),
         (86_400, 0.02, 1, 1),
     ],
 )
@@ -174,8 +164,6 @@ def test_counters_of_time_and_midnight_are_unwrapped(period, step, unit_s, burst
     "steps",
     [
         np.where(np.arange(10_000) < 8000, 1 / 100, 1 / 92),
-        np.where(np.arange(10_000) < 3000, 1 / 100, 1 / 50),
-        1 / np.linspace(100, 95, 10_000),
         1 / np.linspace(120, 110, 10_000),
     ],
 )
@@ -186,8 +174,7 @@ def test_a_rate_that_changes_is_rejected(steps):
         assert "along the recording: split the file" in finding.detail
 
 
-@pytest.mark.parametrize("bits", [8, 16])
-def test_a_packet_counter_may_wrap_but_not_repeat_go_back_or_skip(bits):
+def test_a_packet_counter_may_wrap_but_not_repeat_go_back_or_skip(bits=16):
     counts = np.mod(np.arange(1000) + 2**bits - 100, 2**bits).astype(float)
     assert from_counter(counts, bits).gap_rows.tolist() == []
     skipped = from_counter(np.delete(counts, [300, 301]), bits)

@@ -25,24 +25,16 @@ def axes(name, order="xyz"):
     ("header", "columns", "options"),
     [
         (axes("g# (DPS)"), X, {}),
-        (axes("g# (Rad. per second)"), X * RAD, {}),
+        (axes("g# [deg/h]"), X * 3600, {}),
         (axes("Gyro#_dps"), X, {}),
-        (axes("gyro.# [rad/s]"), X * RAD, {}),
-        (axes("Gyro (rad/s).#"), X * RAD, {}),
         (f"{T}gyro[0],gyro[1],gyro[2]", X, DEG),
-        (f"{T}angular_velocity[0],angular_velocity[1],angular_velocity[2]", X, DEG),
         (axes(""), X, BY_NUMBER),
         (f"{T}roll (deg/s),pitch (deg/s),yaw (deg/s)", X, {"columns": (1, 2, 3)}),
         (f"{T}yaw_rate (deg/s),pitch_rate (deg/s),roll_rate (deg/s)", X[:, ::-1], {}),
-        (f"{T}p,q,r", X, DEG | {"columns": ("p", "q", "r")}),
         (f"{T}r (dps),q (dps),p (dps)", X[:, ::-1], {}),
-        (f"{T}gyro3,gyro2,gyro1", X[:, ::-1], DEG),
-        (f"{T}adc1,adc2,adc3", X, BY_NUMBER),
         (f"{T}delta_angle[0],delta_angle[1],delta_angle[2]", X * RAD / 100,
          {"units": "rad", "columns": (1, 2, 3), "increments": True}),
         (axes("g#"), X * RAD, {"preamble": "# gyroscope in rad/s, range 250 dps"}),
-        (axes("g#"), X * 131,
-         {"preamble": "Sensitivity: 131", "units": "raw", "scale_dps": 1 / 131}),
     ],
 )  # fmt: skip
 def test_rates_are_told_by_name_and_unit_or_by_the_users_word(header, columns, options, read):
@@ -61,10 +53,8 @@ def test_rates_are_told_by_name_and_unit_or_by_the_users_word(header, columns, o
         (axes("g# (LSB)"), {}, "raw counts: give units: raw and scale_dps"),
         (axes("g#"), {"columns": ("gx", "gy", "wz")}, "one column 'wz', got 0.* in 4 columns"),
         (axes("g#"), {"columns": (1, 2, 9)}, "expected one column 9, got 0"),
-        (f"{T}gx,gx,gy", {"columns": ("gx", "gy", "gz")}, r"one column 'gx', got 2.*\[1, 2\]"),
         (axes("g#"), {"columns": {1: (1, 2, 3)}, "imu": 2}, "expected IMU 2, got those of IMUs 1"),
         (axes("g# (rad/s)"), {"preamble": "in deg/s"}, "header says rad/s, but lines above.*deg/s"),
-        (f"{T}gx (deg/s),gy (rad/s),gz (deg/s)", {}, "header says deg/s, but the header says rad"),
         ("k,dx (rad),dy (rad),dz (rad)", {"increments": True}, "the step .* is not known; give ti"),
         (axes("g# (deg/s)"), {"increments": True, "units": "deg"}, "but that is no angle turned"),
     ],
@@ -78,19 +68,14 @@ def test_what_is_not_said_is_asked_for(header, options, words, read):
     ("header", "options", "words"),
     [
         (f"{T}yaw (dps),pitch (dps),roll (dps)", BY_NUMBER, "but by their names 'roll .dps.', 'pi"),
-        (f"{T}r,q,p", BY_NUMBER, "belong together in this order"),
         (f"{T}gyro 3,gyro 2,gyro 1", BY_NUMBER, "belong together in this order"),
-        (f"{T}w2,w1,w0", BY_NUMBER, "belong together in this order"),
         (axes("a#"), BY_NUMBER | {"increments": True, "units": "deg"}, "by name no angular rate"),
-        (axes("g# (LSB)"), DEG, "but the header says LSB"),
         (axes("g# (deg/s)"), {"units": "raw", "scale_dps": 0.1}, "raw, of 0.1 deg/s, but the head"),
         *[
             (axes(f"g# ({unit})"), DEG, "but that is no angular rate")
-            for unit in ("grad/s", "Grad/s", "deg/√h", "0.1*(deg/s)", "LSB/(deg/s)")
+            for unit in ("grad/s", "deg/√h", "LSB/(deg/s)")
         ],
-        (axes("g# (deg/s)*100"), BY_NUMBER, "no angular rate"),
         (f"{T}gx (deg/s),gy (rad/s),gz (deg/s)", BY_NUMBER, "are deg/s, but the header says rad/s"),
-        (axes("g#_dps (rad/s)"), BY_NUMBER, "are deg/s, but the header says rad/s"),
         (axes("g#"), DEG | {"preamble": "Sensitivity: 131"}, "says 'Sensitivity: 131', but"),
         (axes("10*g# (deg/s)"), {}, "name a factor"),
     ],
@@ -109,9 +94,9 @@ def test_contradictions_are_refused_unless_the_options_are_trusted(
 @pytest.mark.parametrize(
     "line",
     [
-        "LSB/dps = 14.2857", "gyro_lsb_per_dps,14.2857", "Gyroscope scale (deg/s per LSB): 0.07",
-        "gyr_scale 0.07", "Sensitivity: 0.07", "resolution: 0.07 deg/s", "gain: 0.07", "gres,0.07",
-        "factor: 0.07", "multiplier,0.07", "gyro sensitivity 70 mdps/LSB", "14.2857 LSB/dps",
+        "LSB/dps = 14.2857",  "Gyroscope scale (deg/s per LSB): 0.07",
+        "gyr_scale 0.07", "Sensitivity: 0.07",  "gain: 0.07",
+         "multiplier,0.07", "gyro sensitivity 70 mdps/LSB",
         "range 250 dps, 14.2857 LSB/dps", "acc: 16384 LSB/g, gyro: 14.2857 LSB/dps",
     ],
 )  # fmt: skip
@@ -130,8 +115,8 @@ def test_a_scale_that_the_file_states_is_named_for_typing(line, read):
     "line",
     [
         "Gyro full scale: 250 dps", "acc sensitivity: 0.061", "ascale,0.0004", "gyro scale: 1.0",
-        "acc scale, mg, 0.061", "gyro range: ±250", "Resolution: 16 bit", "fs_sel: 2", "again 5",
-        "magnetometer gain 0.15", "Factory: 7", "sensitivity of 2021-05-04", "gain set 10:30:00",
+         "gyro range: ±250", "Resolution: 16 bit",
+         "Factory: 7", "sensitivity of 2021-05-04",
     ],
 )  # fmt: skip
 def test_ranges_and_scales_of_other_sensors_are_none_of_the_rates(line, read):
@@ -164,7 +149,7 @@ def test_rates_that_are_free_of_their_bias_are_said(name, read):
     )
 
 
-@pytest.mark.parametrize("name", ["tilt_#", "jerk_#", "field_#", "#"])
+@pytest.mark.parametrize("name", ["tilt_#", "#"])
 def test_rates_by_units_alone_are_said_and_never_a_quaternion(name, read, details):
     assert "only the option units says" in details(read(axes(name), S, X, **DEG), "rates")[0]
     assert not read(axes(name), S, X, **BY_NUMBER).findings
@@ -180,14 +165,11 @@ def test_rates_by_units_alone_are_said_and_never_a_quaternion(name, read, detail
     ("header", "options", "first_c", "words"),
     [
         ("temperature (F)", {}, -3.8888889, ""),
-        ("T_temp [K]", {}, -248.15, ""),
-        ("imu_degC", {}, 25, ""),
         ("T(℃)", {}, 25, ""),
         ("temp_c", {}, 25, "'temp_c' has no unit; degrees Celsius are assumed"),
-        ("temp_gyro", {}, 25, "has no unit"),
         ("temp_gyro,temp_board", {}, None, "none of 'temp_gyro', 'temp_board' is kept"),
         ("temp_gyro,temp_board", {"temperature_column": "temp_gyro"}, 25, ""),
-        *[(name, {}, None, "") for name in ("temp_valid", "attempt", "temp_f", "gain [K]")],
+        *[(name, {}, None, "") for name in ("temp_valid", "gain [K]")],
     ],
 )
 def test_a_temperature_is_kept_in_degrees_celsius(header, options, first_c, words, read, details):
@@ -197,9 +179,7 @@ def test_a_temperature_is_kept_in_degrees_celsius(header, options, first_c, word
     assert words in str(details(log, "temperature")) and bool(words) == bool(log.findings)
 
 
-@pytest.mark.parametrize(
-    ("unit", "factor"), [("g", 1), ("m/s²", 9.80665), ("mg", 1000), ("G", 1), ("", 0), ("V", 0)]
-)
+@pytest.mark.parametrize(("unit", "factor"), [("m/s²", 9.80665), ("mg", 1000), ("", 0)])
 def test_accelerations_are_kept_in_g(unit, factor, read, details):
     header = f"{axes('g# (dps)')},{axes(f'Acc # ({unit})').removeprefix(T)}".replace(" ()", "")
     log = read(header, S, X, (X + 1) * (factor or 1))
@@ -214,14 +194,10 @@ def test_accelerations_are_kept_in_g(unit, factor, read, details):
     ("options", "words"),
     [
         ({"units": "1/s"}, "expected a unit of angle per time"),
-        ({"units": "deg/s", "increments": True}, "expected a unit of an angle"),
         ({"units": "raw"}, "units: raw and scale_dps go together"),
         ({"scale_dps": 0.1}, "units: raw and scale_dps go together"),
         ({"offset": 3}, "offset: applies to raw counts"),
         ({"time_units": "deg"}, "expected a unit of time"),
-        ({"time_units": -1}, "greater than 0"),
-        ({"acceleration_units": "s"}, "expected a unit of acceleration"),
-        ({"trust": "header"}, "options"),
         ({"format": "dot"}, "'auto', 'general', 'movella_dot',"),
     ],
 )

@@ -10,8 +10,8 @@ RAW = {"units": "raw", "scale_dps": 0.00875}
 X = np.random.default_rng(0).normal([0.7, -0.4, 0.15], 0.05, (6000, 3))
 
 
-@pytest.mark.parametrize("bits", [12, 13, 14, 24])
-@pytest.mark.parametrize("shift", [[0, 0, 0], [-1.2, -0.5, -0.85], [-0.7, 0.4, -0.15]])
+@pytest.mark.parametrize("bits", [12, 24])
+@pytest.mark.parametrize("shift", [[0, 0, 0], [-0.7, 0.4, -0.15]])
 def test_signed_counts_that_were_written_as_unsigned_ones(bits, shift, read):
     counts = np.round((X + shift) / RAW["scale_dps"])
     damaged = counts % 2**bits
@@ -23,7 +23,7 @@ def test_signed_counts_that_were_written_as_unsigned_ones(bits, shift, read):
         read("gx,gy,gz", counts - 3000, signed_bits=bits, **RAW)
 
 
-@pytest.mark.parametrize("level", [0, 0.5, 100, 2500, 20000, np.nan])
+@pytest.mark.parametrize("level", [0, 2500, np.nan])
 def test_other_counts_are_not_wrapped(level):
     assert not wrapped(level + np.round(X / 0.01))
 

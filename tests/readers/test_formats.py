@@ -28,7 +28,6 @@ def axes(name, names="xyz"):
 # name of the format (None: its header says all), header, columns, lines above, g in an acceleration
 LOGGERS = [
     ("movella_dot", f"{XSENS},Euler_X", [K, S * 1e6, ACC, X, S], "", MS2),
-    ("movella_dot", f"{XSENS},dq_W", [K, S * 1e6, ACC, X, S], "", MS2),
     ("movella_dot", XSENS, [K, S * 1e6, ACC, X], "DeviceTag:,1\nOutputRate:,100Hz", MS2),
     ("xsens_mt_manager", f"{XSENS},Quat_q0", [K, S * 1e4, ACC, X * RAD, S], MT, MS2),
     ("movella_dot_angles", f"Time,phi,theta,psi,{axes('f_{},w_{}')},", [S, ACC, ACC, X, S],
@@ -36,7 +35,6 @@ LOGGERS = [
     ("openlog_artemis", f"rtcDate,rtcTime,{axes('a{},g{},m{}', 'XYZ')},output_Hz",
      [["07/31/2022"] * N, CLOCK, ACC, X, ACC, S * 0 + 90], "", 1e-3),
     ("ros_imu", f"%time,{axes(ROS)}", [1.7e18 + S * 1e9, X * RAD, ACC], "", MS2),
-    ("ros_imu", f"Time,{axes('angular_velocity.{}')}", [S, X * RAD], "", None),
     ("px4_sensor_combined", f"timestamp,{axes(PX4, '012')}", [S * 1e6, X * RAD, ACC], "", MS2),
     (None, f"Time (s),{axes('Gyroscope {} (deg/s),Accelerometer {} (g)', 'XYZ')},Barometer (hPa)",
      [S, X, ACC, S], "", 1),  # NGIMU; x-IMU3 has Timestamp (us)
@@ -75,11 +73,6 @@ def test_each_logger_is_told_by_its_header_and_read_in_deg_per_s(
 def test_a_format_that_is_contradicted_or_wrong_is_refused(options, words, read):
     with pytest.raises(InputError, match=words):
         read(LOGGERS[0][1], *LOGGERS[0][2], **options)
-
-
-def test_a_header_with_a_unit_needs_no_word_of_the_format(read):
-    header = f"{XSENS.removesuffix('Gyr_X,Gyr_Y,Gyr_Z')}{axes('Gyr_{} (rad/s)', 'XYZ')},Euler_X"
-    np.testing.assert_allclose(read(header, K, S * 1e6, ACC, X * RAD, S).samples, X)
 
 
 def test_a_packet_counter_tells_gaps(read, details):

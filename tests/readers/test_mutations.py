@@ -19,7 +19,7 @@ from gyro_pipeline.readers.table import read_table
 LOGGERS = ["dot", "angles", "general"]
 PLACE = st.floats(0, 1, exclude_max=True)
 SEVERAL = settings(
-    max_examples=80,
+    max_examples=40,
     deadline=None,
     derandomize=True,  # the same files each time
     suppress_health_check=[HealthCheck.function_scoped_fixture],
@@ -100,7 +100,7 @@ def test_no_byte_lost_or_delimiter_added_in_a_header_moves_a_column(logger, good
     start = data.rindex(b"\n", 0, data.index(b"Acc_X")) if logger == "dot" else 0
     delimiter = b";" if logger == "general" else b","
     read = 0
-    for at in range(start + 1, data.index(b"\n", start + 1)):
+    for at in range(start + 1, data.index(b"\n", start + 1), 2):
         for change in (data[:at] + data[at + 1 :], data[:at] + delimiter + data[at:]):
             log = read_or_refused(tmp_path / "log.csv", change)
             read += log is not None

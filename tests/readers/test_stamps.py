@@ -22,17 +22,12 @@ K = {"time_column": "k"}
     ("header", "columns", "options"),
     [
         ("t_ms", [S * 1e3], {}),
-        ("t/s", [S], {}),
-        ("seconds", [S], {}),
         ("time (s),Unix time CAL [ms]", [S * np.nan, S * 1e3], {}),
-        ("Zeit (s)", [S], {}),
         ("T (degC),t [s]", [S * 0 + 25, S], {}),
         ("delta_time (s),time (s)", [STEPS / 1e3, S], {}),
         ("time,seconds_elapsed", [1.7e18 + S * 1e9, S], {"time_units": "ns"}),
         ("stamp", [DATES], {}),
-        ("k", [S], K | {"time_units": "s"}),
         ("k,t (s)", [STEPS, S], K | {"time_is": "steps", "time_units": "ms"}),
-        ("t", [S * 1e3], {"preamble": "tscale,0.001"}),
         *[("t (s)", [S], {"preamble": text}) for text in (
             "Sample rate: 100 Hz", "fs = 100", "// Update Rate: 0.1kHz", "rate of turn 5")],
     ],
@@ -47,9 +42,7 @@ def test_the_first_column_that_holds_times_gives_the_rate(header, columns, optio
     ("header", "column", "words"),
     [
         ("k", S * 0, "no column of times: rate and gaps are not measured; give time_column"),
-        ("Time", ["no times"] * N, "no column of times"),
         ("time (s)", S * np.nan, "no column of times"),
-        ("exposure (ms)", S, "no column of times"),
         ("load (ms)", STEPS, "no column of times"),
         ("time", S, "'time' has no unit: the rate is not measured; give time_units"),
         ("dt (ms)", STEPS, "'dt .ms.' holds the time since the last row; give time_is: steps"),
@@ -75,9 +68,6 @@ def test_what_is_not_known_of_the_time_is_one_short_finding(header, column, word
         ("t (ms)", S, {}, "makes 100000 Hz,.*give time_units: s, which makes 100 Hz;.*trust"),
         ("t (s)", S * 1e6, {}, "makes 0.0001 Hz.*time_units: us, which makes 100 Hz;.*trust"),
         ("t (s)", S, {"preamble": "OutputRate:,120Hz"}, "state 120 Hz, 100 Hz is measured.*trust"),
-        ("t (s)", S, {"preamble": "Sampling frequency (Hz): 50.0\n"}, "state 50 Hz"),
-        ("k", S, K, "'k' has no unit"),
-        ("k", S * 0, K | {"time_units": "s"}, "'k' holds no times"),
         ("k", STEPS, K | {"time_units": "ms"}, "give time_is: steps"),
     ],
 )

@@ -38,44 +38,29 @@ def in_quotes(text):
 
 
 WHOLE = {  # all rows come back and nothing is said
-    "as it is": ("angles", str),
     "lines above the header": ("dot", str),
     "byte order mark": ("angles", lambda t: t.encode("utf-8-sig")),
     "UTF-16": ("general", lambda t: t.encode("utf-16")),
-    "UTF-16, the other way": ("general", lambda t: b"\xfe\xff" + t.encode("utf-16-be")),
     "a degree sign in another encoding": ("general", lambda t: t.encode("cp1252")),
-    "CR LF": ("angles", replaced("\n", "\r\n")),
     "CR only": ("angles", replaced("\n", "\r")),
     "quoted fields": ("general", in_quotes),
     "tabs": ("general", replaced(";", "\t")),
     "decimal commas": ("general", replaced(".", ",")),
-    "decimal commas and tabs": ("general", lambda t: t.replace(".", ",").replace(";", "\t")),
     "commas in texts": ("general", replaced("\n", ";Sun, 31\n")),
     "no trailing delimiter in the header": ("angles", replaced("z,\n", "z\n")),
-    "a header that is a comment": ("general", lambda t: f"# {t}"),
     "lines between header and rows": ("general", inserted(1, "", "started; at noon", "# 1")),
-    "an enormous field elsewhere": ("angles", cell(20, 4, "7" * 3_000_000)),
     "zeros of a card at the end": ("angles", lambda t: t.encode() + bytes(4096)),
 }  # fmt: skip
 SAID = "unreadable rows"
 DAMAGED = {  # rows that are NaN, and what is said
     "NaN": (cell(9, 7, " NaN"), [9], ""),
-    "infinity": (cell(7, 8, "-Infinity"), [7], ""),
-    "an empty field": (cell(9, 7, ""), [9], ""),
     "the first rates empty": (replaced("2.95188,-0.97946,0.38510", ",,"), [0], ""),
     "text in a number column": (cell(9, 8, "error"), [9], SAID),
-    "an enormous text": (cell(9, 8, "x" * 200_000), [9], SAID),
     "bytes that are no text": (
         lambda t: cell(9, 8, "@@")(t).encode().replace(b"@@", b"\xff\xfe"), [9], SAID),
-    "an open quote elsewhere": (cell(9, 4, '"'), [], SAID),
     "the last line cut": (lambda t: t[:-20], [59], SAID),
-    "a field too many in two rows": (
-        lambda t: cell(9, 8, "1,2")(cell(30, 2, "1,2")(t)), [9, 30], SAID),
     "a field too many in the first row": (cell(0, 2, "1,2"), [0], SAID),
     "a message between rows": (inserted(31, "SD card slow"), [30], SAID),
-    "a boot message with commas": (
-        inserted(31, "rst:0x1 (POWERON),boot:0x13", "I (123) wifi: connected, ip x, gw y"),
-        [30, 31], SAID),
     "comments between rows": (inserted(31, "# a, b", "// c"), [30, 31], SAID),
 }  # fmt: skip
 
@@ -106,24 +91,15 @@ def test_damage_of_a_few_rows_is_nan_and_said(case, good, rates, table):
 
 REFUSED = {
     "empty": ("angles", lambda t: "", "got an empty file"),
-    "blank": ("angles", lambda t: "\n\n \n", "expected at least two rows"),
     "one row": ("angles", lines(lambda t: t[:2]), "none in the first 2 lines; line 1 begins 'Time"),
-    "binary zeros": ("angles", lambda t: bytes(range(4)) * 99, "got binary data"),
     "UTF-16 without mark": ("angles", lambda t: t.encode("utf-16-le"), "`encoding: utf-16-le`"),
     "another delimiter": ("angles", lambda t: re.sub(", ?", "|", t), "or '.t' or ' ', got none"),
     "fewer columns from a row on": (
         "angles", lines(lambda t: t[:31] + [line.rsplit(",", 3)[0] for line in t[31:]]),
         "got 30 of 60 that are not: row 30 .line 32."),
-    "a comma too many before the header": (
-        "angles", lambda t: f",{t}", "as many columns as the rows, 10, got 11"),
     "a comma too many in a header without the last": (
         "angles", lambda t: t.replace("psi,", "psi,,").replace("z,\n", "z\n"), "rows, 10, got 11"),
-    "a header of fewer columns": ("angles", replaced("phi,theta,", ""), "the rows, 10, got 8"),
     "two recordings": ("angles", lambda t: t + t, "a second header in row 60 .line 62."),
-    "two loggers": ("angles", lambda t: t + t.replace("f_", ""), "a second header in row 60"),
-    "two recordings, their rows wider than the header": (
-        "angles", lambda t: (t := t.replace("z,\n", "z\n")) + t, "a second header in row 60"),
-    "two recordings with lines above": ("dot", lambda t: t + t, "a second header"),
     "a column of thousands": (
         "general", replaced(";0.", ";1,000."), "numbers in 'z', without thousands"),
     "what may be thousands": (
@@ -138,9 +114,8 @@ def test_what_cannot_be_read_safely_is_refused(case, good, table):
         samples(table(change(good[logger])))
 
 
-@pytest.mark.parametrize("columns", [3, 60])
-@pytest.mark.parametrize("options", [{}, {"fmt": "%12.6f"}, {"delimiter": "\t"}])
-def test_numpys_texts_are_tables_with_or_without_header(columns, options, table):
+@pytest.mark.parametrize("options", [{"fmt": "%12.6f"}, {"delimiter": "\t"}])
+def test_numpys_texts_are_tables_with_or_without_header(options, table, columns=60):
     values = np.random.default_rng(0).normal(size=(30, columns))
     names = [f"c{number} (deg/s)" for number in range(columns)]
     for header in ("", " ".join(names), ",".join(names), "\t".join(names)):
@@ -195,7 +170,7 @@ def test_options_say_how_a_text_is_coded_and_split(table):
     assert table("a|b|c\n" + "1|2|3\n" * 9, delimiter="|").names == ("a", "b", "c")
 
 
-@pytest.mark.parametrize(("rows", "most"), [(100, 3), (1000, 10)])
+@pytest.mark.parametrize(("rows", "most"), [(1000, 10)])
 def test_one_row_in_a_hundred_may_be_unreadable_but_no_more(rows, most, table):
     broken = ["x,y,z", *["1,2,3"] * (rows - most), *["1,2"] * most]
     assert np.isnan(table("\n".join(broken)).columns[0]).sum() == most
@@ -203,17 +178,7 @@ def test_one_row_in_a_hundred_may_be_unreadable_but_no_more(rows, most, table):
         table("\n".join([*broken, "1,2"]))
 
 
-def test_a_finding_says_which_row_and_line_and_why(good, table):
-    text = cell(9, 8, "error")(good["angles"])
-    for content, line in ((text, 11), (text.replace("\n", "\n\n"), 21)):
-        (finding,) = table(content).findings
-        assert finding.detail == (
-            "1 of 60 rows cannot be read and are NaN, or a cell of them: "
-            f"row 9 (line {line}): 'error' in 'y'"
-        )
-
-
-@pytest.mark.parametrize("stray", ['"9","1.5","', '"9""1.5","3"', '"9,"1.5","3"'])
+@pytest.mark.parametrize("stray", ['"9","1.5","', '"9,"1.5","3"'])
 def test_a_stray_quote_takes_no_other_row_with_it(stray, table):
     rows = ['"1","2","3"'] * 9
     log = table("\n".join(['"x","y","z"', *rows, stray, *rows, stray, *rows]))

@@ -157,17 +157,8 @@ def test_of_several_gyroscopes_the_options_pick_one(tmp_path, kind):
         read(path, topic="lost")
 
 
-def test_messages_of_raw_rates_have_their_own_stamps(tmp_path):
-    path = dataflash(tmp_path / "log.bin", raw=True)
-    with pytest.raises(InputError, match="topic: IMU with instance: 0, topic: GYR"):
-        read(path)
-    table, columns, _ = read(path, topic="GYR")
-    np.testing.assert_array_equal(columns["time [us]"], STAMPS_US)
-    assert "INS_GYR" in table.findings[0].detail
-
-
 @pytest.mark.parametrize("kind", ["ulg", "bin", "ros1", "db3", "mcap"])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_damaged_logs_end_in_a_refusal_or_a_table(tmp_path, kind, seed, capfd):
     path, draws = WRITERS[kind](tmp_path), np.random.default_rng(seed)
     data = bytearray(path.read_bytes()[: draws.integers(20, path.stat().st_size)])

@@ -5,8 +5,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from gyro_pipeline.conventions import ALL, DISJOINT, FIRST, MDPS, PAPER, TRUE
-from gyro_pipeline.physics.ceiling import best_gain, best_saving, ceiling_rmse, running_mean_rmse
+from gyro_pipeline.conventions import ALL, DISJOINT, FIRST, PAPER, TRUE
 from gyro_pipeline.scoring.scores import (
     Curve,
     SquaredErrors,
@@ -69,17 +68,6 @@ def test_squared_errors_by_hand():
     disjoint = squared_errors(table, DISJOINT, ALL)
     np.testing.assert_allclose(disjoint.sums, [3.5 + 0.01 - 0.5, 0.5])
     assert squared_errors(table, TRUE, FIRST).sums.tolist() == [49]
-
-
-def test_signed_errors_are_never_averaged():
-    table = errors_table((1, 0, PAPER, 1.0, 0), (1, 1, PAPER, -1.0, 0), (2, 0, PAPER, 1.0, 0))
-    assert squared_errors(table, PAPER, ALL).mean(np.ones((1, 2))).tolist() == [1.0]
-
-
-def test_recordings_weigh_by_their_squares():
-    pooled = SquaredErrors(np.array([8.0, 3.0]), np.array([4, 1]))
-    weights = np.array([[1, 1], [2, 0], [0, 2]])
-    np.testing.assert_allclose(pooled.mean(weights), [11 / 5, 2, 3])
 
 
 def test_of_several_devices_whole_devices_are_resampled_and_else_recordings():
@@ -197,13 +185,6 @@ def test_one_recording_by_hand():
     assert all(estimate.lo is None and estimate.hi is None for estimate in scores.values())
 
 
-def test_worse_than_the_mean_is_a_negative_saving_and_gain():
-    scores = scored(squares([4.0]), squares([2.0]), curve_of([1, 2, 5], [8, 4, 2]), 5.0, PLAIN)
-    assert scores["equivalent_time_s"].value == 2
-    assert scores["time_saving_pct"].value == pytest.approx(-150)
-    assert scores["accuracy_gain_pct"].value == pytest.approx(-100)
-
-
 @pytest.mark.parametrize(("rmse", "off"), [(9.0, -np.inf), (0.5, np.inf)])
 def test_off_the_curve_there_is_a_gain_but_no_time(rmse, off):
     scores = scored(squares([rmse]), squares([2.0]), curve_of([1, 2, 5], [8, 4, 2]), 5.0, PLAIN)
@@ -230,23 +211,6 @@ def test_intervals_hold_the_value_and_pair_the_estimator_with_the_mean():
     saving, time = scores["time_saving_pct"], scores["equivalent_time_s"]
     for end in ("lo", "value", "hi"):
         assert getattr(saving, end) == pytest.approx(100 * (1 - 2 / getattr(time, end)))
-
-
-N, TAU = 3.3 * MDPS, 0.31 * MDPS
-WINDOW_S, RECORDING_S = 10.0, 87.0
-RHO = ceiling_rmse(N, TAU, WINDOW_S, RECORDING_S, PAPER) / running_mean_rmse(
-    N, WINDOW_S, RECORDING_S, PAPER
-)
-
-
-def test_on_the_closed_form_curve_the_ceiling_scores_its_closed_form():
-    times_s = np.arange(0.25, RECORDING_S + 0.01, 0.25)
-    curve = curve_of(times_s, running_mean_rmse(N, times_s, RECORDING_S, PAPER))
-    mean = running_mean_rmse(N, WINDOW_S, RECORDING_S, PAPER)
-    scores = scored(squares([RHO * mean]), squares([mean]), curve, WINDOW_S, PLAIN)
-    saving = 100 * best_saving(RHO, WINDOW_S / RECORDING_S)
-    assert scores["time_saving_pct"].value == pytest.approx(saving, abs=0.01)
-    assert scores["accuracy_gain_pct"].value == pytest.approx(100 * best_gain(RHO))
 
 
 def test_without_a_positive_square_there_is_no_root_and_nothing_is_clipped():

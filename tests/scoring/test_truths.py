@@ -2,10 +2,8 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from gyro_pipeline.conventions import ALL, AXES, DISJOINT, FIRST, PAPER, TRUE
+from gyro_pipeline.conventions import ALL, DISJOINT, FIRST, PAPER, TRUE
 from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.noise import simulate_noise
 from gyro_pipeline.scoring import truths
@@ -57,18 +55,11 @@ def test_truths_are_those_of_brute_force_wherever_the_windows_are(size, starts, 
         np.testing.assert_allclose(value, expected[truth], atol=1e-12)
 
 
-def test_only_the_disjoint_truth_has_a_variance_of_its_own():
-    found = recording().truths(np.arange(0, 40, 10), 10)
-    np.testing.assert_allclose(found[DISJOINT][1], 4 * [NOISE**2 / ((47 - 10) / RATE_HZ)])
-    for truth in (PAPER, TRUE):
-        assert not found[truth][1].any()
-
-
 @pytest.mark.parametrize("figures", [NoiseFigures(1, 0, 0), NoiseFigures(1, 1, 0.5)])
 def test_the_disjoint_variance_is_what_that_truth_scatters_by(figures):
     noise = simulate_noise(
         np.random.default_rng(4),
-        (4000, 3, 48),
+        (2000, 3, 48),
         RATE_HZ,
         np.full(3, figures.white),
         flicker_dps=figures.instability,
@@ -77,14 +68,9 @@ def test_the_disjoint_variance_is_what_that_truth_scatters_by(figures):
     starts = np.array([0, 16, 32])
     found = [of(one, 3 * (figures,)).truths(starts, 16)[DISJOINT] for one in noise]
     scatter = np.array([value for value, _ in found]).var(axis=(0, 2))
-    np.testing.assert_allclose(scatter, found[0][1][:, 0], rtol=0.06)
+    np.testing.assert_allclose(scatter, found[0][1][:, 0], rtol=0.08)
     walks = figures.random_walk > 0
     assert (scatter[0] > 1.2 * scatter[2]) == walks  # what comes later has walked further
-
-
-def test_a_window_of_the_whole_recording_has_nothing_outside_and_measured_ones_no_true_bias():
-    assert set(recording().truths(np.array([0]), 47)) == {PAPER, TRUE}
-    assert set(recording(true_bias=None).truths(np.array([0]), 10)) == {PAPER, DISJOINT}
 
 
 def test_sums_are_in_double_precision():
@@ -141,24 +127,3 @@ def test_the_curve_is_that_of_brute_force(masked):
             assert first.sum_sq.iloc[row] == pytest.approx(squares[0].sum(), abs=1e-10)
             assert first["count"].iloc[row] == 3
     assert (set(curve.imu), set(curve.recording)) == ({2}, {7})
-
-
-@settings(max_examples=15, deadline=None)
-@given(
-    axes=st.permutations(range(len(AXES))),
-    constant=st.floats(-1000, 1000),
-    n=st.integers(12, 40),
-    size=st.integers(1, 12),
-    seed=st.integers(0, 99),
-)
-def test_axes_do_not_mix_and_a_constant_on_samples_and_truth_changes_no_error(
-    axes, constant, n, size, seed
-):
-    one, starts, order = recording(n, seed), np.arange(0, n - size + 1, size), list(axes)
-    figures = tuple(FIGURES[axis] for axis in order)
-    other = of(one.samples[order] + constant, figures, true_bias=BIAS[order] + constant)
-    means, other_means = (each.window_means(starts, size) for each in (one, other))
-    for truth, (value, variance) in one.truths(starts, size).items():
-        moved, other_variance = other.truths(starts, size)[truth]
-        np.testing.assert_allclose(other_means - moved, (means - value)[:, order], atol=1e-8)
-        np.testing.assert_allclose(other_variance, variance[:, order])
