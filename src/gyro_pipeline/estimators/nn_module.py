@@ -8,15 +8,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from gyro_pipeline.conventions import (
-    ALL,
-    BEST,
-    LAST,
-    ORIGIN_REAL,
-    TRAIN,
-    VALIDATION,
-    InputError,
-)
+from gyro_pipeline.conventions import ALL, BEST, LAST, ORIGIN_REAL, TRAIN, VALIDATION, InputError
 from gyro_pipeline.estimators.base import Estimator, Windows
 from gyro_pipeline.estimators.training import TrainingSet
 from gyro_pipeline.learning.design import Design, network_class, options_of

@@ -102,10 +102,7 @@ class EmpiricalBayes(Estimator):
         return means, np.zeros(len(self._noise))
 
     def _spread(
-        self,
-        training: TrainingSet,
-        labels: NDArray[np.float64],
-        averaging: NDArray[np.float64],
+        self, training: TrainingSet, labels: NDArray[np.float64], averaging: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """The tau of each axis, (3,)."""
         if len(labels) < FEWEST_RECORDINGS:
@@ -137,10 +134,7 @@ class PooledEmpiricalBayes(EmpiricalBayes):
     recommended = False
 
     def _spread(
-        self,
-        training: TrainingSet,
-        labels: NDArray[np.float64],
-        averaging: NDArray[np.float64],
+        self, training: TrainingSet, labels: NDArray[np.float64], averaging: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         if not training.seen:
             return super()._spread(training, labels, averaging)

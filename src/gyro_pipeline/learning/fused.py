@@ -205,15 +205,9 @@ def _parameters(
     tap, sample = np.divmod(np.arange(a.kernel), a.stride)
     kernel = np.add.outer(gyroscope * a.stride, tap * s["width"] + sample)
     return {
-        "hidden.weight": (
-            np.add.outer(unit * s["features"], feature),
-            s["hidden"] * s["features"],
-        ),
+        "hidden.weight": (np.add.outer(unit * s["features"], feature), s["hidden"] * s["features"]),
         "hidden.bias": (unit, s["hidden"]),
-        "output.weight": (
-            np.add.outer(gyroscope * s["hidden"], unit),
-            a.gyroscopes * s["hidden"],
-        ),
+        "output.weight": (np.add.outer(gyroscope * s["hidden"], unit), a.gyroscopes * s["hidden"]),
         "output.bias": (gyroscope, _up(a.gyroscopes, CACHE_LINE)),
         "convolution.weight": (
             np.add.outer(channel * s["span"], kernel),

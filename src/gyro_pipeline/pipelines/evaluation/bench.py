@@ -43,12 +43,7 @@ from gyro_pipeline.scoring.scores import (
     squared_errors,
     with_interval,
 )
-from gyro_pipeline.scoring.truths import (
-    TestRecording,
-    error_columns,
-    running_mean_curve,
-    stacked,
-)
+from gyro_pipeline.scoring.truths import TestRecording, error_columns, running_mean_curve, stacked
 from gyro_pipeline.windows import cut_windows, window_size
 
 SCORES = ["weights", "truth", "windows", "score", "value", "lo", "hi"]

@@ -9,35 +9,16 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from gyro_pipeline.conventions import (
-    ALL,
-    FIRST,
-    LAST,
-    MDPS,
-    PAPER,
-    TEST,
-    TRUE,
-)
+from gyro_pipeline.conventions import ALL, FIRST, LAST, MDPS, PAPER, TEST, TRUE
 from gyro_pipeline.estimators import ORIENTATION_NOTE
 from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.fingerprints import code_hash, data_hash, fingerprint
 from gyro_pipeline.pipelines.evaluation.bench import Bench
 from gyro_pipeline.pipelines.evaluation.ceilings import PREMISE
-from gyro_pipeline.pipelines.evaluation.device import (
-    TestDevice,
-    describe_devices,
-    training_labels,
-)
+from gyro_pipeline.pipelines.evaluation.device import TestDevice, describe_devices, training_labels
 from gyro_pipeline.scoring.truths import CURVE_STEP_S
 from gyro_pipeline.studies import MEAN, RunSpec, planned
-from gyro_pipeline.tracking import (
-    CURVE,
-    ERRORS,
-    EVALUATED_WITH,
-    SCORES,
-    EvaluatedRun,
-    StoredRun,
-)
+from gyro_pipeline.tracking import CURVE, ERRORS, EVALUATED_WITH, SCORES, EvaluatedRun, StoredRun
 
 logger = logging.getLogger(__name__)
 
@@ -110,11 +91,7 @@ class Benches:
     """
 
     def __init__(
-        self,
-        recordings: xr.Dataset,
-        windows: pd.DataFrame,
-        bias: pd.DataFrame,
-        allan: xr.Dataset,
+        self, recordings: xr.Dataset, windows: pd.DataFrame, bias: pd.DataFrame, allan: xr.Dataset
     ) -> None:
         self._recordings, self._bias, self._allan = recordings, bias, allan
         key = ["protocol", "window_s", "window_stride_s"]

@@ -28,10 +28,7 @@ _CEILINGS = ("ceiling_time_saving_pct", "ceiling_accuracy_gain_pct")
 
 
 def pool_leakage(
-    study: Study,
-    training: Training,
-    sensors: dict[str, Any],
-    **stored: Any,
+    study: Study, training: Training, sensors: dict[str, Any], **stored: Any
 ) -> dict[str, pd.DataFrame]:
     """Pool the leak study's runs into one row per sensor, stride and way of training.
 
@@ -64,9 +61,7 @@ def pool_leakage(
     return {"results": results}
 
 
-def _rows_of_stride(
-    made: Sequence[tuple[RunSpec, StoredRun]],
-) -> list[dict[str, Any]]:
+def _rows_of_stride(made: Sequence[tuple[RunSpec, StoredRun]]) -> list[dict[str, Any]]:
     """A row for each way of training: all its seeds pooled."""
     by_name = {spec.estimator: run for spec, run in made}
     rows = []
@@ -83,10 +78,7 @@ def _rows_of_stride(
 
 
 def _pooled(
-    runs: Sequence[StoredRun],
-    weights_of: str,
-    mean: StoredRun,
-    constant: StoredRun,
+    runs: Sequence[StoredRun], weights_of: str, mean: StoredRun, constant: StoredRun
 ) -> dict[str, Any]:
     """All seeds of one way of training at one stride."""
     errors, first = _ordered(runs, weights_of), runs[0]

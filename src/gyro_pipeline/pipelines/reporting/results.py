@@ -75,12 +75,7 @@ def column(name: str, windows: str = FIRST) -> str:
 
 
 def pool_results(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
-    study: Study,
-    source: str,
-    windows_s: list[float],
-    seeds: list[int],
-    only: Only,
-    **stored: Any,
+    study: Study, source: str, windows_s: list[float], seeds: list[int], only: Only, **stored: Any
 ) -> dict[str, pd.DataFrame]:
     """Pool the runs that a study's plans ask for into one row per result.
 

@@ -33,14 +33,7 @@ from gyro_pipeline.estimators.training import TrainingSet
 from gyro_pipeline.fingerprints import code_hash, data_hash, fingerprint
 from gyro_pipeline.parameters import Execution, Only, Splits, Study, Training, VirtualGyros
 from gyro_pipeline.physics.bias import fill_masked
-from gyro_pipeline.studies import (
-    LEFT_OUT,
-    RunSpec,
-    planned,
-    run_params,
-    run_specs,
-    study_rows,
-)
+from gyro_pipeline.studies import LEFT_OUT, RunSpec, planned, run_params, run_specs, study_rows
 from gyro_pipeline.tracking import FINGERPRINT, HISTORY, FittedRun, RunIdentity, StoredRun
 from gyro_pipeline.windows import window_size
 

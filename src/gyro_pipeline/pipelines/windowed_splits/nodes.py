@@ -22,18 +22,8 @@ from gyro_pipeline.conventions import (
 from gyro_pipeline.parameters import Only, Splits, Study
 from gyro_pipeline.pipelines.windowed_splits.copies import SAMPLES as COMPARED
 from gyro_pipeline.pipelines.windowed_splits.copies import near_copies
-from gyro_pipeline.pipelines.windowed_splits.protocols import (
-    PROTOCOLS,
-    Candidates,
-    check_table,
-)
-from gyro_pipeline.recordings import (
-    bias_rows,
-    common_length,
-    cut,
-    one_by_one,
-    tested_imu,
-)
+from gyro_pipeline.pipelines.windowed_splits.protocols import PROTOCOLS, Candidates, check_table
+from gyro_pipeline.recordings import bias_rows, common_length, cut, one_by_one, tested_imu
 from gyro_pipeline.studies import study_rows
 from gyro_pipeline.windows import describe_losses, usable_windows, window_size
 

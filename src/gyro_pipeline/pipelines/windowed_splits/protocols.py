@@ -155,10 +155,7 @@ PROTOCOLS: Mapping[str, Callable[[Candidates], Folds]] = {
 
 
 def check_table(
-    table: pd.DataFrame,
-    apart: str,
-    contents: pd.DataFrame,
-    drawn_from: Sequence[int],
+    table: pd.DataFrame, apart: str, contents: pd.DataFrame, drawn_from: Sequence[int]
 ) -> None:
     """Refuse what an honest windows table may not have.
 
