@@ -271,7 +271,7 @@ class Stretch:
         return self._scaled(self.unscaled, *self.noise_scale)
 
     def _scaled(self, estimate: Estimate, factor: Array, freedom: Array) -> Estimate:
-        """Scale variances to Student's limits, over all attempts if only the log shows the noise."""
+        """Scale variances to Student's limits, over all attempts if only this log tells N."""
         if not np.isinf(freedom).all():
             attempts = self.setup.now.attempt if not self.setup.noise_prior[1].any() else 1
             z = -NormalDist().inv_cdf(0.025 / attempts)
