@@ -158,7 +158,7 @@ ASKED = {
     "estimator": (
         {"studies": {"real2real": {"estimators": ["kalman"]}}},
         "real2real",
-        "unknown estimator 'kalman'; there are mean, median",
+        "unknown estimator 'kalman'; expected one of mean, median",
     ),
     "nothing": (
         {"only": {"sensor": "ng"}},

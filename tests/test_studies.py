@@ -219,7 +219,9 @@ def test_a_run_carries_its_identity_and_the_settings_that_it_depends_on(base):
 
 
 def test_an_unknown_estimator_is_refused_with_those_there_are():
-    with pytest.raises(InputError, match="unknown estimator 'oracle'; there are mean, median, .*"):
+    with pytest.raises(
+        InputError, match="unknown estimator 'oracle'; expected one of mean, median, .*"
+    ):
         run_spec(replace(ROW, estimator="oracle"), False)
 
 

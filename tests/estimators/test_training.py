@@ -123,7 +123,7 @@ def test_keys_tell_training_sets_and_recordings_apart(training):
 @pytest.fixture
 def filed(tmp_path, monkeypatch):
     """Recordings in a file, and nothing remembered of any."""
-    monkeypatch.setattr(module, "_OF_FILES", module._Memory())
+    monkeypatch.setattr(module, "_FILE_CACHE", module._ArrayCache())
     drawn().to_netcdf(tmp_path / "recordings.nc", engine="h5netcdf")
     return xr.open_dataset(tmp_path / "recordings.nc", engine="h5netcdf")
 
@@ -141,11 +141,11 @@ def test_folds_share_what_is_read_and_worked_out(filed, monkeypatch):
 
 def test_what_is_remembered_is_bounded(filed, monkeypatch):
     one = drawn().angular_rate[0, 0].nbytes
-    monkeypatch.setattr(module, "_REMEMBERED_BYTES", 3 * one)
+    monkeypatch.setattr(module, "_CACHE_BYTES", 3 * one)
     windows = table((TRAIN, ORIGIN_REAL, 1, range(1, 7), [0]))
     rates = TrainingSet(filed, None, windows, SIZE, 1).rates
     np.testing.assert_array_equal(rates, drawn().angular_rate.to_numpy()[0])
-    assert module._OF_FILES._bytes <= 3 * one
+    assert module._FILE_CACHE._bytes <= 3 * one
 
 
 def test_recordings_of_a_file_go_to_a_worker_as_references(filed):

@@ -94,7 +94,7 @@ class EmpiricalBayes(Estimator):
         self._prior = scatter + (scatter + averaging) / len(labels)
 
     def _labels(self, training: TrainingSet) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Labels (n, 3) for the prior, of recordings or devices, and their averaging variance (3,)."""
+        """Labels of the prior (n, 3), recordings or devices, and their averaging variance (3,)."""
         if training.seen:
             return training.labels[1], self._noise**2 / self._recording_s
         means = np.stack([imu.means.mean(axis=0) for imu in training.known_imus])

@@ -6,7 +6,7 @@ from gyro_pipeline.pipelines.evaluation.nodes import evaluate
 
 
 def create_pipeline(study: str, sensor: str) -> Pipeline:
-    """Evaluation of one study's runs on one sensor."""
+    """The evaluation of the runs of a study on a sensor."""
     return Pipeline(
         [
             Node(

@@ -38,7 +38,9 @@ def _pooled(study: str, sensors: Sequence[str]) -> Node:
     inputs |= {f"{sensor}_runs": f"{study}.{sensor}.evaluation.runs" for sensor in sensors}
     pool: Any = pool_leakage if study == LEAKAGE else pool_results
     settings = "training sensors" if study == LEAKAGE else "source windows_s seeds only"
-    inputs |= {name: f"params:{name}" for name in settings.split()} | {"study": f"params:studies.{study}"}
+    inputs |= {name: f"params:{name}" for name in settings.split()} | {
+        "study": f"params:studies.{study}"
+    }
     return _node(pool, inputs, f"{study}.reporting.pooled", study)
 
 

@@ -6,12 +6,12 @@ from gyro_pipeline.pipelines.training.nodes import plan_runs, train
 
 
 def create_pipeline(study: str, sensor: str, virtual: bool) -> Pipeline:
-    """Trainings of one study on one sensor.
+    """The trainings of a study on a sensor.
 
     Args:
-        study: Its name.
-        sensor: Its name.
-        virtual: Whether virtual gyroscopes take part.
+        study: Name of the study.
+        sensor: Name of the sensor.
+        virtual: Whether the study uses virtual gyroscopes.
     """
     stage = f"{study}.{sensor}.training"
     data = {

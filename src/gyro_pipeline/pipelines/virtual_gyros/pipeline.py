@@ -6,7 +6,7 @@ from gyro_pipeline.pipelines.virtual_gyros.nodes import synthesise
 
 
 def create_pipeline(sensor: str) -> Pipeline:
-    """Virtual gyroscopes like those of one sensor."""
+    """Virtual gyroscopes like those of a sensor."""
     return Pipeline(
         [
             Node(

@@ -6,15 +6,15 @@ from gyro_pipeline.pipelines.windowed_splits.nodes import cut_to_common_length, 
 
 
 def create_pipeline(study: str, sensor: str, virtual: bool) -> Pipeline:
-    """One sensor's recordings, all of one length, and the windows table of a study.
+    """The recordings of a sensor, cut to one length, and the windows table of a study.
 
     Args:
-        study: Its name.
-        sensor: Its name.
-        virtual: Whether virtual gyroscopes take part.
+        study: Name of the study.
+        sensor: Name of the sensor.
+        virtual: Whether the study uses virtual gyroscopes.
     """
     stage = f"{sensor}.windowed_splits"
-    drawn = {"virtual": f"{sensor}.virtual_gyros.recordings"} if virtual else {}
+    optional = {"virtual": f"{sensor}.virtual_gyros.recordings"} if virtual else {}
     return Pipeline(
         [
             Node(
@@ -39,7 +39,7 @@ def create_pipeline(study: str, sensor: str, virtual: bool) -> Pipeline:
                     "windows_s": "params:windows_s",
                     "only": "params:only",
                 }
-                | drawn,
+                | optional,
                 f"{study}.{sensor}.windowed_splits.windows",
                 name=f"split_windows_{study}_{sensor}",
                 namespace="windowed_splits",
