@@ -107,7 +107,7 @@ class Parser:
         rows = [row for row in map(self._row, lines[header:]) if row]
         if not rows:
             text = f"expected numbers in {len(self._names)} columns, got {lines[-1][:60]!r}"
-            raise InputError(f"stream: {text}; correct what sends them")
+            raise InputError(f"stream: {text}; correct the program that sends them")
         content = table.Table("stream", tuple(self._names), tuple(np.array(rows).T))
         log = file.File(content, self.options)
         rates = list(columns.rate_columns(log, None))

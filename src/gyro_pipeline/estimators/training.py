@@ -91,8 +91,8 @@ class TrainingSet:
         if uses not in (NOTHING, OWN, REAL, ALL):
             raise InputError(f"uses: expected {NOTHING}, {OWN}, {REAL} or {ALL}, got {uses!r}")
         real = (self.windows.origin == ORIGIN_REAL).to_numpy()
-        own = (self.windows.imu == self.device).to_numpy() if self.seen else True
-        rows = {NOTHING: real & False, OWN: real & own, REAL: real}.get(uses)
+        device = (self.windows.imu == self.device).to_numpy() if self.seen else True
+        rows = {NOTHING: real & False, OWN: real & device, REAL: real}.get(uses)
         if rows is None or rows.all():
             return self
         settings = self.windows[rows], self.size, self.device, self.side_by_side
@@ -138,8 +138,8 @@ class TrainingSet:
     def recordings(self, role: str | None = None) -> int:
         """Number of recordings of the known IMUs: all, or those with windows of a role."""
         real = self.windows.origin == ORIGIN_REAL
-        own = self.windows.imu == self.device if self.seen else True
-        chosen = self.windows[real & own & (True if role is None else self.windows.role == role)]
+        device = self.windows.imu == self.device if self.seen else True
+        chosen = self.windows[real & device & (True if role is None else self.windows.role == role)]
         return len(chosen[["imu", "recording"]].drop_duplicates())
 
     @property
@@ -219,8 +219,8 @@ class ImuRecordings:
     @property
     def variances(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Allan variances and their counts of differences, (recordings, axes, times)."""
-        both = np.stack(self._cached("variances", self._allan))
-        return both[:, 0], both[:, 1].astype(np.int64)
+        figures = np.stack(self._cached("variances", self._allan))
+        return figures[:, 0], figures[:, 1].astype(np.int64)
 
     @property
     def times_s(self) -> NDArray[np.float64]:

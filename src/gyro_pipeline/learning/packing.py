@@ -74,8 +74,8 @@ class Layout:
     @property
     def samples(self) -> int:
         """Number of samples of a window that the network sees, of all gyroscopes."""
-        seen = self.shape[0] * self.packed.stride if self.packed else self.window
-        return self.gyroscopes * min(self.window, seen)
+        covered = self.shape[0] * self.packed.stride if self.packed else self.window
+        return self.gyroscopes * min(self.window, covered)
 
     def write(self, windows: np.ndarray, out: np.ndarray) -> None:
         """Write windows (gyroscopes, n, window) into zeros of shape (n, *shape)."""

@@ -1,6 +1,6 @@
 """The test bench: the test windows of a sensor, on which all estimators are judged alike."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations, product
@@ -58,21 +58,13 @@ _MIN_CORRELATED = 5
 
 @dataclass(frozen=True)
 class Bench:
-    """The test windows of a sensor, of one length, on which all estimators are judged alike.
+    """The test windows of a sensor, of one length, on which all estimators are judged alike."""
 
-    Attributes:
-        recordings: All recordings of the sensor, of one length.
-        device: The tested IMUs, from :func:`describe_devices`.
-        tests: The test rows of the windows table: ``fold, imu, recording, start``.
-        window_s: Calibration time T0, seconds.
-        labels: Means of the device's training recordings by fold, (n, axes), deg/s; empty for
-            unseen devices.
-    """
-
-    recordings: xr.Dataset
-    device: TestDevice
-    tests: pd.DataFrame
-    window_s: float
+    recordings: xr.Dataset  # all recordings of the sensor, of one length
+    device: TestDevice  # the tested IMUs
+    tests: pd.DataFrame  # test rows of the windows table: fold, imu, recording, start
+    window_s: float  # calibration time T0, seconds
+    # means of the device's training recordings by fold, (n, axes), deg/s; empty if unseen
     labels: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @cached_property
@@ -159,8 +151,8 @@ class Bench:
         """Biases and sigma of the windows of a recording, (windows, 3), by target."""
         samples = recording.samples
         if imus > 1:
-            seen = self.recordings.angular_rate.isel(imu=slice(imus))
-            samples = np.concatenate(seen.sel(recording=recording.number).to_numpy())
+            rates = self.recordings.angular_rate.isel(imu=slice(imus))
+            samples = np.concatenate(rates.sel(recording=recording.number).to_numpy())
         rows = self._rows(recording)
         shape = (len(recording.tested), len(AXES))
         estimates = {t: (np.full(shape, np.nan), np.full(shape, np.nan)) for t in TARGETS}
@@ -217,28 +209,29 @@ class Bench:
         """Errors of the best possible estimator for each truth; None on measured data."""
         if self.device.unit_bias is None:
             return None
-        parts = []
-        for recording, truths in zip(self.tested, self._truths, strict=True):
-            for truth, value in truths.items():
-                best = self._oracle_estimates(recording, truth)
-                sigma = np.full(best.shape, np.nan)
-                parts.append(error_columns(recording, truth, value, best, sigma))
-        return stacked(parts)
+        return self._errors_without_sigma(self._oracle_estimates)
 
     @cached_property
     def constant_errors(self) -> pd.DataFrame | None:
         """Errors of the mean of the training recordings; None for unseen devices."""
         if not self.labels:
             return None
+
+        def constants(recording: TestRecording, truth: str) -> np.ndarray:
+            rows = self._rows(recording).sort_values("start").drop_duplicates("start")
+            return np.stack([self.labels[fold].mean(axis=0) for fold in rows.fold])
+
+        return self._errors_without_sigma(constants)
+
+    def _errors_without_sigma(
+        self, estimate: Callable[[TestRecording, str], np.ndarray]
+    ) -> pd.DataFrame:
         parts = []
         for recording, truths in zip(self.tested, self._truths, strict=True):
-            rows = self._rows(recording).sort_values("start").drop_duplicates("start")
-            constants = np.stack([self.labels[fold].mean(axis=0) for fold in rows.fold])
-            sigma = np.full(constants.shape, np.nan)
-            parts += [
-                error_columns(recording, truth, value, constants, sigma)
-                for truth, value in truths.items()
-            ]
+            for truth, value in truths.items():
+                biases = estimate(recording, truth)
+                sigma = np.full(biases.shape, np.nan)
+                parts.append(error_columns(recording, truth, value, biases, sigma))
         return stacked(parts)
 
     @cached_property
@@ -270,8 +263,8 @@ class Bench:
             assert device.unit_bias is not None
             means = recording.window_means(recording.tested, size)
             axes = self._axes(recording.imu)
-            drawn = (device.unit_bias[axes], device.spread[0, axes], device.noise[axes])
-            return oracle(means, *drawn, self.window_s, self.recording_s, truth)
+            prior = device.unit_bias[axes], device.spread[0, axes], device.noise[axes]
+            return oracle(means, *prior, self.window_s, self.recording_s, truth)
         starts = recording.tested
         windows = cut_windows(recording.samples, size, starts)
         estimates = [
@@ -291,9 +284,9 @@ class Bench:
         assert self.device.models is not None
         axes = self._axes(recording.imu)
         models = self.device.models[axes]
-        drawn = self.recordings.get("true_time_constant")
-        if drawn is not None:
-            constants_s = drawn.sel(imu=recording.imu, recording=recording.number)
+        time_constants = self.recordings.get("true_time_constant")
+        if time_constants is not None:
+            constants_s = time_constants.sel(imu=recording.imu, recording=recording.number)
             pairs = zip(models, constants_s.to_numpy().tolist(), strict=True)
             models = tuple(replace(model, time_constant_s=constant) for model, constant in pairs)
         return list(enumerate(models, axes.start))

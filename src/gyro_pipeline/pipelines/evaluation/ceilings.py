@@ -26,22 +26,14 @@ _CURVE_POINTS = 30  # of the expected running mean, to interpolate between
 
 @dataclass(frozen=True)
 class Ceilings:
-    """Least expected errors on a device, for windows of one length.
+    """Least expected errors on a device, for windows of one length."""
 
-    Attributes:
-        device: The tested device.
-        distinct: Distinct models by axis and time constant, if noise is not white or a bias warms
-            up.
-        size: Samples of a window.
-        samples: Samples of a recording.
-        rate_hz: Samples per second.
-    """
-
-    device: TestDevice
+    device: TestDevice  # the tested device
+    # distinct models by axis and time constant, unless noise is white without warm-up
     distinct: Sequence[tuple[int, RecordingModel]]
-    size: int
-    samples: int
-    rate_hz: float
+    size: int  # samples of a window
+    samples: int  # samples of a recording
+    rate_hz: float  # samples per second
 
     @property
     def basis(self) -> str:
@@ -51,8 +43,8 @@ class Ceilings:
             return f"estimated from recordings, {noise}; {PREMISE}"
         if self.device.models is not None and len(self.distinct) > len(self.device.models):
             return (
-                "drawn values, the time constant of each warm-up among them: an estimator that must "
-                "learn it from the window cannot be as good"
+                "drawn values, the time constant of each warm-up among them: an estimator that "
+                "must learn it from the window cannot be as good"
             )
         return "drawn values"
 
@@ -69,12 +61,12 @@ class Ceilings:
         """
         if truth == DISJOINT and self.device.models is not None:
             return {}
-        if (truth, windows) not in self._made:
-            self._made[truth, windows] = self._of(truth, windows)
-        return self._made[truth, windows]
+        if (truth, windows) not in self._cache:
+            self._cache[truth, windows] = self._of(truth, windows)
+        return self._cache[truth, windows]
 
     @cached_property
-    def _made(self) -> dict[tuple[str, str], dict[str, Estimate]]:
+    def _cache(self) -> dict[tuple[str, str], dict[str, Estimate]]:
         return {}
 
     def _of(self, truth: str, windows: str) -> dict[str, Estimate]:

@@ -27,27 +27,22 @@ class TestDevice:
     """The tested IMU, axis by axis: the drawn values if simulated, else from its recordings.
 
     The axes of several unseen devices follow one another.
-
-    Attributes:
-        imus: The tested IMUs, in order.
-        noise: N, shape (axes,), deg/s sqrt(s).
-        spread: Turn-on spread tau, shape (1 + draws, axes), deg/s: the estimate, then draws of its
-            uncertainty; for an unseen device, the spread of units.
-        unit_bias: Drawn prior mean, shape (axes,), deg/s; None on measured data.
-        models: The model of each axis, if its noise is not white or its bias warms up: drawn if
-            simulated (with the time constant of a single recording), else fitted.
-        joint: Covariance of the turn-on bias of all axes, (1 + draws, axes, axes), (deg/s)^2; None
-            with few recordings, and on simulated data, where axes are independent.
-        history: Variance of the next bias given the calibrations before it, (axes,), mean over
-            the test recordings, (deg/s)^2; None likewise.
     """
 
-    imus: tuple[int, ...]
-    noise: np.ndarray
+    imus: tuple[int, ...]  # the tested IMUs, in order
+    noise: np.ndarray  # N, (axes,), deg/s sqrt(s)
+    # Turn-on spread tau, (1 + draws, axes), deg/s: the estimate, then draws of its uncertainty; for
+    # an unseen device, the spread of units.
     spread: np.ndarray
-    unit_bias: np.ndarray | None
+    unit_bias: np.ndarray | None  # drawn prior mean, (axes,), deg/s; None on measured data
+    # The model of each axis, if its noise is not white or its bias warms up: drawn if simulated
+    # (with the time constant of a single recording), else fitted.
     models: tuple[RecordingModel, ...] | None = None
+    # Covariance of the turn-on bias of all axes, (1 + draws, axes, axes), (deg/s)^2; None with few
+    # recordings, and on simulated data, where axes are independent.
     joint: np.ndarray | None = None
+    # Variance of the next bias given the calibrations before it, mean over the test recordings,
+    # (axes,), (deg/s)^2; None likewise.
     history: np.ndarray | None = None
 
     @property
@@ -70,20 +65,20 @@ def describe_devices(
         table: A windows table. A device is known if a fold in which it tests trains on it.
     """
     imus = sorted(table.imu[table.role == TEST].unique().tolist())
-    places = table[table.origin == ORIGIN_REAL].drop_duplicates(["fold", "role", *_KEYS])
-    learned = places[places.role != TEST]
-    tests = places[places.role == TEST].groupby("imu").fold.unique()
-    training = [learned[(learned.imu == imu) & learned.fold.isin(tests[imu])] for imu in imus]
+    rows = table[table.origin == ORIGIN_REAL].drop_duplicates(["fold", "role", *_KEYS])
+    learning = rows[rows.role != TEST]
+    tests = rows[rows.role == TEST].groupby("imu").fold.unique()
+    training = [learning[(learning.imu == imu) & learning.fold.isin(tests[imu])] for imu in imus]
     if len(imus) == 1 and len(training[0]):
         if recordings.attrs["simulated"]:
             return _describe_drawn(recordings, imus[0])
         of_imu = bias[bias.imu == imus[0]]
         means = of_imu.pivot(index="recording", columns="axis", values="bias_dps")
-        tested = places.recording[places.role == TEST].unique()
+        tested = rows.recording[rows.role == TEST].unique()
         trained = means.loc[means.index.isin(training[0].recording)]
         return _describe_known(recordings, trained, means.loc[sorted(tested)], allan, imus[0])
-    others = learned[learned.fold.isin(tests.explode())][_KEYS].drop_duplicates()
-    return _describe_unseen(recordings, allan, sorted(map(tuple, others.to_numpy().tolist())), imus)
+    keys = learning[learning.fold.isin(tests.explode())][_KEYS].drop_duplicates()
+    return _describe_unseen(recordings, allan, sorted(map(tuple, keys.to_numpy().tolist())), imus)
 
 
 def training_labels(bias: pd.DataFrame, table: pd.DataFrame) -> dict[str, np.ndarray]:
@@ -96,24 +91,21 @@ def training_labels(bias: pd.DataFrame, table: pd.DataFrame) -> dict[str, np.nda
     Returns:
         Means by test fold; empty if a fold has no training recording, or several devices test.
     """
-    places = table[table.origin == ORIGIN_REAL].drop_duplicates(["fold", "role", *_KEYS])
-    tested = places.imu[places.role == TEST].unique().tolist()
+    rows = table[table.origin == ORIGIN_REAL].drop_duplicates(["fold", "role", *_KEYS])
+    tested = rows.imu[rows.role == TEST].unique().tolist()
     if len(tested) > 1:
         return {}
     means = bias[bias.imu == tested[0]].pivot(index="recording", columns="axis", values="bias_dps")
-    training = places[(places.imu == tested[0]) & (places.role != TEST)]
+    training = rows[(rows.imu == tested[0]) & (rows.role != TEST)]
     labels = {
         str(fold): means.loc[sorted(training.recording[training.fold == fold].unique())].to_numpy()
-        for fold in places.fold[places.role == TEST].unique()
+        for fold in rows.fold[rows.role == TEST].unique()
     }
     return labels if all(map(len, labels.values())) else {}
 
 
 def _describe_unseen(
-    recordings: xr.Dataset,
-    allan: xr.Dataset,
-    keys: Sequence[tuple[int, int]],
-    imus: Sequence[int],
+    recordings: xr.Dataset, allan: xr.Dataset, keys: Sequence[tuple[int, int]], imus: Sequence[int]
 ) -> TestDevice:
     """Describe several devices without their recordings.
 
@@ -132,8 +124,8 @@ def _describe_unseen(
     """
     if recordings.attrs["simulated"]:
         noise = recordings.true_noise.to_numpy()
-        drawn = [_drawn_models(recordings.sel(imu=imu)) or () for imu in imus]
-        models = tuple(_with_prior(model, 0.0, UNIT_SPREAD) for of_imu in drawn for model in of_imu)
+        by_imu = [_drawn_models(recordings.sel(imu=imu)) or () for imu in imus]
+        models = tuple(_with_prior(model, 0.0, UNIT_SPREAD) for axes in by_imu for model in axes)
     else:
         fits = _allan_fits(recordings, allan, [allan.sel(imu=i, recording=n) for i, n in keys])
         noise = np.array([figures.white for figures in fits])
@@ -223,16 +215,16 @@ def _allan_fits(
 
 def _drawn_models(recordings: xr.Dataset) -> tuple[RecordingModel, ...] | None:
     """The models that the axes of an IMU were drawn from; None for white noise without warm-up."""
-    drawn = {
-        name: float(recordings.get(f"true_{name}", 0.0)) for name in ("flicker", "random_walk")
-    }
+    flicker, walk = (
+        float(recordings.get(f"true_{name}", 0.0)) for name in ("flicker", "random_walk")
+    )
     warms_up = "true_amplitude" in recordings
-    if not any(drawn.values()) and not warms_up:
+    if not (flicker or walk or warms_up):
         return None
     models = []
     for axis in recordings.axis.to_numpy():
         values = recordings.sel(axis=axis)
-        noise = NoiseFigures(float(values.true_noise), drawn["flicker"], drawn["random_walk"])
+        noise = NoiseFigures(float(values.true_noise), flicker, walk)
         mean, spread = [float(values.true_unit_bias)], [float(values.true_turn_on_spread)]
         if warms_up:
             mean.append(float(values.true_amplitude_mean))

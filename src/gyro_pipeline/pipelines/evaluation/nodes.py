@@ -97,25 +97,25 @@ class Benches:
         key = ["protocol", "window_s", "window_stride_s"]
         self._tables = dict(iter(windows.groupby(key, observed=True)))
         self._devices: dict[str, TestDevice] = {}
-        self._made: dict[Any, Bench] = {}
+        self._cache: dict[Any, Bench] = {}
 
     def of(self, spec: RunSpec) -> Bench:
         """The bench on which a run is evaluated."""
         key = _bench_key(spec)
-        if key not in self._made:
+        if key not in self._cache:
             table = self._tables[key]
             columns = ["fold", "imu", "recording", "start"]
             tests = table[table.role == TEST][columns].astype({"fold": str})
             device = self._device(table)
             labels = training_labels(self._bias, table)
             bench = Bench(self._recordings, device, tests, spec.window_s, labels)
-            self._made = {key: bench}
-        return self._made[key]
+            self._cache = {key: bench}
+        return self._cache[key]
 
     def _device(self, table: pd.DataFrame) -> TestDevice:
         """The description of the tested devices, which is the same for most windows."""
-        places = table[["fold", "role", "origin", "imu", "recording"]].drop_duplicates()
-        key = fingerprint(places.astype(str).to_numpy().tolist())
+        roles = table[["fold", "role", "origin", "imu", "recording"]].drop_duplicates()
+        key = fingerprint(roles.astype(str).to_numpy().tolist())
         if key not in self._devices:
             self._devices[key] = describe_devices(self._recordings, self._bias, self._allan, table)
         return self._devices[key]
@@ -204,10 +204,10 @@ def _conflict(scores: pd.DataFrame, run: StoredRun) -> dict[str, str]:
     axes = {axis: p for axis, p in zip(names, chances.value, strict=True) if p < _CONFLICT}
     if not axes:
         return {}
-    shown = ", ".join(f"{axis} (p = {p:.1g})" for axis, p in axes.items())
+    listed = ", ".join(f"{axis} (p = {p:.1g})" for axis, p in axes.items())
     rmse, mean = (_value(scores, f"{name}_rmse_dps", ALL) / MDPS for name in ("test", "mean"))
     text = (
-        f"test recordings contradict the prior on {shown}: turned, or a bias that moved on. RMSE "
+        f"test recordings contradict the prior on {listed}: turned, or a bias that moved on. RMSE "
         f"{rmse:.3g} mdps; the running mean gives {mean:.3g}"
     )
     logger.warning("%s %s: %s", run.study, run.tags["mlflow.runName"], text)

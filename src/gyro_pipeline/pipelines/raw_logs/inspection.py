@@ -20,19 +20,12 @@ _NO_RATE = (
 
 @dataclass(frozen=True)
 class Inspection:
-    """A recording to read and judge.
+    """A recording to read and judge."""
 
-    Attributes:
-        entry: Entry of the recording in its source.
-        rate_hz: Expected sample rate; None if it is unknown.
-        quality: Settings of quality control.
-        key: Hash of everything that the result depends on.
-    """
-
-    entry: LogEntry
-    rate_hz: float | None
-    quality: Quality
-    key: str
+    entry: LogEntry  # entry of the recording in its source
+    rate_hz: float | None  # expected sample rate; None if it is unknown
+    quality: Quality  # settings of quality control
+    key: str  # hash of everything that the result depends on
 
     @property
     def work(self) -> float:

@@ -55,9 +55,9 @@ def inspect_logs(
         )
         for entry in files.entries
     }
-    yield Listing({place: job.key for place, job in jobs.items()})
+    yield Listing({number: job.key for number, job in jobs.items()})
     stored = {recording.place: recording.key for recording in earlier}
-    missing = [job for place, job in jobs.items() if stored.get(place) != job.key]
+    missing = [job for number, job in jobs.items() if stored.get(number) != job.key]
     if len(missing) < len(jobs):
         count = len(jobs) - len(missing)
         logger.info("%s: %d of %d recordings were read before", files.sensor, count, len(jobs))

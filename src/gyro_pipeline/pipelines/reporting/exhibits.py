@@ -43,56 +43,39 @@ _KEYS = ["sensor", "real_gyros", "virtual_gyros", "window_s"]
 
 @dataclass(frozen=True)
 class Exhibit:
-    """A table or figure of the report.
+    """A table or figure of the report."""
 
-    Attributes:
-        name: Name of its files.
-        title: A few words.
-        caption: Explanation for a reader who has not read the paper.
-        content: The table or figure.
-        shown: Columns of the table that the page shows, all by default; files have all columns.
-    """
-
-    name: str
-    title: str
-    caption: str
+    name: str  # name of its files
+    title: str  # a few words
+    caption: str  # explanation for a reader who has not read the paper
     content: "pd.DataFrame | Figure"
-    shown: Sequence[str] | None = None
+    shown: Sequence[str] | None = None  # columns of the table that the page shows, all by default
 
 
 @dataclass(frozen=True)
 class Material:
-    """The data that the tables and figures of a source are made from.
+    """The data that the tables and figures of a source are made from."""
 
-    Attributes:
-        source: Where the logs come from.
-        published: What the paper states.
-        results: Results of all studies, with the column ``study``.
-        curves: Running-mean curves, likewise.
-        leaks: Results of the leak study, which have other columns.
-        sensors: A row per sensor, from ``describe``.
-        quality: The quality table of all sensors.
-        signals: Lines of figures, with the column ``sensor``.
-    """
-
-    source: str
-    published: Published
-    results: pd.DataFrame
-    curves: pd.DataFrame
-    leaks: pd.DataFrame
-    sensors: pd.DataFrame
-    quality: pd.DataFrame
-    signals: pd.DataFrame
+    source: str  # where the logs come from
+    published: Published  # results and specifications that the paper states
+    results: pd.DataFrame  # results of all studies, with the column study
+    curves: pd.DataFrame  # running-mean curves, with the column study
+    leaks: pd.DataFrame  # results of the leak study, which have other columns
+    sensors: pd.DataFrame  # a row per sensor, from describe
+    quality: pd.DataFrame  # the quality table of all sensors
+    signals: pd.DataFrame  # lines of figures, with the column sensor
 
     @cached_property
-    def made(self) -> pd.DataFrame:
+    def finished(self) -> pd.DataFrame:
         """Results whose runs are finished."""
         return self.results[self.results.status.isna()]
 
     @property
     def simulated(self) -> bool:
         """Whether all recordings are simulated."""
-        kinds = [table.simulated for table in (self.made, self.sensors, self.leaks) if len(table)]
+        kinds = [
+            table.simulated for table in (self.finished, self.sensors, self.leaks) if len(table)
+        ]
         return bool(kinds) and all(bool(kind.all()) for kind in kinds)
 
     @property

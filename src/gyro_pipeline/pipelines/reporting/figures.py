@@ -243,7 +243,7 @@ def _time_axis(ax: Axes, recording_s: float) -> None:
 def gyroscopes_10s(material: Material) -> Exhibit | None:
     """RMSE at 10 s against the number of gyroscopes (paper, section IV-D, second figure)."""
     claims = material.published.of_networks("sparkfun", virtual_gyros=0)
-    rows = material.made[material.made.study == "real2real"]
+    rows = material.finished[material.finished.study == "real2real"]
     rows = rows[(rows.sensor == "sparkfun") & (rows.estimator == CNN)]
     rows = rows[rows.window_s == claims[0].window_s] if claims else rows[:0]
     if rows.empty:
@@ -289,7 +289,9 @@ def saving_against_turn_on_spread(material: Material) -> Exhibit | None:
     The curve of a sensor is the ceiling with its N and T and the same spread on all axes. A network
     stands at the spread that gives its ceiling: that of the sensor, if its axes share one.
     """
-    rows = material.made[(material.made.study == "real2real") & (material.made.estimator == CNN)]
+    rows = material.finished[
+        (material.finished.study == "real2real") & (material.finished.estimator == CNN)
+    ]
     claims = material.published.of_table("generalization")
     rows = rows[rows.window_s.isin([claim.window_s for claim in claims])]
     claims = [claim for claim in claims if (rows.sensor == claim.sensor).any()]
@@ -380,7 +382,9 @@ def _draw_saving(ax: Axes, row: pd.Series, shift: float, colour: str, marker: st
 
 def estimators(material: Material, study: str, sensor: str) -> Exhibit | None:
     """RMSE of all estimators of a study against the window length, with the ceiling."""
-    rows = material.made[(material.made.study == study) & (material.made.sensor == sensor)]
+    rows = material.finished[
+        (material.finished.study == study) & (material.finished.sensor == sensor)
+    ]
     if rows.empty:
         return None
     with LOOK():

@@ -25,7 +25,7 @@ _SIGNIFICANT = 0.001
 
 def distinct(material: Material) -> pd.DataFrame:
     """Finished results, each once where studies share a training."""
-    return material.made.drop_duplicates(["estimator", "window_s", "sensor", "fingerprints"])
+    return material.finished.drop_duplicates(["estimator", "window_s", "sensor", "fingerprints"])
 
 
 def answer(material: Material) -> list[str]:
@@ -152,7 +152,7 @@ def _ranked(window_s: float, networks: pd.DataFrame) -> str:
     best = networks[_ORACLE if realised else _CEILING]
     sentences = (
         f"At {window_s:g} s, {better} of {len(networks)} networks are better than the running mean "
-        f"with their whole interval and {worse} are worse with it; A is {_range(networks[_GAIN])} "
+        f"with their whole interval and {worse} are worse; A is {_range(networks[_GAIN])} "
         f"%. Their RMSE is {_range(networks[_RMSE] / best, '.2f')} times "
         f"{'that of the oracle on the same windows' if realised else 'the expected ceiling'}."
     )

@@ -75,7 +75,7 @@ def write_report(
         premise=PREMISE,
         answer=answer(material),
         findings=findings(material),
-        explained=_explained(material.made.estimator),
+        explained=_explained(material.finished.estimator),
         facts=_facts(material, only, set(fresh)),
         missing=_missing(material, only, studies, sensors),
         runs=_runs(material),
@@ -189,7 +189,7 @@ def _description(name: str) -> str:
 
 def _facts(material: Material, only: Only, fresh: set[str]) -> list[tuple[str, str]]:
     """How the numbers were made: data, networks, windows, code and environment."""
-    rows = material.made
+    rows = material.finished
     facts = {"Data": _data(material)}
     if len(material.sensors):
         facts["Recordings"] = "; ".join(
@@ -232,7 +232,7 @@ def _missing(
     material: Material, only: Only, studies: Mapping[str, Any], sensors: Iterable[str]
 ) -> pd.DataFrame:
     """The fewest commands that make the missing results, and the results of each."""
-    envs = {env for env in material.made.env.dropna() if env not in _BASE}
+    envs = {env for env in material.finished.env.dropna() if env not in _BASE}
     env = f" --env={envs.pop()}" if len(envs) == 1 else ""
     makes: dict[str, list[str]] = {}
     for name, settings in studies.items():
@@ -245,7 +245,7 @@ def _missing(
         command = f"kedro run{'' if study.default else f' --pipeline={name}'}{env}"
         results = f"{lacking} of {len(rows)} results of {name}" if begun else f"the study {name}"
         makes.setdefault(command, []).append(results)
-    table = [{"Command": command, "Makes": ", ".join(made)} for command, made in makes.items()]
+    table = [{"Command": command, "Makes": ", ".join(names)} for command, names in makes.items()]
     return pd.DataFrame(table, columns=["Command", "Makes"])
 
 
@@ -258,7 +258,7 @@ def _runs(material: Material) -> list[dict[str, Any]]:
             "runs": rows.run_ids.str.split().explode().nunique(),
             "experiment": str(rows.experiment_id.iloc[0]),
         }
-        for study, rows in material.made.groupby("study", sort=False)
+        for study, rows in material.finished.groupby("study", sort=False)
     ]
 
 

@@ -152,15 +152,10 @@ class Finder:
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """The results of a sensor and window length, which share a running mean.
+    """The results of a sensor and window length, which share a running mean."""
 
-    Attributes:
-        specs: The rows of the study, a spec for every seed.
-        find: Finds the runs of a row.
-    """
-
-    specs: Sequence[RunSpec]
-    find: Finder
+    specs: Sequence[RunSpec]  # rows of the study, a spec for every seed
+    find: Finder  # finds the runs of a row
 
     @cached_property
     def _rows(self) -> list[tuple[list[RunSpec], list[StoredRun], str]]:

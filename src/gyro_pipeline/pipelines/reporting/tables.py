@@ -217,7 +217,7 @@ def comparison(material: Material, study: str) -> Exhibit | None:
     negative one favours the estimator of the row. Against the samples outside the window, truth
     (b), and the drawn bias, truth (c), they are differences of mean squares.
     """
-    results = material.made[material.made.study == study].copy()
+    results = material.finished[material.finished.study == study].copy()
     if results.empty:
         return None
     results["rank"] = results.estimator.map({name: i for i, name in enumerate(ESTIMATORS)})
@@ -274,7 +274,9 @@ def _difference(row: pd.Series, name: str, truth: str = PAPER) -> str:
 
 def ratios(material: Material, study: str, sensor: str) -> Exhibit | None:
     """Errors of a sensor's estimators relative to the running mean, by window length."""
-    rows = material.made[(material.made.study == study) & (material.made.sensor == sensor)]
+    rows = material.finished[
+        (material.finished.study == study) & (material.finished.sensor == sensor)
+    ]
     if rows.empty:
         return None
     table: dict[str, dict[str, str]] = {}

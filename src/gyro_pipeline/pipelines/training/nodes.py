@@ -42,18 +42,12 @@ logger = logging.getLogger(__name__)
 
 @dataclass
 class TrainingSets:
-    """Training sets of the runs of a study and sensor, each made once.
+    """Training sets of the runs of a study and sensor, each made once."""
 
-    Attributes:
-        windows: The windows table.
-        recordings: Real recordings.
-        virtual: Virtual recordings, if the study uses some.
-    """
-
-    windows: pd.DataFrame
-    recordings: xr.Dataset
-    virtual: xr.Dataset | None
-    _made: dict[Any, dict[str, TrainingSet]] = field(default_factory=dict)
+    windows: pd.DataFrame  # the windows table
+    recordings: xr.Dataset  # real recordings
+    virtual: xr.Dataset | None  # virtual recordings, if the study uses some
+    _cache: dict[Any, dict[str, TrainingSet]] = field(default_factory=dict)
 
     def of(self, spec: RunSpec) -> dict[str, TrainingSet]:
         """The training set of each fold of a run, by the name of the fold.
@@ -63,18 +57,18 @@ class TrainingSets:
         """
         key = spec.protocol, spec.window_s, spec.window_stride_s
         counts = spec.method, spec.real_imus, spec.virtual_imus
-        if (key, counts) not in self._made:
+        if (key, counts) not in self._cache:
             rows = self.table_of(spec)
             tested = rows.imu[rows.role == TEST].unique()
             device = int(tested[0]) if len(tested) == 1 else UNSEEN
-            self._made[key, counts] = {
+            self._cache[key, counts] = {
                 str(fold): self._training_set(spec, in_fold, device)
                 for fold, in_fold in rows.groupby("fold", observed=True, sort=False)
             }
-        return self._made[key, counts]
+        return self._cache[key, counts]
 
     @cached_property
-    def _seen(self) -> xr.Dataset:
+    def _without_truths(self) -> xr.Dataset:
         """Real recordings without the drawn values of simulated data."""
         return self.recordings[["angular_rate", "samples", "recording_mean"]]
 
@@ -96,8 +90,8 @@ class TrainingSets:
         )
         if spec.real_imus > len(real):
             raise InputError(
-                f"{spec.sensor}: {spec.study} needs {spec.real_gyros} gyroscopes, the {spec.source} "
-                f"recordings hold {len(AXES) * len(real)} that train; narrow with "
+                f"{spec.sensor}: {spec.study} needs {spec.real_gyros} gyroscopes, the "
+                f"{spec.source} recordings hold {len(AXES) * len(real)} that train; narrow with "
                 "--params=only.real_gyros=..."
             )
         # the model of a study on unseen devices is trained on all of them
@@ -109,7 +103,7 @@ class TrainingSets:
         used = [(learned.origin == origin) & learned.imu.isin(i) for origin, i in imus.items()]
         attributes, samples = self.recordings.attrs, self.recordings.sizes["sample"]
         return TrainingSet(
-            self._seen,
+            self._without_truths,
             self.virtual if spec.virtual_imus else None,
             learned[used[0] | used[1]],
             window_size(spec.window_s, attributes["rate_hz"], samples, spec.sensor),
@@ -170,8 +164,8 @@ def _check_plan(specs: Mapping[str, RunSpec], sets: TrainingSets, settings: Trai
     for key, spec in specs.items():
         if fingerprint(_content(spec, sets, settings)) != key:
             raise InputError(
-                f"{_name(spec)}: its plan was made with other data or settings than the current ones; "
-                f"type kedro run --pipeline={spec.study}, without options that skip its plan"
+                f"{_name(spec)}: its plan was made with other data or settings than the current "
+                f"ones; type kedro run --pipeline={spec.study}, without options that skip its plan"
             )
 
 

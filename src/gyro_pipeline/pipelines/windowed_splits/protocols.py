@@ -37,21 +37,13 @@ Folds = Iterator[tuple[str, Texts]]
 
 @dataclass(frozen=True)
 class Candidates:
-    """The windows that a protocol assigns to roles.
+    """The windows that a protocol assigns to roles."""
 
-    Attributes:
-        windows: A row per usable window of a real recording: ``imu, recording, start``.
-        split: Role of each recording in a hold-out; None for a k-fold.
-        tested: The IMU whose recordings test.
-        numbers: Recordings of this IMU that can test, in order.
-        splits: Counts, and the seed of all random choices.
-    """
-
-    windows: pd.DataFrame
-    split: Mapping[int, str] | None
-    tested: int
-    numbers: Sequence[int]
-    splits: Splits
+    windows: pd.DataFrame  # a row per usable window of a real recording: imu, recording, start
+    split: Mapping[int, str] | None  # role of each recording in a hold-out; None for a k-fold
+    tested: int  # the IMU whose recordings test
+    numbers: Sequence[int]  # recordings of this IMU that can test, in order
+    splits: Splits  # counts, and the seed of all random choices
 
     def roles(self, of_recordings: Mapping[int, str]) -> Texts:
         """Roles of windows by their recordings; only the tested IMU tests."""
@@ -177,11 +169,12 @@ def check_table(
         _refuse_two_roles(str(fold), real, apart)
         _refuse_copies(str(fold), real, contents)
         tests = set(real.recording[real.role == TEST])
-        seen = sorted(tests & set(drawn_from)) if len(real) < len(rows) else []
-        if seen:
+        leaked = sorted(tests & set(drawn_from)) if len(real) < len(rows) else []
+        if leaked:
             raise InputError(
                 f"{fold}: virtual recordings that train were drawn from recordings "
-                f"{', '.join(map(str, seen))}, which test; draw them from training recordings alone"
+                f"{', '.join(map(str, leaked))}, which test; "
+                "draw them from training recordings alone"
             )
         if tests and not (rows.role == TRAIN).any():
             raise InputError(
@@ -197,9 +190,9 @@ def _refuse_two_roles(fold: str, rows: pd.DataFrame, apart: str) -> None:
     for name, of_name in roles:
         if len(of_name) > 1:
             uses = rows[rows[apart] == name].groupby("role", observed=True).imu.unique()
-            shown = (f"{role} (IMU {', '.join(map(str, imus))})" for role, imus in uses.items())
+            texts = (f"{role} (IMU {', '.join(map(str, imus))})" for role, imus in uses.items())
             raise InputError(
-                f"{fold}: {apart} {name} has more than one role: {', '.join(shown)}; a recording "
+                f"{fold}: {apart} {name} has more than one role: {', '.join(texts)}; a recording "
                 "trains, validates or tests, for all IMUs recorded together, and an unseen device "
                 "never trains"
             )
@@ -214,8 +207,8 @@ def _refuse_copies(fold: str, rows: pd.DataFrame, contents: pd.DataFrame) -> Non
             if first and second and first != second:
                 (imu, number), (imu_2, number_2) = key, keys[other]
                 raise InputError(
-                    f"{fold}: IMU {imu} recording {number} ({', '.join(sorted(first))}) is a copy of "
-                    f"IMU {imu_2} recording {number_2} ({', '.join(sorted(second))}): their noise "
-                    f"has a correlation of {correlation:.2f}, where two recordings have less than "
-                    "0.1; leave one of them out, or give both the same role"
+                    f"{fold}: IMU {imu} recording {number} ({', '.join(sorted(first))}) is a copy "
+                    f"of IMU {imu_2} recording {number_2} ({', '.join(sorted(second))}): their "
+                    f"noise has a correlation of {correlation:.2f}, where two recordings have less "
+                    "than 0.1; leave one of them out, or give both the same role"
                 )
