@@ -146,10 +146,8 @@ class Calibrator:
             rate_hz: Samples per second.
             target_mdps: Standard deviation to reach.
             registry: Folder of the registry; None: that of the environment or of the user.
-            started_at: Time of the first sample, POSIX seconds; None: a day after the last
-                calibration.
-            since_power_on_s: Time of the first sample after power-on; None: the warm-up amplitude
-                is free.
+            started_at: POSIX time of the first sample; None: a day after the last calibration.
+            since_power_on_s: Age of the first sample; None: the warm-up amplitude is free.
             device_type: Name of the type; None, here and below: the value in ``device.toml``.
             same_heading: Whether the heading repeats.
             latitude_deg: Latitude.
@@ -271,9 +269,8 @@ class Calibrator:
         if temperature_c is not None:
             rows[7] = temperature_c
         finite, zero = np.isfinite(rows[:4].sum(axis=0)), ~rows[1:4].any(axis=0)
-        self.counts.update(
-            samples=len(rates), not_finite=int(np.sum(~finite)), zero=int(np.sum(zero))
-        )
+        invalid = {"not_finite": int(np.sum(~finite)), "zero": int(np.sum(zero))}
+        self.counts.update(samples=len(rates), **invalid)
         if len(rates) and np.isfinite(rows[0, -1]):
             self._last_time = float(rows[0, -1])
         good = finite & ~zero

@@ -42,17 +42,13 @@ _OPEN = {  # arguments of Calibrator.open
         "--same-heading/--any-heading", default=None, help="whether the heading repeats"
     ),
     "latitude_deg": _option("--latitude", type=float, help="latitude, degrees"),
-    "started_at": _option(
-        "--started-at", metavar="TIME", help="time of the first sample, ISO 8601"
-    ),
+    "started_at": _option("--started-at", metavar="TIME", help="of the first sample, ISO 8601"),
     "since_power_on_s": _option("--since-power-on", type=float, help="age of the first sample, s"),
     "known_still": _option("--known-still", is_flag=True, help="it is at rest: cut nothing"),
 }
 _JSON = {"as_json": _option("--json", is_flag=True, help="one JSON object")}
 _SHARED = {
-    "require_history": _option(
-        "--require-history", is_flag=True, help="exit with 5 if it is not used"
-    ),
+    "require_history": _option("--require-history", is_flag=True, help="exit 5 if it is not used"),
     "store": _option("--store/--no-store", default=True, help="add to the device's history"),
     "plot": _option("--plot", type=Path, help="file for a plot of the running estimate"),
     "rate_hz": _option("--rate", type=float, help="samples per second, if times do not show it"),
@@ -90,9 +86,7 @@ def _read_reader_options(texts: dict[str, str]) -> Any:
 
     from gyro_pipeline.parameters import ReaderOptions  # noqa: PLC0415
 
-    values: dict[str, Any] = {
-        name: _parse(text) for name, text in texts.items() if text is not None
-    }
+    values: Any = {name: _parse(text) for name, text in texts.items() if text is not None}
     for name in {"columns", "acceleration_columns"} & values.keys():
         values[name] = [_parse(part) for part in texts[name].split(",")]
     if "rows" in values:
@@ -388,9 +382,8 @@ def set_bias(
     """Set a bias, deg/s about x, y and z, which replaces the history until it is forgotten."""
     device, variance = Device(registry_folder(folder), name), (sigma * MDPS) ** 2
     device.create(device_type)
-    device.append(
-        Calibration(bias_dps, (variance,) * 3, time=time.time(), hash=SET, source=SET, event="set")
-    )
+    typed: Any = {"time": time.time(), "hash": SET, "source": SET, "event": SET}
+    device.append(Calibration(bias_dps, (variance,) * 3, **typed))
 
 
 @devices.command()

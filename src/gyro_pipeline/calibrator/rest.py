@@ -50,7 +50,7 @@ class Alarm(NamedTuple):
 
 
 class RestMonitor:
-    """The three tests over one stretch; :meth:`update` returns a new one.
+    """The three tests over a stretch; :meth:`update` returns a new monitor.
 
     Args:
         size: Samples of a block.

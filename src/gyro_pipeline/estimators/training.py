@@ -269,10 +269,8 @@ def fitted_noise(imus: Sequence[ImuRecordings]) -> list[NoiseFigures]:
     parts = zip(*(imu.variances for imu in imus), strict=True)
     variances, counts = (np.concatenate(part) for part in parts)
     first = imus[0]
-    recording_s, shortest_s = (
-        first.sample_count / first.rate_hz,
-        SHORTEST_FIT_SAMPLES / first.rate_hz,
-    )
+    recording_s = first.sample_count / first.rate_hz
+    shortest_s = SHORTEST_FIT_SAMPLES / first.rate_hz
     means = mean_variance(variances, counts)
     return [fit_noise(first.times_s, variance, recording_s, shortest_s) for variance in means]
 

@@ -75,9 +75,8 @@ def train_perceptrons(
     optimizer = torch.optim.AdamW(parameters, _LEARNING_RATE, weight_decay=_WEIGHT_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _LEARNING_RATE, total_steps=steps)
     for _ in range(steps):
-        batch = torch.stack(
-            [r[torch.randint(len(r), (_BATCH,), generator=generator)] for r in rows]
-        )
+        picks = [r[torch.randint(len(r), (_BATCH,), generator=generator)] for r in rows]
+        batch = torch.stack(picks)
         loss = torch.square(networks.forward(x[batch]) - y[batch]).mean(dim=(1, 2)).sum()
         optimizer.zero_grad()
         loss.backward()

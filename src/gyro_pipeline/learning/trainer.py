@@ -145,15 +145,13 @@ def train(
         FloatingPointError: If the loss is no longer finite.
     """
     steps = engine(network, training.inputs, training.targets, schedule.batch_size)
-    validation_tensors = None
-    if validation is not None:
-        validation_tensors = _tensors(validation, _device(network))
+    held_out = None if validation is None else _tensors(validation, _device(network))
     losses = Losses()
     for rate in schedule.learning_rates(len(training.inputs)).tolist():
         order = torch.randperm(len(training.inputs), generator=shuffling).numpy()
         loss = steps.epoch(order, rate)
         steps.load_into(network)
-        val_loss = None if validation_tensors is None else _loss(network, *validation_tensors)
+        val_loss = None if held_out is None else _loss(network, *held_out)
         losses.add(rate, loss, val_loss, lambda: weights_of(network))
         after_epoch()
     return losses.trained(weights_of(network))

@@ -111,10 +111,8 @@ def train_batch(
         Learner(network, *examples[_cell(job)][:2], shuffling(job.seed))
         for job, network in zip(batch, networks, strict=True)
     ]
-    results, engine = (
-        train_together(learners, first.settings, device, label),
-        f"batched {device.type}",
-    )
+    results = train_together(learners, first.settings, device, label)
+    engine = f"batched {device.type}"
     return [
         TrainedNetwork(
             stored(job.design, examples[_cell(job)][2], trained), trained.history, started, engine

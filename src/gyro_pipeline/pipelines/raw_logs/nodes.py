@@ -45,9 +45,8 @@ def inspect_logs(
         The list of recordings, then the recordings that were not read before, in any order.
     """
     code = code_hash("gyro_pipeline.quality", inspection.__name__)
-    judged_by = quality.model_dump(
-        mode="json", exclude={"needed_pct"}
-    )  # which concerns all recordings together
+    # needed_pct concerns all recordings together
+    judged_by = quality.model_dump(mode="json", exclude={"needed_pct"})
     jobs = {
         (entry.imu, entry.recording): Inspection(
             *(entry, files.rate_hz, quality),
@@ -83,16 +82,8 @@ def quality_table(files: Logs, inspected: Sequence[Recording]) -> pd.DataFrame:
         of them are ``masked``; ``rate_hz``, measured; and ``findings``, which count the rows of the
         file.
     """
-    columns = [
-        "imu",
-        "recording",
-        "where",
-        "outcome",
-        "rows",
-        *_USED_COLUMNS,
-        "rate_hz",
-        "findings",
-    ]
+    labels = "imu recording where outcome rows".split()
+    columns = [*labels, *_USED_COLUMNS, "rate_hz", "findings"]
     table = pd.DataFrame(map(vars, _without_copies(inspected)))[columns]
     table.insert(0, "sensor", files.sensor)
     table["findings"] = [

@@ -1,6 +1,6 @@
 """The data that a report is made from, and the tables and figures that it consists of."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -183,10 +183,15 @@ def ends(row: Mapping[str, Any] | pd.Series | None, name: str, windows: str) -> 
 
 def interval(row: Any, name: str, windows: str = ALL) -> str:
     """A score in percent with its 95 % interval."""
-    value, lo, hi = ends(row, name, windows)
+    return bracketed(ends(row, name, windows), percent)
+
+
+def bracketed(values: Iterable[float], text: Callable[[float], str]) -> str:
+    """A value with its interval in brackets, if it has one; a dash for NaN."""
+    value, lo, hi = values
     if np.isnan(value):
         return "–"
-    return percent(value) + ("" if np.isnan(lo) else f" [{percent(lo)}, {percent(hi)}]")
+    return text(value) + ("" if np.isnan(lo) else f" [{text(lo)}, {text(hi)}]")
 
 
 def percent(value: float) -> str:

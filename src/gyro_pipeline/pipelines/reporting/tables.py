@@ -13,6 +13,7 @@ from gyro_pipeline.pipelines.reporting.exhibits import (
     STUDIES_OF,
     Exhibit,
     Material,
+    bracketed,
     ends,
     from_to,
     gyroscopes,
@@ -266,10 +267,10 @@ def _difference(row: pd.Series, name: str, truth: str = PAPER) -> str:
     if truth != PAPER:
         key, unit = f"less_{name}_dps2_{truth}", MDPS**2
     values = [row.get(key + end) for end in ("", "_lo", "_hi")]
-    value, lo, hi = (np.nan if value is None else value / unit for value in values)
-    if np.isnan(value) or name == row.estimator:
+    if name == row.estimator:
         return "–"
-    return f"{value:+.3f}" + ("" if np.isnan(lo) else f" [{lo:+.3f}, {hi:+.3f}]")
+    scaled = (np.nan if value is None else value / unit for value in values)
+    return bracketed(scaled, "{:+.3f}".format)
 
 
 def ratios(material: Material, study: str, sensor: str) -> Exhibit | None:
@@ -320,9 +321,7 @@ def _ratio(row: pd.Series, gain: str) -> str:
     """The error relative to the running mean, 1 - A, with its interval."""
     gains = [row.get(f"{gain}{end}") for end in ("", "_lo", "_hi")]
     value, hi, lo = (1 - np.array(gains, np.float64) / 100).tolist()
-    if np.isnan(value):
-        return "–"
-    return f"{value:.3f}" if np.isnan(lo) else f"{value:.3f} [{lo:.3f}, {hi:.3f}]"
+    return bracketed((value, lo, hi), "{:.3f}".format)
 
 
 # sensors
