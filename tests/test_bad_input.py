@@ -117,7 +117,7 @@ def test_a_pickle_is_not_even_opened(mine, tmp_path):
 
 def test_what_is_not_there(mine):
     refused(mine(entry={"files": {"all": "other.npy"}}), ["memsense other.npy: no such file"])
-    words = ["6 gyroscopes asked by real2real, the mine recordings hold 3"]
+    words = ["real2real needs 6 gyroscopes, the mine recordings hold 3"]
     refused(mine(real_gyros=6), words)
 
 

@@ -6,7 +6,7 @@ from importlib.resources import files
 import numpy as np
 import pytest
 
-from gyro_pipeline.calibrator.device_types import names, read_type, type_of, type_of_models
+from gyro_pipeline.calibrator.device_types import read_type, type_names, type_of, type_of_models
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.recording_model import constant_bias
@@ -29,7 +29,7 @@ def test_a_type_is_made_from_fits_and_read_again(tmp_path):
     np.testing.assert_allclose(kind.noise.white, 3e-3, rtol=0.03)
     np.testing.assert_allclose(kind.dps("turn_on_mdps"), 1e-3, rtol=1e-3)
     assert 25 < kind.noise_freedom < 100  # a spread of a tenth is worth 50
-    assert names(tmp_path) == ["bench", "consumer", "dot", "memsense"]
+    assert type_names(tmp_path) == ["bench", "consumer", "dot", "memsense"]
 
 
 def test_flicker_that_short_recordings_show_as_turn_on_spread_is_counted_once():

@@ -75,7 +75,7 @@ def test_the_list_is_there_without_what_it_names():
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("kalman", "unknown estimator 'kalman'; there are mean, .* package.module:Class"),
+        ("kalman", "unknown estimator 'kalman'; expected one of mean, .* package.module:Class"),
         ("not_there:Mine", "No module named 'not_there'; expected package.module:Class"),
         ("a_strangers_file:Other", "has no attribute 'Other'"),
         (

@@ -123,7 +123,7 @@ def test_keys_tell_training_sets_and_recordings_apart(training):
 @pytest.fixture
 def filed(tmp_path, monkeypatch):
     """Recordings in a file, and nothing remembered of any."""
-    monkeypatch.setattr(module, "_OF_FILES", module._Memory())
+    monkeypatch.setattr(module, "_FILE_CACHE", module._ArrayCache())
     drawn().to_netcdf(tmp_path / "recordings.nc", engine="h5netcdf")
     return xr.open_dataset(tmp_path / "recordings.nc", engine="h5netcdf")
 

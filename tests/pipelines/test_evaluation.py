@@ -321,7 +321,7 @@ def test_with_time_constants_of_their_own_the_limit_is_that_of_one_who_is_told_t
     simulated, bench_of
 ):
     bench = of_all(bench_of, coloured(simulated, (8.0, 30.0), count=20))
-    assert "nobody who must learn" in bench.ceilings.basis
+    assert "an estimator that must learn it" in bench.ceilings.basis
     oracle = squared_errors(bench.oracle_errors, PAPER, ALL).mean(np.ones((1, 20)))
     # 60 gyroscope recordings: 18 % of a mean square
     best, _ = bench.ceilings._expected(PAPER, ALL, SIZE, bench.device.spread**2)

@@ -238,7 +238,7 @@ def test_processes_give_the_same_as_this_one(inspected, monkeypatch, caplog, tmp
     here, table = inspected(files)
     here = here.load()
     (tmp_path / "recordings.nc").unlink()
-    monkeypatch.setattr(nodes, "_WORTH_PROCESSES", 0)
+    monkeypatch.setattr(nodes, "_MIN_PARALLEL_BYTES", 0)
     with caplog.at_level(logging.INFO, "gyro_pipeline"):
         there, other = inspected(files)
     assert there.identical(here)

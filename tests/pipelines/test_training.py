@@ -354,7 +354,7 @@ def test_a_plan_comes_back_from_its_file_as_it_was(few, tmp_path):
 
 def test_more_gyroscopes_than_the_recordings_hold_are_refused(world, make_study):
     study = make_study("real2real", real_gyros=[9])
-    with pytest.raises(InputError, match=r"sparkfun: 9 gyroscopes asked by real2real, .* hold 6"):
+    with pytest.raises(InputError, match=r"sparkfun: real2real needs 9 gyroscopes, .* hold 6"):
         replace(world, study=study).train()
 
 

@@ -275,7 +275,9 @@ def test_virtual_recordings_train_and_come_from_recordings_that_train(
 def test_without_a_window_that_tests_a_study_says_so(make, table_of):
     recordings = make(4).copy(deep=True)
     recordings.angular_rate[..., ::5] = np.nan
-    message = "augmentation sparkfun, 10 s windows: no test recording has one .* lower windows_s"
+    message = (
+        "augmentation sparkfun, 10 s windows: no test recording has a usable .* lower windows_s"
+    )
     with pytest.raises(InputError, match=message):
         table_of(recordings, protocol="test_in_training")
     with pytest.raises(InputError, match=r"window of 60 s is 1200 samples .* has 600"):

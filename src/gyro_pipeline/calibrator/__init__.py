@@ -1,4 +1,4 @@
-"""A gyroscope at rest in, its bias out: with a standard deviation, and the seconds still needed.
+"""Calibrate a gyroscope at rest: its bias, a standard deviation, and the seconds still needed.
 
     from gyro_pipeline.calibrator import Calibrator
 
@@ -8,8 +8,8 @@
         if state.done:
             break
 
-Importing it imports NumPy alone. ``docs/calibrator.md`` is the tutorial; the command line is
-``gyro-calibrate``.
+Importing this package imports only NumPy. ``docs/calibrator.md`` is the tutorial; the command line
+is ``gyro-calibrate``.
 """
 
 from gyro_pipeline.calibrator.calibrator import Calibrator, State

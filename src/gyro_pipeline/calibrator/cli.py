@@ -1,8 +1,7 @@
-"""``gyro-calibrate``: what a person types. Results go to standard output, words to standard error.
+"""The command line ``gyro-calibrate``. Results go to standard output, remarks to standard error.
 
-Exit codes, the highest of several files: 0 done; 2 usage; 3 target not reached; 4 not at rest;
-5 history not used where --require-history asks for it; 6 data that cannot be used; 7 nothing can be
-stored.
+The exit code is the highest of all files: 0 done; 2 usage; 3 target not reached; 4 not at rest;
+5 history not used, with --require-history; 6 data unusable; 7 nothing can be stored.
 """
 
 import hashlib
@@ -24,7 +23,7 @@ import numpy as np
 import gyro_pipeline
 from gyro_pipeline.calibrator import output, registry
 from gyro_pipeline.calibrator.calibrator import Calibrator, State
-from gyro_pipeline.calibrator.device_types import names
+from gyro_pipeline.calibrator.device_types import type_names
 from gyro_pipeline.calibrator.history import STILL, USED, Calibration
 from gyro_pipeline.calibrator.reasons import UNUSABLE_CODES
 from gyro_pipeline.calibrator.registry import SET, Device, RegistryError, registry_folder
@@ -33,34 +32,33 @@ from gyro_pipeline.conventions import MDPS, InputError
 
 DONE, USAGE, NOT_REACHED, NOT_AT_REST, NO_HISTORY, UNUSABLE, NOT_STORED = 0, 2, 3, 4, 5, 6, 7
 
-
-_option = partial(partial, click.option)  # still without the name of its argument
-_DEVICE = {  # by the arguments of Calibrator.open
+_option = partial(partial, click.option)  # the name of its argument is added later
+_OPEN = {  # arguments of Calibrator.open
     "device": _option("--device", help="name in the registry; its history is used and added to"),
-    "device_type": _option("--type", help="of the device: noise, turn-on spread, ..."),
-    "registry": _option("--registry", help="folder of the devices"),
+    "device_type": _option("--type", help="type of the device: noise, turn-on spread, ..."),
+    "registry": _option("--registry", help="folder of the registry"),
     "target_mdps": _option("--target", type=float, help="standard deviation to reach, mdps"),
     "same_heading": _option(
         "--same-heading/--any-heading", default=None, help="whether the heading repeats"
     ),
-    "latitude_deg": _option("--latitude", type=float, help="of the place, degrees"),
+    "latitude_deg": _option("--latitude", type=float, help="latitude, degrees"),
     "started_at": _option("--started-at", metavar="TIME", help="of the first sample, ISO 8601"),
-    "since_power_on_s": _option("--since-power-on", type=float, help="of the first sample, s"),
-    "known_still": _option("--known-still", is_flag=True, help="it was at rest: cut nothing"),
+    "since_power_on_s": _option("--since-power-on", type=float, help="age of the first sample, s"),
+    "known_still": _option("--known-still", is_flag=True, help="it is at rest: cut nothing"),
 }
 _JSON = {"as_json": _option("--json", is_flag=True, help="one JSON object")}
 _SHARED = {
     "require_history": _option("--require-history", is_flag=True, help="exit 5 if it is not used"),
     "store": _option("--store/--no-store", default=True, help="add to the device's history"),
-    "plot": _option("--plot", type=Path, help="file to draw the running estimate to"),
-    "rate_hz": _option("--rate", type=float, help="samples a second, where times do not tell"),
+    "plot": _option("--plot", type=Path, help="file for a plot of the running estimate"),
+    "rate_hz": _option("--rate", type=float, help="samples per second, if times do not show it"),
     **_JSON,
 }
-_FOLDER = {"folder": _DEVICE["registry"]}
+_FOLDER = {"folder": _OPEN["registry"]}
 
 
 def _with(options: dict[str, Any]) -> Callable[[Any], Any]:
-    """Add options to a command, by the names of its arguments."""
+    """Add options to a command, each under the name of an argument."""
 
     def add(command: Any) -> Any:
         for name, option in reversed(options.items()):
@@ -83,19 +81,19 @@ def _flag(name: str) -> str:
 
 
 def _read_reader_options(texts: dict[str, str]) -> Any:
-    """The readers' options of what was typed: lists with commas, ``rows`` as COLUMN=VALUE."""
+    """Options of the readers from their texts: lists with commas, ``rows`` as COLUMN=VALUE."""
     from pydantic import ValidationError  # noqa: PLC0415
 
     from gyro_pipeline.parameters import ReaderOptions  # noqa: PLC0415
 
-    given: dict[str, Any] = {name: _value(text) for name, text in texts.items() if text is not None}
-    for name in {"columns", "acceleration_columns"} & given.keys():
-        given[name] = [_value(part) for part in texts[name].split(",")]
-    if "rows" in given:
+    values: Any = {name: _parse(text) for name, text in texts.items() if text is not None}
+    for name in {"columns", "acceleration_columns"} & values.keys():
+        values[name] = [_parse(part) for part in texts[name].split(",")]
+    if "rows" in values:
         pairs = (part.partition("=") for part in texts["rows"].split(","))
-        given["rows"] = {_value(column): _value(value) for column, _, value in pairs}
+        values["rows"] = {_parse(column): _parse(value) for column, _, value in pairs}
     try:
-        return ReaderOptions(**given)
+        return ReaderOptions(**values)
     except ValidationError as error:
         first = error.errors()[0]
         text = first["msg"].removeprefix("Value error, ")
@@ -104,16 +102,16 @@ def _read_reader_options(texts: dict[str, str]) -> Any:
         raise InputError(f"{_flag(name)}: {rest}") from error
 
 
-def _value(text: str) -> Any:
-    """A number or true or false, or else the text."""
+def _parse(text: str) -> Any:
+    """A number, true or false; any other text as it is."""
     try:
         return json.loads(text)
     except ValueError:
         return text.strip()
 
 
-def _in_options(message: str) -> str:
-    """A reader's message with options of the command line in place of keys of a catalog."""
+def _name_options(message: str) -> str:
+    """A message of a reader, with options of the command line in place of catalog keys."""
     from gyro_pipeline.parameters import ReaderOptions  # noqa: PLC0415
     from gyro_pipeline.readers.table import IN_READER  # noqa: PLC0415
 
@@ -125,23 +123,23 @@ def _in_options(message: str) -> str:
     return f"{text}; {advice}"
 
 
-def _say(text: str, colour: str = "yellow") -> None:
+def _remark(text: str, colour: str = "yellow") -> None:
     click.secho(text, fg=colour, err=True)
 
 
-def _print(as_json: bool, answer: Any, lines: Iterable[str]) -> None:
-    click.echo(json.dumps(answer, allow_nan=False) if as_json else "\n".join(lines))
+def _print(as_json: bool, result: Any, lines: Iterable[str]) -> None:
+    click.echo(json.dumps(result, allow_nan=False) if as_json else "\n".join(lines))
 
 
 class Commands(click.Group):
-    """Commands that return exit codes, and whose errors are one sentence."""
+    """Commands that return exit codes, and whose errors are shown as a sentence."""
 
     def invoke(self, ctx: click.Context) -> None:
-        """Run a command, and end with its code."""
+        """Run a command and exit with its code."""
         try:
             code = super().invoke(ctx)
         except (InputError, RegistryError) as error:
-            _say(_in_options(str(error)), "red")
+            _remark(_name_options(str(error)), "red")
             code = USAGE if isinstance(error, InputError) else NOT_STORED
         ctx.exit(code or DONE)
 
@@ -153,64 +151,63 @@ def main() -> None:
 
 
 def _job(values: dict[str, Any]) -> SimpleNamespace:
-    """What ``log`` and ``stream`` were asked for: ``known`` is for :meth:`.Calibrator.open`.
+    """The options of ``log`` and ``stream``; ``opening`` is for :meth:`.Calibrator.open`.
 
-    That the device can be written is seen before anything is measured.
+    The device is created here, so that a registry that cannot be written fails before measuring.
     """
-    known = {name: values.pop(name) for name in _DEVICE}
+    opening = {name: values.pop(name) for name in _OPEN}
     try:
-        text = known["started_at"]
-        known["started_at"] = text and datetime.fromisoformat(text).timestamp()
+        text = opening["started_at"]
+        opening["started_at"] = text and datetime.fromisoformat(text).timestamp()
     except ValueError as error:
         raise InputError(f"--started-at: expected 2026-01-31T12:00:00Z, got {text!r}") from error
-    job = SimpleNamespace(known=known, **{name: values.pop(name) for name in _SHARED})
-    job.reader, job.stored_in = _read_reader_options(values), None
-    if known["device"] is not None and job.store:
-        job.stored_in = Device(registry_folder(known["registry"]), known["device"])
-        job.stored_in.create(known["device_type"])
+    job = SimpleNamespace(opening=opening, **{name: values.pop(name) for name in _SHARED})
+    job.reader, job.device = _read_reader_options(values), None
+    if opening["device"] is not None and job.store:
+        job.device = Device(registry_folder(opening["registry"]), opening["device"])
+        job.device.create(opening["device_type"])
     return job
 
 
 @main.command()
 @click.argument("files", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
-@_with({**_DEVICE, **_SHARED, **_reader_options()})
+@_with({**_OPEN, **_SHARED, **_reader_options()})
 def log(files: tuple[Path, ...], **values: Any) -> int:
-    """Calibrate from each of some files."""
+    """Calibrate from log files, one after the other."""
     job = _job(values)
-    return max(_log(path, job) for path in files)
+    return max(_calibrate(path, job) for path in files)
 
 
-def _log(path: Path, job: SimpleNamespace) -> int:
-    """One file; returns the exit code."""
+def _calibrate(path: Path, job: SimpleNamespace) -> int:
+    """Calibrate from a file; returns the exit code."""
     from gyro_pipeline.readers import read_log  # noqa: PLC0415
     from gyro_pipeline.readers.table import IN_READER  # noqa: PLC0415
 
     try:
         recording = read_log(path, job.reader, job.rate_hz)
     except InputError as error:
-        _say(_in_options(str(error)), "red")
+        _remark(_name_options(str(error)), "red")
         return USAGE if IN_READER in str(error) else UNUSABLE
     for finding in recording.findings:
         if finding.outcome == "rejected":
-            _say(_in_options(f"{path}: {finding.check}: {finding.detail}"), "red")
+            _remark(_name_options(f"{path}: {finding.check}: {finding.detail}"), "red")
             return UNUSABLE
     rate_hz = recording.rate_hz or job.rate_hz
     if rate_hz is None:
-        raise InputError(f"{path}: expected times that tell the rate, got none; give --rate")
+        raise InputError(f"{path}: expected times that show the rate, got none; give --rate")
     source = hashlib.sha256(path.read_bytes()).hexdigest()
-    calibrator = Calibrator.open(rate_hz=rate_hz, **job.known, without=source)
+    calibrator = Calibrator.open(rate_hz=rate_hz, **job.opening, without=source)
     states = _feed(calibrator, recording, 1.0 if job.plot else np.inf)
     return _report(calibrator, job, states, source, path.name)
 
 
 def _feed(calibrator: Calibrator, recording: Any, chunk_s: float) -> list[State]:
-    """Feed a log in chunks; the states after each."""
+    """Feed a log in chunks; returns the state after each."""
     count, rate_hz = len(recording.samples), calibrator.setup.rate_hz
     times = np.arange(count) / rate_hz
-    for row in recording.gap_rows:  # how long a gap is, a log does not say
+    for row in recording.gap_rows:  # a log does not say how long a gap is
         times[row:] += 2 * BLOCK_S
-    beside = recording.acceleration_g, recording.temperature_c
-    columns: list[Any] = [times, recording.samples, *beside]
+    columns = times, recording.samples, recording.acceleration_g, recording.temperature_c
     step, states = max(round(min(chunk_s * rate_hz, count)), 1), []
     for row in range(0, count, step):
         chunk: list[Any] = [None if x is None else x[row : row + step] for x in columns]
@@ -221,34 +218,34 @@ def _feed(calibrator: Calibrator, recording: Any, chunk_s: float) -> list[State]
 def _report(
     calibrator: Calibrator, job: SimpleNamespace, states: Sequence[State], source: str, name: str
 ) -> int:
-    """Print, plot and store; returns the exit code."""
-    state, target = calibrator.finish(), job.known["target_mdps"]
-    code = _code(state, job)
+    """Print, plot and store the result; returns the exit code."""
+    state, target = calibrator.finish(), job.opening["target_mdps"]
+    code = _exit_code(state, job)
     if job.as_json or code != UNUSABLE:
-        answer = output.as_json(state, job.known["device"], source=name)
-        _print(job.as_json, answer, output.as_text(state, target, calibrator))
+        result = output.as_json(state, job.opening["device"], source=name)
+        _print(job.as_json, result, output.as_text(state, target, calibrator))
     if not job.as_json:
         for sentence in output.notes(state):
-            _say(sentence, "red" if code in {UNUSABLE, NOT_AT_REST} else "yellow")
+            _remark(sentence, "red" if code in {UNUSABLE, NOT_AT_REST} else "yellow")
     if job.plot:
         output.plot(job.plot, [*states, state], target)
-    if job.stored_in is not None and code != UNUSABLE:
+    if job.device is not None and code != UNUSABLE:
         calibration = replace(
             calibrator.calibration(), hash=source, source=name, version=gyro_pipeline.__version__
         )
-        if not job.stored_in.append(calibration):
-            _say(f"{name} is stored already; it is not stored again")
+        if not job.device.append(calibration):
+            _remark(f"{name} is stored already; it is not stored again")
             return code
         rate_hz = calibrator.setup.rate_hz
         try:
-            job.stored_in.write_model(Calibrator.open(rate_hz=rate_hz, **job.known))
+            job.device.write_model(Calibrator.open(rate_hz=rate_hz, **job.opening))
         except RegistryError as error:
-            _say(f"{name} is stored, but model.json is that of before: {error}")
+            _remark(f"{name} is stored, but model.json was not updated: {error}")
     return code
 
 
-def _code(state: State, job: SimpleNamespace) -> int:
-    """The exit code of an answer."""
+def _exit_code(state: State, job: SimpleNamespace) -> int:
+    """The exit code of a result."""
     if any(reason.code in UNUSABLE_CODES for reason in state.reasons):
         return UNUSABLE
     if job.require_history and not all(outcome == USED for outcome in state.history):
@@ -259,77 +256,81 @@ def _code(state: State, job: SimpleNamespace) -> int:
 
 
 @main.command()
-@click.option("--port", help="serial port; else standard input")
+@click.option("--port", help="serial port instead of standard input")
 @click.option("--baud", type=int, default=115200, show_default=True)
-@click.option("--timeout", type=float, default=5.0, show_default=True, help="of silence, seconds")
-@_with({**_DEVICE, **_SHARED, **_reader_options()})
+@click.option("--timeout", type=float, default=5.0, show_default=True, help="seconds of silence")
+@_with({**_OPEN, **_SHARED, **_reader_options()})
 def stream(port: str | None, baud: int, timeout: float, **values: Any) -> int:
-    """Calibrate from lines as they come, until the target is reached: a JSON line a second."""
+    """Calibrate from a live stream until the target is reached; prints a JSON line a second."""
     from gyro_pipeline.calibrator import stream as lines  # noqa: PLC0415
 
     job = _job(values)
     parser, name = lines.Parser(job.reader, job.rate_hz), port or "standard input"
-    job.known["started_at"] = job.known["started_at"] or time.time()
+    job.opening["started_at"] = job.opening["started_at"] or time.time()
     calibrator, states = None, list[State]()
 
     def show(state: State) -> None:
-        click.echo(json.dumps(output.as_json(state, job.known["device"]), allow_nan=False))
+        click.echo(json.dumps(output.as_json(state, job.opening["device"]), allow_nan=False))
         states.append(state)
 
     with lines.source(port, baud) as descriptor:
-        for samples in parser.seconds(lines.lines_of(descriptor, timeout, _say)):
-            if calibrator is None:  # the first answer is the history's
-                calibrator = Calibrator.open(rate_hz=parser.rate_hz or 0.0, **job.known)
+        for samples in parser.seconds(lines.lines_of(descriptor, timeout, _remark)):
+            if calibrator is None:  # the first result is that of the history
+                calibrator = Calibrator.open(rate_hz=parser.rate_hz or 0.0, **job.opening)
                 show(calibrator.state())
             state = calibrator.update(*samples)
             if int(state.time_s) > int(states[-1].time_s):
                 show(state)
-            if state.done and job.known["target_mdps"] is not None:
+            if state.done and job.opening["target_mdps"] is not None:
                 break
     if calibrator is None:
-        raise InputError("stream: expected lines of samples, got none; check what sends them")
+        raise InputError(
+            "stream: expected lines of samples, got none; check the program that sends them"
+        )
     if parser.bad:
-        _say(f"{parser.bad} lines were of another shape and were left out")
-    source = hashlib.sha256(f"{name} {job.known['started_at']}".encode()).hexdigest()
+        _remark(f"{parser.bad} lines were of another shape and were left out")
+    source = hashlib.sha256(f"{name} {job.opening['started_at']}".encode()).hexdigest()
     return _report(calibrator, job, states, source, name)
 
 
 @main.command()
-@click.option("--heading", help="a drift of the heading in place of --target, such as 1deg/h")
-@_with({**{name: _DEVICE[name] for name in [*_DEVICE][:6]}, **_JSON})
-def plan(heading: str | None, as_json: bool, **known: Any) -> int:
-    """How many seconds at rest a standard deviation takes."""
-    if (heading is None) == (known["target_mdps"] is None):
+@click.option("--heading", help="drift of the heading instead of --target, such as 1deg/h")
+@_with({**{name: _OPEN[name] for name in [*_OPEN][:6]}, **_JSON})
+def plan(heading: str | None, as_json: bool, **opening: Any) -> int:
+    """Predict the seconds at rest that a standard deviation takes."""
+    target_mdps = opening["target_mdps"]
+    if (heading is None) == (target_mdps is None):
         raise InputError("plan: expected either --target 0.3 (mdps) or --heading 1deg/h")
-    target_mdps = known["target_mdps"] = known["target_mdps"] or _heading_mdps(str(heading))
-    calibrator = Calibrator.open(rate_hz=100.0, **known)
-    if not np.all(calibrator.setup.known[1] > 0):
-        listed = ", ".join(names(registry_folder(known["registry"])))
+    if heading is not None:
+        target_mdps = opening["target_mdps"] = _heading_mdps(heading)
+    calibrator = Calibrator.open(rate_hz=100.0, **opening)
+    if not np.all(calibrator.setup.noise_prior[1] > 0):
+        listed = ", ".join(type_names(registry_folder(opening["registry"])))
         text = f"expected a device of known noise; give --type ({listed})"
         raise InputError(f"plan: {text} or a --device with history")
     state = calibrator.state()
-    answer = {"target_mdps": target_mdps, "seconds": output.numbers(state.seconds_left)}
-    _print(as_json, answer, output.planned(state, target_mdps))
+    result = {"target_mdps": target_mdps, "seconds": output.numbers(state.seconds_left)}
+    _print(as_json, result, output.planned(state, target_mdps))
     return DONE if np.isfinite(state.seconds_left).all() else NOT_REACHED
 
 
 def _heading_mdps(text: str) -> float:
-    """A rate such as 1deg/h in mdps."""
+    """A rate such as 1deg/h, in mdps."""
     from gyro_pipeline.units import read_unit  # noqa: PLC0415
 
     match = re.fullmatch(r"([\d.]+) *(.+)", text)
     unit = read_unit(match[2]) if match else None
     if match is None or unit is None or unit.quantity != "rate":
-        raise InputError(f"--heading: expected such as 1deg/h, got {text!r}")
+        raise InputError(f"--heading: expected a rate such as 1deg/h, got {text!r}")
     return float(match[1]) * unit.factor / MDPS
 
 
 @main.group()
 def devices() -> None:
-    """List and look after the devices of the registry."""
+    """List and manage the devices of the registry."""
 
 
-def _existing(folder: str | None, name: str) -> Device:
+def _existing_device(folder: str | None, name: str) -> Device:
     device = Device(registry_folder(folder), name)
     if not device.folder.is_dir():
         listed = ", ".join(d.name for d in registry.devices(registry_folder(folder))) or "none"
@@ -340,22 +341,22 @@ def _existing(folder: str | None, name: str) -> Device:
 @devices.command("list")
 @_with({**_FOLDER, **_JSON})
 def list_devices(folder: str | None, as_json: bool) -> None:
-    """Devices, their types and how many calibrations count."""
+    """List devices, their types and the number of calibrations that count."""
     rows = [
         {"device": d.name, "type": d.settings().get("type"), "calibrations": len(d.history())}
         for d in registry.devices(registry_folder(folder))
     ]
-    _print(as_json, rows, output.device_list(rows, names(registry_folder(folder))))
+    _print(as_json, rows, output.device_list(rows, type_names(registry_folder(folder))))
 
 
 @devices.command()
 @click.argument("name")
 @_with({**_FOLDER, **_JSON})
 def show(name: str, folder: str | None, as_json: bool) -> None:
-    """Level over time, turn-on spread, walk, temperature slope, noise and health of a device."""
-    device = _existing(folder, name)
-    answer = {"lines": device.lines(), "model": device.model()}
-    _print(as_json, answer, output.device_table(device))
+    """Show level over time, turn-on spread, walk, temperature slope, noise and health."""
+    device = _existing_device(folder, name)
+    content = {"lines": device.lines(), "model": device.model()}
+    _print(as_json, content, output.device_table(device))
 
 
 @devices.command()
@@ -363,24 +364,26 @@ def show(name: str, folder: str | None, as_json: bool) -> None:
 @click.argument("text")
 @_with(_FOLDER)
 def note(name: str, text: str, folder: str | None) -> None:
-    """Append a note to a device's history."""
-    _existing(folder, name).append({"event": "note", "time": time.time(), "text": text})
+    """Append a note to the history of a device."""
+    _existing_device(folder, name).append({"event": "note", "time": time.time(), "text": text})
 
 
 @devices.command("set", context_settings={"ignore_unknown_options": True})  # -0.1 is a number
 @click.argument("name")
 @click.argument("bias_dps", nargs=3, type=float)
-@click.option("--sigma", type=float, default=0.0, show_default=True, help="of them, mdps")
-@_with({**_FOLDER, "device_type": _DEVICE["device_type"]})
+@click.option(
+    "--sigma", type=float, default=0.0, show_default=True, help="its standard deviation, mdps"
+)
+@_with({**_FOLDER, "device_type": _OPEN["device_type"]})
 def set_bias(
     name: str, bias_dps: tuple[float, float, float], sigma: float, folder: str | None,
     device_type: str | None,
 ) -> None:  # fmt: skip
-    """Type in a bias, deg/s about x, y and z: it stands for the history until it is forgotten."""
+    """Set a bias, deg/s about x, y and z, which replaces the history until it is forgotten."""
     device, variance = Device(registry_folder(folder), name), (sigma * MDPS) ** 2
     device.create(device_type)
-    about: Any = {"time": time.time(), "hash": SET, "source": SET, "event": SET}
-    device.append(Calibration(bias_dps, (variance,) * 3, **about))
+    typed: Any = {"time": time.time(), "hash": SET, "source": SET, "event": SET}
+    device.append(Calibration(bias_dps, (variance,) * 3, **typed))
 
 
 @devices.command()
@@ -389,8 +392,8 @@ def set_bias(
 @click.option("--all", "everything", is_flag=True, help="remove the device's folder")
 @_with(_FOLDER)
 def forget(name: str, source: str | None, everything: bool, folder: str | None) -> None:
-    """Withdraw a calibration, by its file's name or hash: it stays stored, and counts no more."""
-    device = _existing(folder, name)
+    """Withdraw a calibration by the name or hash of its file; it stays stored without counting."""
+    device = _existing_device(folder, name)
     if everything:
         device.remove()
         return
@@ -398,8 +401,8 @@ def forget(name: str, source: str | None, everything: bool, folder: str | None) 
     matches = {key for key in stored if source and key.startswith(source)}
     hashes = matches | {key for key, c in stored.items() if c.source == source}
     if not hashes:
-        known = ", ".join(c.source for c in stored.values()) or "none"
-        raise InputError(f"forget: expected one of {known}, or a hash, got {source!r}; or --all")
+        listed = ", ".join(c.source for c in stored.values()) or "none"
+        raise InputError(f"forget: expected one of {listed}, or a hash, got {source!r}; or --all")
     for withdrawn in hashes:
         device.append({"event": "forget", "time": time.time(), "of": withdrawn})
 
@@ -409,23 +412,24 @@ def forget(name: str, source: str | None, everything: bool, folder: str | None) 
 @click.argument("file", type=click.Path(dir_okay=False, path_type=Path))
 @_with(_FOLDER)
 def save(name: str, file: Path, folder: str | None) -> None:
-    """Write a device to one file."""
-    file.write_text(json.dumps(_existing(folder, name).content(), indent=1) + "\n", "utf-8")
+    """Write a device to a file."""
+    content = _existing_device(folder, name).content()
+    file.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
 
 
 @devices.command()
 @click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
-@click.option("--as", "name", help="another name")
+@click.option("--as", "name", help="new name of the device")
 @_with(_FOLDER)
 def load(file: Path, name: str | None, folder: str | None) -> None:
-    """Read a device from such a file; what is there already is kept, and nothing is doubled."""
+    """Read a device from a file that ``devices save`` wrote; stored lines are kept, once each."""
     try:
         content = json.loads(file.read_text("utf-8"))
         Device(registry_folder(folder), name or content["device"]).restore(content)
     except InputError:
         raise
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{file}: expected what devices save writes, but: {error!r}") from error
+        raise InputError(f"{file}: expected a file from devices save, but: {error!r}") from error
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""What the devices of one type share: ``<registry>/types/<type>.json``, or one that ships.
+"""Properties that all devices of a type share: noise, turn-on spread, temperature, warm-up.
 
-A file is written by hand, or by :func:`type_of_models` from the pipeline's own fits. Its keys are
-the fields of :class:`DeviceType`; docs/calibrator.md explains them.
+A type is a file, ``<registry>/types/<type>.json`` or one that ships with the package. A person
+writes it, or :func:`type_of_models` makes it from the fits of the pipeline. Its keys are the fields
+of :class:`DeviceType`; docs/calibrator.md explains them.
 """
 
 import json
@@ -21,14 +22,14 @@ if TYPE_CHECKING:
     from gyro_pipeline.physics.recording_model import RecordingModel
 
 Axes = float | tuple[float, float, float]
-"""A number, or one for each of x, y, z."""
+"""One number for all axes, or one each for x, y and z."""
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class WarmUp:
-    """The bias of a device that warms up: it decays from an amplitude at power-on."""
+    """A warm-up: the bias decays exponentially from an amplitude at power-on."""
 
     amplitude_mdps: Axes
     spread_mdps: Axes
@@ -37,55 +38,59 @@ class WarmUp:
 
 @dataclass(frozen=True)
 class DeviceType:
-    """A type, as in its file. Without its noise it is told from the log alone."""
+    """A device type, as its file states it. Without N, the log alone shows the noise."""
 
     type: str = "unknown"
     noise_mdps_rts: Axes | None = None  # N
-    noise_spread: float = 0.0  # of N from device to device, relative
+    noise_spread: float = 0.0  # relative spread of N from device to device
     flicker_mdps: Axes = 0.0  # B
     random_walk_mdps_per_rts: Axes = 0.0  # K
     turn_on_mdps: Axes = 10.0  # median of tau
     turn_on_factor: float = 3.0  # one standard deviation of tau, as a factor
     walk_mdps_per_rtday: Axes = 3.0  # median of the level's walk
     walk_factor: float = 4.0
-    conflict_mdps: Axes = 5.0  # standard deviation of a history that is wrong
+    conflict_mdps: Axes = 5.0  # standard deviation of a wrong history
     temperature_slope_mdps_per_c: Axes = 0.0
-    temperature_spread_mdps_per_c: Axes = 0.0  # of the slope; 0: temperature is not used
-    least_change_mdps: float = 20.0  # smaller changes within half a minute are no motion
+    temperature_spread_mdps_per_c: Axes = 0.0  # of the slope; 0: the temperature is not used
+    least_change_mdps: float = 20.0  # a smaller change within half a minute is no motion
     warm_up: WarmUp | None = None
     schema: int = 1
     about: str = ""
     sources: dict[str, str] = field(default_factory=dict)
 
     def dps(self, name: str) -> Array:
-        """(3,), a field that is in mdps, in deg/s."""
+        """A field that is in mdps, converted to deg/s, (3,)."""
         return np.broadcast_to(np.asarray(getattr(self, name), np.float64) * MDPS, 3)
 
     @cached_property
     def noise(self) -> Noise:
-        """Its noise figures; N is 1 where it is not known."""
+        """The noise figures of the type; N is 1 where it is unknown."""
         white = np.ones(3) if self.noise_mdps_rts is None else self.dps("noise_mdps_rts")
-        warm, warm_up = self.warm_up, None
-        if warm is not None:
-            mean = np.broadcast_to(np.multiply(warm.amplitude_mdps, MDPS), 3)
-            spread = np.broadcast_to(np.maximum(warm.spread_mdps, 1e-3) * MDPS, 3)
-            warm_up = mean, spread, warm.time_constant_s
-        others = self.dps("flicker_mdps"), self.dps("random_walk_mdps_per_rts")
-        return Noise(white, *others, warm_up)
+        warm_up = None
+        if self.warm_up is not None:
+            mean = np.broadcast_to(np.multiply(self.warm_up.amplitude_mdps, MDPS), 3)
+            spread = np.broadcast_to(np.maximum(self.warm_up.spread_mdps, 1e-3) * MDPS, 3)
+            warm_up = mean, spread, self.warm_up.time_constant_s
+        random_walk = self.dps("random_walk_mdps_per_rts")
+        return Noise(white, self.dps("flicker_mdps"), random_walk, warm_up)
 
     @property
     def noise_freedom(self) -> float:
-        """Degrees of freedom that N is worth before a log is seen; infinite: known."""
+        """Degrees of freedom of N before a log is read; infinite where N is known exactly."""
         if self.noise_mdps_rts is None:
             return 0.0
         return 1 / (2 * self.noise_spread**2) if self.noise_spread else np.inf
 
 
 def read_type(name: str | None, registry: Path | None = None) -> DeviceType:
-    """Read a type by its name: the registry's own, else one that ships; None: the unknown one.
+    """Read a type by its name, from the registry or else from those that ship with the package.
+
+    Args:
+        name: None for a device of unknown type.
+        registry: The folder of all devices.
 
     Raises:
-        InputError: There is no such type, or its file is not as it should be.
+        InputError: There is no such type, or its file is invalid.
     """
     if name in (None, DeviceType.type):
         return DeviceType()
@@ -96,32 +101,32 @@ def read_type(name: str | None, registry: Path | None = None) -> DeviceType:
             except json.JSONDecodeError as error:
                 raise InputError(f"{path}: expected JSON, but: {error}; correct it") from error
     raise InputError(
-        f"type: expected {', '.join(names(registry))}, got {name!r}; "
+        f"type: expected {', '.join(type_names(registry))}, got {name!r}; "
         "write a file types/<type>.json in the registry, or leave --type out"
     )
 
 
-def names(registry: Path | None = None) -> list[str]:
-    """Names of the types that ship and of the registry's own."""
+def type_names(registry: Path | None = None) -> list[str]:
+    """Names of all types, those in the registry and those that ship with the package."""
     paths = [path for folder in _folders(registry) if folder.is_dir() for path in folder.iterdir()]
     return sorted({path.name.removesuffix(".json") for path in paths})
 
 
 def _folders(registry: Path | None) -> list[Any]:
-    own = [] if registry is None else [registry / "types"]
-    return [*own, files("gyro_pipeline.calibrator") / "types"]
+    in_registry = [] if registry is None else [registry / "types"]
+    return [*in_registry, files("gyro_pipeline.calibrator") / "types"]
 
 
 def type_of(content: Mapping[str, Any], where: str) -> DeviceType:
-    """The type that a file's content describes."""
+    """The device type that the content of a file describes."""
     return validated(DeviceType, content, where)
 
 
 def validated(kind: type[T], content: Mapping[str, Any], where: str) -> T:
-    """A dataclass of what a file holds.
+    """A dataclass made from the content of a file.
 
     Raises:
-        InputError: A key is unknown, or a value is not as it should be.
+        InputError: A key is unknown, or a value is invalid.
     """
     from pydantic import ValidationError  # noqa: PLC0415
 
@@ -143,13 +148,13 @@ def _adapter(kind: Any) -> Any:
 def type_of_models(
     name: str, models: Sequence[Sequence["RecordingModel"]], source: str
 ) -> dict[str, Any]:
-    """The content of a type's file, from what the pipeline fitted to several devices.
+    """The content of a type file, from the models that the pipeline fitted to several devices.
 
     Args:
-        name: Of the type.
+        name: Name of the type.
         models: (device, axis), as :func:`gyro_pipeline.physics.reml.fit_recording_model` returns
-            them; flicker slower than ``FLICKER_S`` is counted as turn-on spread.
-        source: Which recordings they were fitted to.
+            them; flicker slower than ``FLICKER_S`` counts as turn-on spread.
+        source: The recordings that the models were fitted to.
     """
     figures = [
         [(m.noise.white, m.noise.instability, m.noise.random_walk) for m in device]

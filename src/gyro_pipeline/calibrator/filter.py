@@ -6,14 +6,14 @@ The mean of block k of each axis is
 
 with X_k = (1, mean of exp(-t / time constant) in the block). The rate random walk starts at 0 with
 the stretch, flicker is the sum of three AR(1) processes, and white noise has variance N^2 / block.
-The filter runs over y and over the columns of X with the same gains, so what it leaves of them is
-white: e_y of variance S, and e_X. Then (generalised least squares, the sequential form of
-:class:`gyro_pipeline.physics.recording_model.WindowModel`)
+The filter runs over y and over the columns of X with the same gains, so its residuals are white:
+e_y of variance S, and e_X. Generalised least squares, the sequential form of
+:class:`gyro_pipeline.physics.recording_model.WindowModel`, then gives
 
     information = sum of e_X e_X' / S,    c = information^-1 (sum of e_X e_y / S)
 
-so an unknown bias needs no large variance anywhere. Everything but y is independent of the data:
-the variance at any later time is known now.
+so an unknown bias needs no large prior variance. Everything but y is independent of the data, so
+the variance at any later time is known in advance.
 """
 
 from collections.abc import Sequence
@@ -27,15 +27,15 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 FLICKER_S = 120.0
-"""Flicker counts down to one cycle in two such times; what is slower is turn-on bias."""
+"""Flicker counts down to one cycle in twice this time; slower flicker is turn-on bias."""
 
-# Three AR(1) processes whose block means have, in the sums that estimates of 1 to 30 s make, the
-# covariance of B = 1 in recordings of FLICKER_S (tests/calibrator/test_filter.py).
+# Three AR(1) processes. Their block means have, in estimates from 1 to 30 s, the covariance of
+# B = 1 in recordings of FLICKER_S (tests/calibrator/test_filter.py).
 _TIME_CONSTANTS_S = np.array([0.19990, 1.57091, 13.58328])
 _VARIANCES = np.array([0.826513, 0.602418, 0.896548])
 _WITHIN_BLOCK = 0.009284  # faster flicker, as white noise of a block of 0.5 s
 
-_FREE_DPS = 1.0  # standard deviation of a warm-up's amplitude where the time of power-on is unknown
+_FREE_DPS = 1.0  # standard deviation of the warm-up amplitude where the power-on time is unknown
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,33 +50,33 @@ class Noise:
 
     @property
     def floor_dps(self) -> Array:
-        """The flicker floor of the Allan deviation, (3,): no average comes below it."""
+        """The flicker floor of the Allan deviation, (3,): no average has a smaller error."""
         return np.sqrt(2 * np.log(2) / np.pi) * self.instability
 
 
 class Estimate(NamedTuple):
-    """An estimate by the data alone, (..., 3); infinite variances before the first block.
+    """An estimate from the data alone, (..., 3); variances are infinite before the first block.
 
-    The bias now is ``transfer`` times the bias at the start, plus something independent of it.
+    The current bias is ``transfer`` times the bias at the start, plus an independent part.
     """
 
-    bias: Array  # now
+    bias: Array  # the current one
     variance: Array
     start: Array  # the bias at the start
     start_variance: Array
     transfer: Array
-    squares: Array  # of the residuals over their variances
-    freedom: Array  # (..., 1), degrees of freedom of those
+    squares: Array  # sum of squared residuals over their variances
+    freedom: Array  # (..., 1), degrees of freedom of the squares
 
 
 class _Step(NamedTuple):
-    """What some seconds do to the four processes, the walk first (exact integrals)."""
+    """How the four processes, the walk first, move over a time step (exact integrals)."""
 
     keep: Array  # (4,), F
     forget: Array  # (4, 4), F F'
     read: Array  # (4,), H: the mean over the step, per value at its start
     added: Array  # (3, 4, 4), Q
-    shared: Array  # (3, 4), covariance of what is added to the end and to the mean
+    shared: Array  # (3, 4), covariance of the noise added to the end and to the mean
     white: Array  # (3,), R
 
 
@@ -99,20 +99,20 @@ def _step(noise: Noise, step_s: float) -> _Step:
 
 
 class Filter(NamedTuple):
-    """State after some blocks; an update makes a new one, so one can go back to an older one.
+    """The immutable state after some blocks: an update returns a new filter.
 
-    In a :meth:`stack` of several, arrays have a leading axis.
+    In a :meth:`stack` of several filters, arrays have a leading axis.
     """
 
     noise: Noise
     block_s: float
-    age_s: float | None  # from power-on to the start; None: a warm-up's amplitude is free
+    age_s: float | None  # from power-on to the start; None: the warm-up amplitude is free
     time_s: float  # since the start, gaps included
-    reference: Array  # (3,), deg/s, the first block's mean, which is subtracted from the data
-    blocks: NDArray[np.integer] | int  # taken so far
-    states: Array  # (3, 4, 1 + p), of the walk and flicker, in y and in each column of X
-    covariance: Array  # (3, 4, 4), of the states, (deg/s)^2
-    information: Array  # (3, p, p), on c
+    reference: Array  # (3,), deg/s, the mean of the first block, subtracted from the data
+    blocks: NDArray[np.integer] | int  # number of them so far
+    states: Array  # (3, 4, 1 + p), walk and flicker in y and in each column of X
+    covariance: Array  # (3, 4, 4), covariance of the states, (deg/s)^2
+    information: Array  # (3, p, p), about c
     weighted: Array  # (3, p), the sum of e_X e_y / S
     squares: Array  # (3,), the sum of e_y^2 / S
 
@@ -123,7 +123,7 @@ class Filter(NamedTuple):
         flicker = noise.instability[:, None] ** 2 * _VARIANCES
         covariance = np.hstack([np.zeros((3, 1)), flicker])[:, :, None] * np.eye(4)
         information, weighted, squares = np.zeros((3, p, p)), np.zeros((3, p)), zero
-        if noise.warm_up is not None:  # the amplitude's prior is one datum more
+        if noise.warm_up is not None:  # the prior of the amplitude counts as one more datum
             mean, spread, _ = noise.warm_up
             if age_s is None:
                 mean, spread = zero, np.full(3, _FREE_DPS)
@@ -133,9 +133,9 @@ class Filter(NamedTuple):
         return cls(noise, block_s, age_s, 0.0, zero, 0, *sums)
 
     def update(self, mean: Array | None) -> tuple[Self, Array]:
-        """Take the mean of a block, (3,), deg/s; None looks ahead: all but the data moves on.
+        """Process the mean of a block, (3,), deg/s; None predicts the variances without data.
 
-        The second result is the innovation (3,) in its standard deviation; 0 at the first block.
+        The second result is the innovation (3,) in standard deviations; 0 at the first block.
         """
         reference = self.reference if self.blocks or mean is None else mean
         step = _step(self.noise, self.block_s)
@@ -143,24 +143,24 @@ class Filter(NamedTuple):
         variance = to_mean @ step.read + step.white
         columns = self._columns(0.0 if mean is None else mean - reference)
         residuals = columns - step.read @ self.states
-        of_y, of_x = residuals[:, 0], residuals[:, 1:]
+        e_y, e_x = residuals[:, 0], residuals[:, 1:]
         added = step.keep * to_mean + step.shared
-        gain, scaled = added / variance[:, None], of_x / variance[:, None]
+        gain, scaled = added / variance[:, None], e_x / variance[:, None]
         skipped = self.skip(self.block_s)
         following = skipped._replace(
             reference=reference,
             blocks=self.blocks + 1,
             states=skipped.states + gain[:, :, None] * residuals[:, None, :],
             covariance=skipped.covariance - added[..., None] * gain[:, None],
-            information=self.information + scaled[:, :, None] * of_x[:, None, :],
-            weighted=self.weighted + scaled * of_y[:, None],
-            squares=self.squares + of_y**2 / variance,
+            information=self.information + scaled[:, :, None] * e_x[:, None, :],
+            weighted=self.weighted + scaled * e_y[:, None],
+            squares=self.squares + e_y**2 / variance,
         )
         if mean is None or not self.blocks:
             return following, np.zeros(3)
-        c, uncertainty = self._constants()
-        spread = variance + np.sum(_times(uncertainty, of_x) * of_x, axis=1)
-        return following, (of_y - np.sum(of_x * c, axis=1)) / np.sqrt(spread)
+        c, covariance = self._constants()
+        spread = variance + np.sum(_matvec(covariance, e_x) * e_x, axis=1)
+        return following, (e_y - np.sum(e_x * c, axis=1)) / np.sqrt(spread)
 
     def skip(self, seconds: float) -> Self:
         """Move on over a gap without data."""
@@ -172,7 +172,7 @@ class Filter(NamedTuple):
         )
 
     def _columns(self, y: Array | float) -> Array:
-        """(3, 1 + p): y about the reference, 1, and the decay's mean in the block."""
+        """Y about the reference and the columns of X, 1 and the mean decay, (3, 1 + p)."""
         columns = np.ones((3, self.states.shape[-1]))
         columns[:, 0] = y
         if self.noise.warm_up is not None:
@@ -181,54 +181,54 @@ class Filter(NamedTuple):
         return columns
 
     def _decay(self) -> float:
-        """What is left now of a warm-up's amplitude at power-on, or else at the start."""
+        """The share that is left of the warm-up amplitude at power-on, or else at the start."""
         constant_s = self.noise.warm_up[2] if self.noise.warm_up else np.inf
         return float(np.exp(-(self.time_s + (self.age_s or 0.0)) / constant_s))
 
     def _constants(self) -> tuple[Array, Array]:
-        """The constants c by the data alone, (..., p), and their covariance, (..., p, p)."""
-        one = self.information.shape[-1] == 1
-        uncertainty = np.asarray(1 / self.information if one else np.linalg.inv(self.information))
-        return _times(uncertainty, self.weighted), uncertainty
+        """The constants c from the data alone, (..., p), and their covariance, (..., p, p)."""
+        scalar = self.information.shape[-1] == 1
+        covariance = np.asarray(1 / self.information if scalar else np.linalg.inv(self.information))
+        return _matvec(covariance, self.weighted), covariance
 
     def warm_up(self) -> tuple[Array, Array]:
-        """How far the warm-up still is from its end, and the standard deviation, (3,), deg/s."""
-        c, uncertainty = self._constants()
-        return self._decay() * c[:, -1], self._decay() * np.sqrt(uncertainty[:, -1, -1])
+        """The remaining warm-up and its standard deviation, (3,), deg/s."""
+        c, covariance = self._constants()
+        return self._decay() * c[:, -1], self._decay() * np.sqrt(covariance[:, -1, -1])
 
     def stack(self, filters: Sequence[Self]) -> Self:
-        """Later ones of the same stretch as one."""
+        """Later filters of the same stretch, stacked along a leading axis."""
         arrays = (np.array(values) for values in list(zip(*filters, strict=True))[4:])
         return self.__class__(*self[:4], *arrays)
 
     def ahead(self, blocks: int) -> tuple[Self, Self]:
-        """The filter after some blocks to come, and a stack of those after each of them."""
+        """The filter after some future blocks, and the stack of the filters after each of them."""
         filters = [self]
         for _ in range(blocks):
             filters.append(filters[-1].update(None)[0])
         return filters[-1], self.stack(filters[1:])
 
     def estimate(self) -> Estimate:
-        """What the filter, or each of a stack, says by the data alone."""
+        """The estimate from the data alone; of a stack, one for each filter."""
         if not np.all(self.blocks):
             unknown, infinite, zero = np.full(3, np.nan), np.full(3, np.inf), np.zeros(3)
             return Estimate(unknown, infinite, unknown, infinite, zero + 1, zero, zero[:1])
-        c, uncertainty = self._constants()
-        walk = self.states[..., 0, :]  # of y, and of each column
-        on_c = -walk[..., 1:]
-        on_c[..., 0] += 1
-        shared = _times(uncertainty, on_c)
+        c, covariance = self._constants()
+        walk = self.states[..., 0, :]  # in y, and in each column of X
+        gradient = -walk[..., 1:]  # of the bias now, with respect to c
+        gradient[..., 0] += 1
+        shared = _matvec(covariance, gradient)
         free = self.noise.warm_up is not None and self.age_s is None
         return Estimate(
-            bias=self.reference + walk[..., 0] + np.sum(on_c * c, axis=-1),
-            variance=self.covariance[..., 0, 0] + np.sum(shared * on_c, axis=-1),
+            bias=self.reference + walk[..., 0] + np.sum(gradient * c, axis=-1),
+            variance=self.covariance[..., 0, 0] + np.sum(shared * gradient, axis=-1),
             start=self.reference + c[..., 0],
-            start_variance=uncertainty[..., 0, 0],
-            transfer=shared[..., 0] / uncertainty[..., 0, 0],
+            start_variance=covariance[..., 0, 0],
+            transfer=shared[..., 0] / covariance[..., 0, 0],
             squares=self.squares - np.sum(c * self.weighted, axis=-1),
             freedom=np.maximum(np.asarray(self.blocks, float)[..., None] - 1 - free, 0),
         )
 
 
-def _times(matrices: Array, vectors: Array) -> Array:
+def _matvec(matrices: Array, vectors: Array) -> Array:
     return np.asarray((matrices @ vectors[..., None])[..., 0])

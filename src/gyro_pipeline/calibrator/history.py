@@ -1,18 +1,18 @@
-"""What a device's past calibrations say about its bias now (CALIBRATOR.md, section 3).
+"""The prior of the bias from the past calibrations of a device (docs/calibrator.md, The model).
 
-Each calibration stores its evidence, the mean and the variance of its own data alone. Of one axis
+Each calibration stores its evidence: the mean and the variance of its own data alone. On one axis
 
     evidence_i = level_i + slope (temperature_i - reference) + turn-on_i + Earth's rate_i + noise_i
 
 with a level that walks by a variance of walk^2 a day, a turn-on bias of standard deviation tau and
-noise of the stored variance. The first level is unknown, the slope has the type's normal prior.
-The bias of the next calibration is the conditional mean given the others (kriging), integrated over
-a grid of tau and walk, each point weighted by its restricted likelihood times the log-normal prior
-of the type.
+noise of the stored variance. The first level is unknown, and the slope has the normal prior of the
+device type. The bias of the next calibration is its conditional mean given the others (kriging),
+integrated over a grid of tau and walk, each point weighted by its restricted likelihood times the
+log-normal prior of the type.
 
-The Earth turns at 4.18 mdps, so a bias at rest is one of an attitude and a heading. With the up
-direction u in the axes of the device, latitude phi and an unknown heading, the Earth's rate is
-4.18 sin(phi) u and, on axis i, something horizontal of variance (4.18 cos phi)^2 (1 - u_i^2) / 2.
+The Earth turns at 4.18 mdps, so the bias of a device at rest depends on attitude and heading. With
+the up direction u in the axes of the device, latitude phi and an unknown heading, the Earth's rate
+is 4.18 sin(phi) u plus, on axis i, a horizontal part of variance (4.18 cos phi)^2 (1 - u_i^2) / 2.
 """
 
 from collections.abc import Sequence
@@ -30,18 +30,18 @@ EARTH_DPS = 4.178e-3
 """The Earth's rate, 15.041 deg/h."""
 
 SAME_ATTITUDE_DEG = 5.0
-"""Attitudes that differ by more are different ones."""
+"""Attitudes count as different where they differ by more."""
 
 STILL, MOVING, UNSURE = "still", "moving", "unsure"
 """At rest, not at rest, or too few blocks to say."""
 
 USED, DROPPED, NONE = "used", "dropped", "none"
-"""What became of the history on an axis."""
+"""How the history was treated on an axis."""
 
 _DAY_S = 86400.0
-_GRID = (11, 9)  # points of tau and of the walk, over 2.5 standard deviations to both sides
-_MOST = 100  # calibrations that are used, the latest
-_LEAST_DPS = 1e-3 * MDPS
+_GRID = (11, 9)  # points of tau and of the walk, over 2.5 standard deviations on both sides
+_MAX_CALIBRATIONS = 100  # the latest ones are used
+_MIN_DPS = 1e-3 * MDPS
 
 Triple = tuple[float, float, float]
 Fitted = dict[str, tuple[float, float]]
@@ -50,9 +50,9 @@ Fitted = dict[str, tuple[float, float]]
 
 @dataclass(frozen=True)
 class Calibration:
-    """A calibration as it is stored: its evidence, by its own data alone, and what it is from."""
+    """A stored calibration: its evidence, from its own data alone, and its circumstances."""
 
-    mean_dps: Triple | None  # None: an attempt that was not at rest
+    mean_dps: Triple | None  # None: the device was not at rest
     variance_dps2: Triple | None  # of the mean
     time: float | None = None  # of the first sample, POSIX seconds
     since_power_on_s: float | None = None
@@ -60,47 +60,47 @@ class Calibration:
     gravity: Triple | None = None  # mean acceleration, g
     seconds: float = 0.0  # at rest
     rest: Literal["still", "moving", "unsure"] = "still"
-    outcome: tuple[str, str, str] = (NONE, NONE, NONE)  # what became of the history on each axis
-    noise_mdps_rts: Triple | None = None  # N, as these data show it
+    outcome: tuple[str, str, str] = (NONE, NONE, NONE)  # how the history was treated on each axis
+    noise_mdps_rts: Triple | None = None  # N, estimated from these data
     noise_freedom: float = 0.0  # its degrees of freedom
     same_heading: bool = False  # declared
     known_still: bool = False  # declared
-    reached: bool = True  # the target, where one was given
-    attempt: int = 1  # 2: the one before was not at rest, or did not reach its target
+    reached: bool = True  # whether the target, if any, was reached
+    attempt: int = 1  # 2: the previous attempt was not at rest or did not reach its target
     reasons: tuple[str, ...] = ()
-    hash: str = ""  # of the source
+    hash: str = ""  # hash of the source
     source: str = ""
     version: str = ""
-    event: Literal["calibration", "set"] = "calibration"  # set: numbers that a person typed
+    event: Literal["calibration", "set"] = "calibration"  # set: typed in by a person
     schema: int = 1
 
     @property
     def mean(self) -> Array:
-        """The mean of its data, (3,), deg/s."""
+        """Mean of the data, (3,), deg/s."""
         return _floats(self.mean_dps or [None] * 3)
 
     @property
     def variance(self) -> Array:
-        """The variance of the mean, (3,)."""
+        """Variance of the mean, (3,), (deg/s)^2."""
         return _floats(self.variance_dps2 or [None] * 3)
 
     @property
     def celsius(self) -> float | None:
-        """The mean temperature."""
+        """Mean temperature, degrees Celsius."""
         return None if self.temperature_c is None else self.temperature_c[0]
 
     @property
     def up(self) -> Array | None:
-        """The direction of gravity, a unit vector (3,)."""
+        """Direction of the mean acceleration, a unit vector (3,)."""
         return None if self.gravity is None else unit(np.array(self.gravity))
 
 
 @dataclass(frozen=True)
 class Circumstances:
-    """What is known of a calibration besides its samples."""
+    """Conditions of a calibration that are known besides its samples."""
 
     time: float | None = None  # of the first sample, POSIX seconds
-    since_power_on_s: float | None = None  # None: a warm-up's amplitude is left free
+    since_power_on_s: float | None = None  # None: the warm-up amplitude is free
     same_heading: bool = False  # whether the heading is declared to be that of the history
     latitude_deg: float | None = None
     known_still: bool = False  # declared to be at rest: nothing is cut
@@ -111,82 +111,85 @@ class Circumstances:
 
 @dataclass(frozen=True)
 class Prior:
-    """What the history says, (3,) each; NaN and infinite where it says nothing."""
+    """The prior of the bias on each axis, (3,); NaN and infinite variance without a history."""
 
     mean: Array  # of the bias, deg/s
     narrow: Array  # variance where the history is right
     wide: Array  # variance where it is wrong
-    slope: Array  # of the bias, deg/s a degree Celsius; the type's where there is no history
+    slope: Array  # of the bias, deg/s per degree Celsius; the type's without a history
     slope_sigma: Array
-    count: int = 0  # calibrations that make the level, of the axis that has most
-    reasons: tuple[Reason, ...] = ()  # what widened it
+    count: int = 0  # calibrations that make the level, on the axis with the most
+    reasons: tuple[Reason, ...] = ()  # why it was widened
     fitted: tuple[Fitted, ...] = ()
 
 
 def unit(vector: Array) -> Array:
-    """Its direction."""
+    """The unit vector in the direction of a vector."""
     return np.asarray(vector / np.linalg.norm(vector))
 
 
 def angle_deg(first: Array, second: Array) -> float:
-    """Angle between two directions, degrees."""
+    """Angle between two vectors, degrees."""
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second)))
 
 
 def prior_of(
     calibrations: Sequence[Calibration], device_type: DeviceType, now: Circumstances
 ) -> Prior:
-    """The prior of a calibration under these circumstances, from those before it."""
-    past = list(calibrations)[-_MOST:]
+    """The prior of a calibration under the given circumstances, from the earlier calibrations."""
+    past = list(calibrations)[-_MAX_CALIBRATIONS:]
     if not past:
-        none, infinite = np.full(3, np.nan), np.full(3, np.inf)
+        unknown, infinite = np.full(3, np.nan), np.full(3, np.inf)
         spread = device_type.dps("temperature_spread_mdps_per_c")
         slope = device_type.dps("temperature_slope_mdps_per_c")
-        return Prior(none, infinite, infinite, slope, spread)
+        return Prior(unknown, infinite, infinite, slope, spread)
     times = _floats([*(c.time for c in past), now.time]) / _DAY_S
-    days = np.nan_to_num(np.abs(np.diff(times)), nan=1.0)  # a gap that is not known is of one day
+    days = np.nan_to_num(np.abs(np.diff(times)), nan=1.0)  # an unknown gap counts as one day
     days = np.append(0.0, np.cumsum(days))
     turn_on = device_type.dps("turn_on_mdps")
     members = [level_members(past, axis, turn_on[axis]) for axis in range(3)]
     axes = [
-        _axis_prior([past[i] for i in chosen], days[[*chosen, -1]], axis, device_type, now)
-        for axis, chosen in enumerate(members)
+        _axis_prior([past[i] for i in numbers], days[[*numbers, -1]], axis, device_type, now)
+        for axis, numbers in enumerate(members)
     ]
     mean, variance, tau, fitted = zip(*axes, strict=True)
-    slope, slope_sigma = np.array([of_axis["slope"] for of_axis in fitted]).T
-    heading, of_heading = _earth(past, now, np.array(tau))
-    beyond, of_temperature = _beyond(past, device_type, now)
-    narrow = np.array(variance) + heading + beyond
-    wide = np.maximum(device_type.dps("conflict_mdps") ** 2, 9 * narrow)  # at least thrice as far
-    count, reasons = max(map(len, members)), (*of_heading, *of_temperature)
+    slope, slope_sigma = np.array([parameters["slope"] for parameters in fitted]).T
+    earth, earth_reasons = _earth_rate_variance(past, now, np.array(tau))
+    temperature, temperature_reasons = _temperature_variance(past, device_type, now)
+    narrow = np.array(variance) + earth + temperature
+    wide = np.maximum(
+        device_type.dps("conflict_mdps") ** 2, 9 * narrow
+    )  # at least three times the spread
+    count, reasons = max(map(len, members)), (*earth_reasons, *temperature_reasons)
     return Prior(np.array(mean), narrow, wide, slope, slope_sigma, count, reasons, fitted)
 
 
 def _floats(values: Sequence[float | None]) -> Array:
-    """An array, NaN for None."""
+    """An array with NaN for None."""
     return np.array(values, np.float64)
 
 
 def level_members(past: Sequence[Calibration], axis: int, turn_on: float) -> list[int]:
     """Numbers of the calibrations that make the level of an axis.
 
-    One that contradicted the history is left out; a second that agrees with it starts a new level.
+    A calibration that contradicted the history is left out, unless the next one that contradicts it
+    agrees with the first: then these two start a new level.
     """
     members: list[int] = []
-    odd: int | None = None
+    outlier: int | None = None
     for number, calibration in enumerate(past):
         if calibration.outcome[axis] != DROPPED:
             members.append(number)
-            odd = None
-        elif odd is not None and _agree(past[odd], calibration, axis, turn_on):
-            members, odd = [odd, number], None
+            outlier = None
+        elif outlier is not None and _agree(past[outlier], calibration, axis, turn_on):
+            members, outlier = [outlier, number], None
         else:
-            odd = number
+            outlier = number
     return members or [len(past) - 1]
 
 
 def _agree(first: Calibration, second: Calibration, axis: int, turn_on: float) -> bool:
-    """Whether two are within three standard deviations of their difference."""
+    """Whether two calibrations differ by less than three standard deviations."""
     variance = first.variance[axis] + second.variance[axis] + 2 * turn_on**2
     return bool(abs(first.mean[axis] - second.mean[axis]) < 3 * np.sqrt(variance))
 
@@ -194,26 +197,26 @@ def _agree(first: Calibration, second: Calibration, axis: int, turn_on: float) -
 def _axis_prior(
     past: Sequence[Calibration], days: Array, axis: int, device_type: DeviceType, now: Circumstances
 ) -> tuple[float, float, float, Fitted]:
-    """Mean and variance of the next bias without the Earth, tau squared, and what was fitted."""
+    """Mean and variance of the next bias without the Earth's rate, tau^2, and the parameters."""
     temperatures = _floats([*(c.celsius for c in past), now.temperature_c])
     unknown = np.isnan(temperatures[:-1])
-    seen = temperatures[:-1][~unknown] if not unknown.all() else np.zeros(1)
-    warmth = np.nan_to_num(temperatures - seen.mean()) * (not unknown.all())
+    measured = temperatures[:-1][~unknown] if not unknown.all() else np.zeros(1)
+    warmth = np.nan_to_num(temperatures - measured.mean()) * (not unknown.all())
     type_slope = device_type.dps("temperature_slope_mdps_per_c")[axis]
     spread = device_type.dps("temperature_spread_mdps_per_c")[axis] ** 2
     tau, walk, logs = _grid(device_type, axis)
     days = days - days[0]
     of_walk = walk[:, None, None] ** 2 * np.minimum(days[:, None], days)
     moving = of_walk + spread * np.outer(warmth, warmth)
-    variances = np.array([c.variance[axis] for c in past]) + unknown * spread * seen.var()
+    variances = np.array([c.variance[axis] for c in past]) + unknown * spread * measured.var()
     variances = variances + tau[:, None] ** 2
     among = moving[:, :-1, :-1] + variances[:, :, None] * np.eye(len(past))
     slope = np.broadcast_to(spread * warmth[:-1], variances.shape)
     cross = np.stack([moving[:, :-1, -1], of_walk[:, :-1, -1], slope], axis=-1)
-    own = [moving[:, -1, -1] + tau**2, of_walk[:, -1, -1], np.full(len(tau), spread)]
-    y = _levelled(past, axis, now) - type_slope * warmth[:-1]
-    flat = np.array([1.0, 1.0, 0.0])  # the bias and the level move with the level, the slope not
-    deviance, mean, variance = _krige(among, cross, np.stack(own, axis=-1), y, flat)
+    targets = [moving[:, -1, -1] + tau**2, of_walk[:, -1, -1], np.full(len(tau), spread)]
+    y = _at_present_attitude(past, axis, now) - type_slope * warmth[:-1]
+    flat = np.array([1.0, 1.0, 0.0])  # bias and level move with the level, the slope does not
+    deviance, mean, variance = _krige(among, cross, np.stack(targets, axis=-1), y, flat)
     logs = logs - deviance / 2
     weights = np.exp(logs - logs.max()) / np.exp(logs - logs.max()).sum()
     (bias, sigma), level, (extra, slope_sigma) = _moments(weights, mean, variance)
@@ -223,8 +226,8 @@ def _axis_prior(
     return bias + type_slope * warmth[-1], sigma**2, float(weights @ tau**2), fitted
 
 
-def _levelled(past: Sequence[Calibration], axis: int, now: Circumstances) -> Array:
-    """Evidence (n,) with the Earth's vertical rate as in the attitude of now, where it is known."""
+def _at_present_attitude(past: Sequence[Calibration], axis: int, now: Circumstances) -> Array:
+    """Evidence (n,), with the Earth's vertical rate moved to the present attitude if known."""
     means = np.array([c.mean[axis] for c in past])
     if now.latitude_deg is None or now.up is None:
         return means
@@ -233,23 +236,23 @@ def _levelled(past: Sequence[Calibration], axis: int, now: Circumstances) -> Arr
 
 
 def _grid(device_type: DeviceType, axis: int) -> tuple[Array, Array, Array]:
-    """Points of tau and of the walk, (g,) each, and the logarithm of their prior."""
+    """Grid points of tau and of the walk, (g,) each, and the logarithm of their prior."""
     z = [np.linspace(-2.5, 2.5, number) for number in _GRID]
     first, second = (grid.ravel() for grid in np.meshgrid(*z, indexing="ij"))
-    tau = np.maximum(device_type.dps("turn_on_mdps")[axis], _LEAST_DPS)
-    walk = np.maximum(device_type.dps("walk_mdps_per_rtday")[axis], _LEAST_DPS)
+    tau = np.maximum(device_type.dps("turn_on_mdps")[axis], _MIN_DPS)
+    walk = np.maximum(device_type.dps("walk_mdps_per_rtday")[axis], _MIN_DPS)
     logs = -(first**2 + second**2) / 2
     return tau * device_type.turn_on_factor**first, walk * device_type.walk_factor**second, logs
 
 
 def _krige(
-    among: Array, cross: Array, own: Array, y: Array, flat: Array
+    among: Array, cross: Array, targets: Array, y: Array, flat: Array
 ) -> tuple[Array, Array, Array]:
     """Restricted deviance, conditional means and variances of k targets at each point of a grid.
 
     ``among`` (g, n, n) is the covariance of the evidence y (n,) about an unknown level, ``cross``
-    (g, n, k) that with the targets, ``own`` (g, k) holds the targets' variances, and ``flat`` (k,)
-    by how much a target moves with the level.
+    (g, n, k) its covariance with the targets, ``targets`` (g, k) holds their variances, and
+    ``flat`` (k,) says by how much each target moves with the level.
     """
     reference = y.mean()
     columns = np.stack([np.ones(len(y)), y - reference], axis=-1)
@@ -264,21 +267,21 @@ def _krige(
     deviance = deviance + np.log(information) + np.sum(residuals**2, axis=1)
     missing = flat - np.einsum("gn,gnk->gk", ones, to_targets)
     mean = flat * (level[:, None] + reference) + np.einsum("gn,gnk->gk", residuals, to_targets)
-    variance = own - np.sum(to_targets**2, axis=1) + missing**2 / information[:, None]
+    variance = targets - np.sum(to_targets**2, axis=1) + missing**2 / information[:, None]
     return deviance, mean, np.maximum(variance, 0)
 
 
 def _moments(weights: Array, mean: Array, variance: Array) -> list[tuple[float, float]]:
-    """Means and standard deviations of k mixtures over the grid, from (g, k) of each."""
+    """Mean and standard deviation of k mixtures over the grid, from means and variances (g, k)."""
     means = weights @ mean
     variances = weights @ (variance + (mean - means) ** 2)
     return [(float(m), float(np.sqrt(v))) for m, v in zip(means, variances, strict=True)]
 
 
-def _beyond(
+def _temperature_variance(
     past: Sequence[Calibration], device_type: DeviceType, now: Circumstances
 ) -> tuple[Array, list[Reason]]:
-    """Variance of a temperature that the history has not seen, or that is not known now."""
+    """Variance due to a temperature that is unknown now, or beyond the range of the history."""
     spread = device_type.dps("temperature_spread_mdps_per_c")
     ranges = [c.temperature_c for c in past if c.temperature_c is not None]
     if not ranges or not spread.any():
@@ -289,28 +292,27 @@ def _beyond(
     if not distance:
         return np.zeros(3), []
     key = "temperature unknown" if value is None else "temperature beyond"
-    told = reason(key, value, distance, least=least, most=most)
-    return (spread * distance) ** 2, [told]
+    return (spread * distance) ** 2, [reason(key, value, distance, least=least, most=most)]
 
 
-def _earth(
+def _earth_rate_variance(
     past: Sequence[Calibration], now: Circumstances, tau_squared: Array
 ) -> tuple[Array, list[Reason]]:
-    """Variance of the Earth's rate between the history's headings and this one, (3,), (deg/s)^2.
+    """Variance of the Earth's rate between the past headings and this one, (3,), (deg/s)^2.
 
-    Two unknown headings: (4.18 cos phi)^2 on a horizontal axis, 0 on a vertical one. Nothing where
-    the heading is declared to repeat and no other attitude is seen. Where past attitudes differ,
-    tau holds it already.
+    Between two unknown headings it is (4.18 cos phi)^2 on a horizontal axis and 0 on a vertical
+    one. It is 0 where the heading is declared to repeat and the attitude is that of the history.
+    Where past attitudes differ, tau already contains it.
     """
     ups, up, latitude = [c.up for c in past if c.up is not None], now.up, now.latitude_deg
     before = unit(np.sum(ups, axis=0)) if ups else None
     turned = 0.0 if before is None or up is None else angle_deg(up, before)
     if turned > SAME_ATTITUDE_DEG:
-        told = reason("attitude history", turned, SAME_ATTITUDE_DEG)
+        cause = reason("attitude history", turned, SAME_ATTITUDE_DEG)
     elif now.same_heading:
         return np.zeros(3), []
     else:
-        told = reason("heading")
+        cause = reason("heading")
     horizontal = (EARTH_DPS * (1.0 if latitude is None else np.cos(np.radians(latitude)))) ** 2
     variance = np.full(3, horizontal)
     if before is not None and up is not None:
@@ -319,11 +321,11 @@ def _earth(
             variance = variance + (EARTH_DPS * (up - before)) ** 2
     if before is not None and max(angle_deg(u, before) for u in ups) > SAME_ATTITUDE_DEG:
         variance = np.maximum(variance - tau_squared, 0)
-    return variance, [told]
+    return variance, [cause]
 
 
 def noise_of(calibrations: Sequence[Calibration], device_type: DeviceType) -> tuple[Array, Array]:
-    """N^2 over that of the type, (3,), and its degrees of freedom: of type and history together."""
+    """N^2 relative to the type, (3,), and its degrees of freedom, from type and history."""
     freedom = np.full(3, device_type.noise_freedom)
     if np.isinf(device_type.noise_freedom):
         return np.ones(3), freedom

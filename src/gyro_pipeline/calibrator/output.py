@@ -1,4 +1,4 @@
-"""Answers as text for people and as JSON for programs, and a picture of how one came about."""
+"""Results as text for people, as JSON for programs, and as a plot of the running estimate."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,13 +15,13 @@ from gyro_pipeline.calibrator.registry import SET, Device
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 
 HEADING_DEG = 3.6
-"""Degrees of heading an hour in one mdps."""
+"""Drift of the heading in degrees per hour for 1 mdps."""
 
-_IN_TEXT = {"conflict", "cut", "floor", "rotation_bound"}  # reasons that the text says itself
+_IN_TEXT = {"conflict", "cut", "floor", "rotation_bound"}  # reasons that the text contains
 
 
 def as_json(state: State, device: str | None, **more: Any) -> dict[str, Any]:
-    """One object for a program; null stands where there is no number."""
+    """A result as a JSON object; null stands where there is no number."""
     return {
         "device": device,
         "bias_dps": numbers(state.bias_dps),
@@ -36,12 +36,12 @@ def as_json(state: State, device: str | None, **more: Any) -> dict[str, Any]:
 
 
 def numbers(values: Array) -> list[float | None]:
-    """Numbers of JSON."""
+    """Numbers for JSON, None where they are not finite."""
     return [value if math.isfinite(value) else None for value in values.tolist()]
 
 
 def as_text(state: State, target_mdps: float | None, calibrator: Calibrator) -> Iterator[str]:
-    """A table of the axes, with a line above and what is left to do below; coloured."""
+    """A coloured table of the axes, with a summary above and the time left below."""
     yield click.style(_summary(state, calibrator), fg="green" if state.rest == STILL else "red")
     sigmas = state.sigma_dps / MDPS
     if state.rest != STILL:
@@ -50,10 +50,10 @@ def as_text(state: State, target_mdps: float | None, calibrator: Calibrator) -> 
         yield "The stored value is still the one to use:"
     yield f"{'bias, deg/s':>17}{'σ, mdps':>11}   from"
     for axis, name in enumerate(AXES):
-        row = f"{name}{state.bias_dps[axis]:+16.6f}{sigmas[axis]:11.2f}   {_from(state, axis)}"
+        row = f"{name}{state.bias_dps[axis]:+16.6f}{sigmas[axis]:11.2f}   {_sources(state, axis)}"
         yield click.style(row, fg="yellow") if state.history[axis] == DROPPED else row
     if target_mdps is not None:
-        yield _left(state, target_mdps)
+        yield _time_left(state, target_mdps)
     if np.isfinite(sigmas).all():
         drifts = zip(sigmas * HEADING_DEG, AXES, strict=True)
         listed = ", ".join(f"{drift:.2g}° about {name}" for drift, name in drifts)
@@ -62,7 +62,7 @@ def as_text(state: State, target_mdps: float | None, calibrator: Calibrator) -> 
 
 
 def _summary(state: State, calibrator: Calibrator) -> str:
-    """How long it was at rest, what was cut, the temperature and the history."""
+    """The time at rest, motions that were cut, the temperature and the history."""
     cut = ", ".join(f"{r.value:.1f} s" for r in state.reasons if r.code == "cut")
     text = "" if state.rest == STILL else f"not at rest ({state.rest}): "
     text += f"at rest for {state.seconds_at_rest:.1f} of {state.time_s:.1f} s"
@@ -79,25 +79,25 @@ def _summary(state: State, calibrator: Calibrator) -> str:
 
 
 def notes(state: State) -> Iterator[str]:
-    """What should be known and the text does not say."""
+    """Remarks that the text does not contain."""
     for reason in state.reasons:
         if reason.code not in _IN_TEXT:
             yield f"{reason.axis}: {reason.sentence}" if reason.axis else reason.sentence
 
 
-def _from(state: State, axis: int) -> str:
-    """What an axis's answer is made of."""
+def _sources(state: State, axis: int) -> str:
+    """The sources of the bias of an axis: this log, the history, or both."""
     if state.history[axis] == USED:
         stretch = state.stretch
         variances = stretch.estimate.variance[axis], stretch.prior.narrow[axis]
-        own, past = np.sqrt(variances) / MDPS
-        return f"this log {own:.2f}, history {past:.2f}"
+        log, history = np.sqrt(variances) / MDPS
+        return f"this log {log:.2f}, history {history:.2f}"
     conflicts = [r for r in state.reasons if r.code == "conflict" and r.axis == AXES[axis]]
     return f"this log alone: {conflicts[0].sentence}" if conflicts else "this log"
 
 
-def _left(state: State, target_mdps: float) -> str:
-    """How long it still takes."""
+def _time_left(state: State, target_mdps: float) -> str:
+    """The seconds that each axis still needs."""
     floors = {r.axis: f", below its floor of {r.value:.2g}" for r in state.reasons
               if r.code == "floor"}  # fmt: skip
     parts = []
@@ -112,12 +112,12 @@ def _left(state: State, target_mdps: float) -> str:
 
 
 def planned(state: State, target_mdps: float) -> Iterator[str]:
-    """A line an axis: the seconds that a target takes, or why it is not reached."""
-    same = f"{target_mdps:.3g} mdps ({target_mdps * HEADING_DEG:.3g}° of heading an hour)"
+    """A line for each axis: the seconds that a target takes, or why it cannot be reached."""
+    target = f"{target_mdps:.3g} mdps ({target_mdps * HEADING_DEG:.3g}° of heading an hour)"
     floors = state.stretch.floor_dps / MDPS
     for name, needed, floor in zip(AXES, state.seconds_left, floors, strict=True):
         if np.isfinite(needed):
-            yield f"{name}: {needed:.1f} s at rest for {same}"
+            yield f"{name}: {needed:.1f} s at rest for {target}"
         elif floor > target_mdps:
             yield f"{name}: not with this sensor: its floor is {floor:.2g} mdps"
         else:
@@ -125,14 +125,14 @@ def planned(state: State, target_mdps: float) -> Iterator[str]:
 
 
 def device_list(rows: Sequence[Mapping[str, Any]], types: Sequence[str]) -> Iterator[str]:
-    """A line a device, and the types that there are."""
+    """A line for each device, and the names of the types."""
     for row in rows:
         yield f"{row['device']:<24} {row['type'] or '-':<12} {row['calibrations']:>4}"
     yield f"types: {', '.join(types)}"
 
 
 def device_table(device: Device) -> Iterator[str]:
-    """The history of a device, what is derived from it, and its health."""
+    """The history of a device, its fitted model, and how often it was not at rest."""
     yield f"{'source':<24}{'rest':>8}{'s':>8}  {'bias, deg/s':^36}{'σ, mdps':^20}  history"
     stored, counting = device.calibrations(), device.history()
     for line in device.lines():
@@ -155,12 +155,12 @@ def device_table(device: Device) -> Iterator[str]:
 
 
 def plot(path: Path, states: Sequence[State], target_mdps: float | None) -> None:
-    """A picture of the running estimate with its band, the history, the stop and what was cut.
+    """Plot the running estimate with its limits, the history, the stop and motions that were cut.
 
     Args:
-        path: Of the picture; its ending says of which kind.
-        states: One a second or so, the last one finished.
-        target_mdps: To mark the stop.
+        path: File to write; its suffix sets the format.
+        states: About one for each second; the last one is the final result.
+        target_mdps: Target whose first reach is marked.
 
     Raises:
         InputError: matplotlib is not installed.
@@ -183,7 +183,7 @@ def plot(path: Path, states: Sequence[State], target_mdps: float | None) -> None
 
 
 def _draw(panel: Any, states: Sequence[State], axis: int) -> None:
-    """One axis, in mdps about its last estimate."""
+    """Draw one axis, in mdps about its last estimate."""
     last, times = states[-1], [state.time_s for state in states]
     centre = last.bias_dps[axis]
     bias = np.array([state.bias_dps[axis] - centre for state in states]) / MDPS
@@ -192,8 +192,8 @@ def _draw(panel: Any, states: Sequence[State], axis: int) -> None:
     panel.plot(times, bias, label="estimate")
     if last.history[axis] != NONE:
         prior = last.stretch.prior
-        past, width = prior.mean[axis] - centre, 1.96 * np.sqrt(prior.narrow[axis])
-        low, high = (past - width) / MDPS, (past + width) / MDPS
+        middle, half = prior.mean[axis] - centre, 1.96 * np.sqrt(prior.narrow[axis])
+        low, high = (middle - half) / MDPS, (middle + half) / MDPS
         panel.axhspan(low, high, color="C1", alpha=0.2, label="history, 95 %")
     for reason in last.reasons:
         if reason.code == "cut":

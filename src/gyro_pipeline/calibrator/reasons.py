@@ -1,4 +1,4 @@
-"""What should be known about an answer: codes for programs, sentences for people."""
+"""Remarks on a result: codes for programs, sentences for people."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -16,14 +16,14 @@ UNUSABLE_CODES = {"dead", "unit"}
 """Codes of data that cannot be used at all."""
 
 VERTICAL = 0.9
-"""Cosine of the angle between an axis that counts as vertical and the vertical."""
+"""An axis counts as vertical where the cosine of its angle to the vertical is larger."""
 
-_FAR = 15.0  # factor on the noise that another unit makes, not another device
-_WARMER_C = 1.0  # over a log, from which on it is said
-_ENOUGH = 6  # blocks that tell a unit by their noise
+_UNIT_FACTOR = 15.0  # on the noise; a larger one means a wrong unit, not another device
+_WARMING_C = 1.0  # a larger change of temperature over a log is reported
+_MIN_FREEDOM = 6  # degrees of freedom of the noise, to recognise a unit by it
 _UNITS = {57.3: "rad/s", 1e3: "mdps", 3600.0: "deg/h", 6.0: "rpm"}
 
-_SENTENCES = {  # by code, and what distinguishes several of one code
+_SENTENCES = {  # by code, followed by a word where a code has several sentences
     "dead": "one value for 2 s: a dead sensor, or steps far above its noise; check the sensor and "
     "its resolution",
     "dead zero": "all samples are zero: a dead sensor; check its wiring",
@@ -33,30 +33,30 @@ _SENTENCES = {  # by code, and what distinguishes several of one code
     "cut": "a motion at {value:.1f} s was cut",
     "motion": "in motion up to {value:.1f} s; the stretch that knows most counts",
     "attitude": "the device was turned before {value:.1f} s; the stretch that knows most counts",
-    "noise": "up to {value:.1f} s the rates scatter {factor:.1f} times as much as {name} does at "
-    "rest: not at rest, or another --type",
+    "noise": "up to {value:.1f} s the rates scatter {factor:.1f} times as much as those of {name} "
+    "at rest: not at rest, or another --type",
     "rotation": "the accelerometer sees a rotation of {rate:.2g} mdps (σ {sigma:.2g}) about a "
     "horizontal axis before {value:.1f} s: not at rest",
-    "attitude history": "the attitude differs by {value:.0f}° from that of the history: it counts "
-    "less",
-    "heading": "the heading is not declared to repeat, so the history holds less about horizontal "
+    "attitude history": "the attitude differs by {value:.0f}° from that of the history, which "
+    "counts less",
+    "heading": "the heading is not declared to repeat, so the history counts less on horizontal "
     "axes; declare it with --same-heading, or mounted = true in device.toml",
-    "temperature unknown": "the temperature is not known, in the history it was {least:.1f} to "
-    "{most:.1f} °C: it counts less",
+    "temperature unknown": "the temperature is not known; the history, recorded at {least:.1f} to "
+    "{most:.1f} °C, counts less",
     "temperature beyond": "{value:.1f} °C is beyond the {least:.1f} to {most:.1f} °C of the "
-    "history: it counts less",
+    "history, which counts less",
     "temperature missing": "the temperature is missing in {value:.0f} of {limit} blocks",
     "temperature moved": "the temperature moved by {value:.1f} °C; the bias may have moved with it",
     "conflict": "the history is {away:.1f} mdps away (1 in {chance:,.0f}) and was dropped",
-    "attempt": "attempt {value}: those before it were not at rest or did not reach their target",
+    "attempt": "attempt {value}: earlier ones were not at rest or did not reach their target",
     "colour": "the colour of the noise is not known, and σ holds for white noise; give --type",
-    "floor": "the target is below the floor of {value:.2g} mdps, which no longer average of this "
-    "sensor goes below",
+    "floor": "the target is below {value:.2g} mdps, the floor of this sensor: a longer average "
+    "does not get below it",
     "warm_up": "warming up, still {value:+.1f} mdps; the bias is what it settles to",
     "not_finite": "{value} of {limit} samples are not finite and were left out",
     "zero": "{value} of {limit} samples are zero on all axes and were left out",
     "gap": "samples are missing at {places} places, {value:.3g} s in all",
-    "clock": "the clock jumped {value} times; time goes on from there",
+    "clock": "the clock jumped {value} times; time continues from there",
     "rotation_bound": "A steady rotation about {about} below {value:.2g} mdps cannot be told from "
     "a bias.",
     "rotation_bound none": "A steady rotation about {about} cannot be told from a bias.",
@@ -65,20 +65,20 @@ _SENTENCES = {  # by code, and what distinguishes several of one code
 
 @dataclass(frozen=True)
 class Reason:
-    """Something that a user or a program should know."""
+    """A remark on a result."""
 
     code: str  # one word for programs, such as ``conflict``, ``motion`` or ``floor``
     sentence: str  # the same for people
     axis: str | None = None  # x, y or z; None where it is about all
-    value: float | None = None  # what was found, in the unit of the sentence
-    limit: float | None = None  # what it was compared with
+    value: float | None = None  # in the unit of the sentence
+    limit: float | None = None  # that the value was compared with
 
 
 def reason(
     key: str, value: float | None = None, limit: float | None = None,
     axis: SupportsIndex | None = None, **words: Any,
 ) -> Reason:  # fmt: skip
-    """A reason with its sentence from the table."""
+    """A reason, with its sentence from the table."""
     sentence = _SENTENCES[key].format(value=value, limit=limit, **words)
     return Reason(
         key.partition(" ")[0], sentence, None if axis is None else AXES[axis], value, limit
@@ -86,19 +86,19 @@ def reason(
 
 
 def unit_reason(factor: float, name: str) -> Reason | None:
-    """That the noise is so far off that of the type that the unit must be wrong."""
-    if not 0 < factor < np.inf or 1 / _FAR < factor < _FAR:
+    """The reason ``unit`` where the noise is so far from that of the type that a unit is wrong."""
+    if not 0 < factor < np.inf or 1 / _UNIT_FACTOR < factor < _UNIT_FACTOR:
         return None
     ratio, way = max(factor, 1 / factor), "above" if factor > 1 else "below"
     near = min(_UNITS, key=lambda unit: abs(np.log(ratio / unit)))
     words: dict[str, Any] = {"ratio": ratio, "way": way, "name": name, "near": near}
-    return reason("unit", factor, _FAR, unit=_UNITS[near], **words)
+    return reason("unit", factor, _UNIT_FACTOR, unit=_UNITS[near], **words)
 
 
 def reasons_of(
     counts: Counter[str], ended: dict[str, Reason], stretch: "Stretch", target_dps: float | None
 ) -> Iterator[Reason]:
-    """All that should be known, the most important first."""
+    """All remarks on a result, the most important first."""
     yield from ended.values()
     for code in ("zero", "not_finite"):
         if 0 < counts[code] < counts["samples"]:
@@ -106,25 +106,25 @@ def reasons_of(
         elif counts[code]:
             yield reason(f"dead {code}")
     setup, (noise, freedom) = stretch.setup, stretch.log_noise()
-    if noise is not None and freedom >= _ENOUGH and np.all(setup.known[1] > 0):
-        factors = noise / (np.sqrt(setup.known[0]) * setup.noise.white)  # also too little noise
-        if told := unit_reason(sorted(factors.tolist())[1], setup.device_type.type):
-            yield told
+    if noise is not None and freedom >= _MIN_FREEDOM and np.all(setup.noise_prior[1] > 0):
+        factors = noise / (setup.noise_factor * setup.noise.white)  # also too little noise
+        if wrong_unit := unit_reason(sorted(factors.tolist())[1], setup.device_type.type):
+            yield wrong_unit
     if np.isfinite(stretch.prior.narrow).any():
         yield from stretch.prior.reasons
     yield from stretch.notes
     if setup.now.attempt > 1:
         yield reason("attempt", setup.now.attempt)
-    yield from _of_noise(stretch, target_dps)
+    yield from _noise_reasons(stretch, target_dps)
     if counts["gaps"]:
         yield reason("gap", counts["gap_ms"] / 1e3, places=counts["gaps"])
     if counts["jumps"]:
         yield reason("clock", counts["jumps"])
-    yield from _of_temperature(stretch)
-    yield from _of_rotation(stretch)
+    yield from _temperature_reasons(stretch)
+    yield from _rotation_reasons(stretch)
 
 
-def _of_noise(stretch: "Stretch", target_dps: float | None) -> Iterator[Reason]:
+def _noise_reasons(stretch: "Stretch", target_dps: float | None) -> Iterator[Reason]:
     setup, floor = stretch.setup, stretch.floor_dps / MDPS
     if not setup.device_type.noise_freedom:
         yield reason("colour")
@@ -137,17 +137,17 @@ def _of_noise(stretch: "Stretch", target_dps: float | None) -> Iterator[Reason]:
             yield reason("warm_up", float(left[axis] / MDPS), axis=axis)
 
 
-def _of_temperature(stretch: "Stretch") -> Iterator[Reason]:
+def _temperature_reasons(stretch: "Stretch") -> Iterator[Reason]:
     measured = stretch.temperature
     if 0 < measured.blocks < stretch.blocks:
         yield reason("temperature missing", stretch.blocks - measured.blocks, stretch.blocks)
     moved = measured.most - measured.least
-    if moved > _WARMER_C:
-        yield reason("temperature moved", moved, _WARMER_C)
+    if moved > _WARMING_C:
+        yield reason("temperature moved", moved, _WARMING_C)
 
 
-def _of_rotation(stretch: "Stretch") -> Iterator[Reason]:
-    """The bound on a rotation that nothing sees, about the vertical where gravity is measured."""
+def _rotation_reasons(stretch: "Stretch") -> Iterator[Reason]:
+    """The bound on an undetectable rotation, about the vertical where gravity is measured."""
     if not stretch.blocks:
         return
     up = stretch.up

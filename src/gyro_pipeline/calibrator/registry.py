@@ -1,12 +1,12 @@
-"""The registry of devices: a folder each, whose history is only ever appended to.
+"""The registry of devices: each has a folder, and its history is append-only.
 
     <registry>/<device>/device.toml         written by people: type, mounted, latitude, frame, notes
-                        calibrations.jsonl  one line a calibration, note or withdrawal
+                        calibrations.jsonl  a line for each calibration, note or withdrawal
                         model.json          derived: noise, level, tau, walk, slope
     <registry>/types/<type>.json
 
-A line is written at once, under a lock, and synced before the call returns. A line that a crash cut
-off is ignored, and the next one starts on a new line.
+A line is written in one call, under a lock, and synced before the call returns. A line that a crash
+cut off is ignored, and the next one starts on a new line.
 """
 
 import json
@@ -29,22 +29,21 @@ from gyro_pipeline.calibrator.history import STILL, Calibration
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 
 VARIABLE = "GYRO_CALIBRATE_REGISTRY"
-"""The environment variable that names the folder."""
+"""Environment variable with the folder of the registry."""
 
 SET = "set"
-"""In place of a hash, what was set by hand."""
+"""Stands in place of a hash where a bias was typed in."""
 
 _NAME = re.compile(r"[\w][\w.-]{0,63}")
-_LOCK_S = 10.0
-_ROOM = 4096  # bytes, more than a line takes
+_LOCK_TIMEOUT_S = 10.0
+_MAX_LINE_BYTES = 4096
 _TEMPLATE = """{type}
 # mounted = true     # the heading repeats at each calibration
 # latitude = 32.1    # degrees
 # notes = ""
 """
 _KEYS = {"type", "mounted", "latitude", "frame", "notes"}
-
-_OF_TYPE = ("flicker_mdps", "random_walk_mdps_per_rts")
+_TYPE_FIGURES = ("flicker_mdps", "random_walk_mdps_per_rts")
 
 Line = dict[str, Any]
 
@@ -54,7 +53,7 @@ class RegistryError(Exception):
 
 
 def registry_folder(path: str | Path | None = None) -> Path:
-    """The folder that was named, the environment's, or the user's own for data."""
+    """The given folder, or that of the environment variable, or the user's folder for data."""
     if path or os.environ.get(VARIABLE):
         return Path(path or os.environ[VARIABLE])
     import platformdirs  # noqa: PLC0415 - not needed where a folder is named
@@ -68,11 +67,11 @@ def devices(registry: Path) -> list["Device"]:
 
 
 class Device:
-    """A device's folder.
+    """The folder of a device.
 
     Args:
         registry: The folder of all devices.
-        name: Letters, digits, ``.``, ``-`` and ``_``.
+        name: Name of the device: letters, digits, ``.``, ``-`` and ``_``.
     """
 
     def __init__(self, registry: Path, name: str) -> None:
@@ -85,7 +84,7 @@ class Device:
         self.model_path = self.folder / "model.json"
 
     def settings(self) -> dict[str, Any]:
-        """What ``device.toml`` says; nothing where there is none."""
+        """The content of ``device.toml``; empty where there is none."""
         try:
             content = tomllib.loads(_read(self.settings_path).decode())
         except ValueError as error:
@@ -98,41 +97,41 @@ class Device:
         return content
 
     def lines(self) -> list[Line]:
-        """All whole lines of its history, the oldest first."""
+        """All complete lines of the history, the oldest first."""
         parsed = map(_parsed, _read(self.lines_path).split(b"\n"))
         return [line for line in parsed if line is not None]
 
     def calibrations(self) -> dict[str, Calibration]:
-        """All that were not withdrawn since, by hash, attempts as well."""
-        kept: dict[str, Calibration] = {}
+        """Calibrations and failed attempts that were not withdrawn, by hash."""
+        stored: dict[str, Calibration] = {}
         for number, line in enumerate(self.lines(), 1):
             if line["event"] in ("calibration", SET):
                 calibration = validated(Calibration, line, f"{self.lines_path}: line {number}")
                 if calibration.event == SET:
-                    kept.pop(SET, None)
-                kept.setdefault(calibration.hash, calibration)
+                    stored.pop(SET, None)
+                stored.setdefault(calibration.hash, calibration)
             elif line["event"] == "forget":
-                kept.pop(line["of"], None)
-        return kept
+                stored.pop(line["of"], None)
+        return stored
 
     def history(self, without: str | None = None) -> list[Calibration]:
-        """The calibrations that count, but for that of one hash; or what was set by hand alone."""
-        kept = self.calibrations()
-        if SET in kept:
-            return [kept[SET]]
-        return [c for key, c in kept.items() if c.rest == STILL and c.mean_dps and key != without]
+        """The calibrations that count, except that of one hash; only the bias typed in if any."""
+        stored = self.calibrations()
+        if SET in stored:
+            return [stored[SET]]
+        return [c for key, c in stored.items() if c.rest == STILL and c.mean_dps and key != without]
 
     def attempt(self, without: str | None = None) -> int:
-        """Number of the next attempt: one more than those that just did not do."""
+        """Number of the next attempt, counted from the last one that reached its target."""
         past = [c for key, c in self.calibrations().items() if key not in (SET, without)]
         numbers = [n for n, c in enumerate(reversed(past)) if c.reached]
         return 1 + (numbers[0] if numbers else len(past))
 
     def append(self, line: Mapping[str, Any] | Calibration) -> bool:
-        """Write a line, synced; not if there is a calibration of the same hash.
+        """Append a line and sync it, unless a calibration with the same hash is stored.
 
         Returns:
-            Whether it was written.
+            Whether the line was written.
 
         Raises:
             RegistryError: The disk is full, or the folder cannot be written.
@@ -146,11 +145,12 @@ class Device:
         return True
 
     def write_model(self, calibrator: Calibrator) -> None:
-        """Replace ``model.json``, for people and other programs, by what is known now."""
+        """Replace ``model.json``, which people and other programs read, by the current model."""
         setup, fitted = calibrator.setup, calibrator.best.prior.fitted or ({},) * len(AXES)
-        noise, freedom = setup.factor * setup.noise.white / MDPS, np.maximum(setup.known[1], 1e-9)
+        noise = setup.noise_factor * setup.noise.white / MDPS
+        freedom = np.maximum(setup.noise_prior[1], 1e-9)
         sigma = noise / np.sqrt(2 * freedom)
-        types = {k: getattr(setup.device_type, k) for k in _OF_TYPE}  # not fitted: no uncertainty
+        figures = {key: getattr(setup.device_type, key) for key in _TYPE_FIGURES}  # without σ
         model = {
             name: {key: [v / MDPS, s / MDPS] for key, (v, s) in fitted[axis].items()}
             | ({"noise": [float(noise[axis]), float(sigma[axis])]} if freedom[axis] >= 1 else {})
@@ -158,51 +158,51 @@ class Device:
         }
         temporary = self.model_path.with_suffix(".new")
         with self._locked():
-            temporary.write_text(json.dumps(model | types, indent=1) + "\n", "utf-8")
+            temporary.write_text(json.dumps(model | figures, indent=1) + "\n", "utf-8")
             os.replace(temporary, self.model_path)
 
     def model(self) -> dict[str, Any]:
-        """What ``model.json`` holds; nothing where there is none."""
+        """The content of ``model.json``; empty where there is none."""
         return dict(json.loads(_read(self.model_path) or "{}"))
 
     def create(self, device_type: str | None = None, settings: str = "") -> None:
-        """Make the folder and ``device.toml``, where they are not there.
+        """Create the folder and ``device.toml`` where they are missing; check that a line fits.
 
         Raises:
-            RegistryError: Nothing can be written; this is said before anything is measured.
+            RegistryError: Nothing can be written.
         """
-        of_type = f'type = "{device_type}"' if device_type else '# type = "consumer"'
+        type_line = f'type = "{device_type}"' if device_type else '# type = "consumer"'
         with self._locked():
-            size = _append(self.lines_path, b" " * _ROOM)  # is there room for a line?
+            size = _append(self.lines_path, b" " * _MAX_LINE_BYTES)  # is there room for a line?
             os.truncate(self.lines_path, size)
             if not self.settings_path.exists():
-                self.settings_path.write_text(settings or _TEMPLATE.format(type=of_type), "utf-8")
+                self.settings_path.write_text(settings or _TEMPLATE.format(type=type_line), "utf-8")
 
     def content(self) -> dict[str, Any]:
-        """All of it, for one file."""
+        """Settings and history of the device, to save in one file."""
         settings = _read(self.settings_path).decode()
         return {"device": self.name, "device_toml": settings, "lines": self.lines()}
 
     def restore(self, content: Mapping[str, Any]) -> None:
-        """Add what such a file holds and is not there yet."""
-        lines, there = list(content["lines"]), self.lines()
+        """Add the lines of a saved device that are not stored yet, and its settings if missing."""
+        lines, stored = list(content["lines"]), self.lines()
         self.create(settings=content["device_toml"])
         for line in lines:
-            if line not in there:
+            if line not in stored:
                 self.append(line)
 
     def remove(self) -> None:
-        """Remove the folder and all that is in it."""
+        """Remove the folder with its content."""
         shutil.rmtree(self.folder)
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            with FileLock(self.folder / ".lock", timeout=_LOCK_S):
+            with FileLock(self.folder / ".lock", timeout=_LOCK_TIMEOUT_S):
                 yield
         except Timeout as error:
-            text = f"{self.folder}: another process has held its lock for {_LOCK_S:g} s"
+            text = f"{self.folder}: another process has held its lock for {_LOCK_TIMEOUT_S:g} s"
             raise RegistryError(f"{text}; end it, or give --no-store") from error
         except OSError as error:
             text = f"{self.folder}: nothing can be stored: {error.strerror or error}"
@@ -210,7 +210,7 @@ class Device:
 
 
 def _read(path: Path) -> bytes:
-    """A file's content, empty where it is not there."""
+    """The content of a file; empty where there is none."""
     try:
         return path.read_bytes()
     except (FileNotFoundError, NotADirectoryError):
@@ -218,11 +218,11 @@ def _read(path: Path) -> bytes:
 
 
 def _append(path: Path, data: bytes) -> int:
-    """All of the data at the end of a file, or none, on the disk; returns where it begins."""
+    """Append all of the data to a file and sync it, or nothing; returns the size before."""
     with open(path, "a+b", buffering=0) as file:
         size = file.seek(0, os.SEEK_END)
         if size and os.pread(file.fileno(), 1, size - 1) != b"\n":
-            data = b"\n" + data  # a crash cut the last line off
+            data = b"\n" + data  # a crash cut off the last line
         try:
             if os.write(file.fileno(), data) < len(data):
                 raise OSError(28, "No space left on device")

@@ -1,4 +1,4 @@
-"""Samples from a pipe or a serial port, line by line: CSV, or one JSON object a line."""
+"""Samples from a pipe or a serial port, as lines of CSV or one JSON object per line."""
 
 import json
 import os
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import InputError
 
-_FIRST = 20  # lines that columns, units and the rate are told from
+_HEADER_LINES = 20  # that columns, units and the rate are inferred from
 
 Samples = list[Any]
 """Times (n,), rates (n, 3) in deg/s, accelerations (n, 3) in g, temperatures (n,), or None each."""
@@ -22,7 +22,7 @@ Samples = list[Any]
 
 @contextmanager
 def source(port: str | None, baud: int) -> Iterator[int]:
-    """The descriptor of a serial port, or of standard input.
+    """The file descriptor of a serial port, or of standard input.
 
     Raises:
         InputError: The port cannot be opened.
@@ -36,31 +36,34 @@ def source(port: str | None, baud: int) -> Iterator[int]:
         text = "--port needs pyserial: pip install 'gyro-pipeline[serial]'"
         raise InputError(text) from error
     try:
-        with serial.Serial(port, baud) as opened:
-            yield int(opened.fileno())
+        with serial.Serial(port, baud) as connection:
+            yield int(connection.fileno())
     except serial.SerialException as error:
-        text = f"--port {port}: {error}; check its name, and who else reads it"
+        text = f"--port {port}: {error}; check its name, and that no other program reads it"
         raise InputError(text) from error
 
 
 def lines_of(descriptor: int, timeout_s: float, say: Callable[[str], None]) -> Iterator[list[str]]:
-    """Whole lines, some at a time as they come; silence ends them, and is said."""
-    left, data = b"", b" "
+    """Complete lines, some at a time as they arrive, until a silence, which is reported."""
+    remainder, data = b"", b" "
     while data:
         if not select.select([descriptor], [], [], timeout_s)[0]:
-            say(f"nothing came for {timeout_s:g} s; this is what there is")
+            say(f"nothing came for {timeout_s:g} s; the result is from the samples before")
             return
         data = os.read(descriptor, 1 << 16)
-        *whole, left = (left + data).split(b"\n") if data else (left, b"")
-        yield [line.decode("utf-8", "replace").strip() for line in whole if line.strip()]
+        *lines, remainder = (remainder + data).split(b"\n") if data else (remainder, b"")
+        yield [line.decode("utf-8", "replace").strip() for line in lines if line.strip()]
 
 
 class Parser:
-    """Finds the columns in the first lines, as the readers of files do, then reads on.
+    """Finds the columns in the first lines, as the readers of files do, and parses all lines.
 
     Args:
-        options: Of the readers.
-        rate_hz: Samples per second; None: as the times say.
+        options: Options of the readers.
+        rate_hz: Samples per second; None: inferred from the times.
+
+    Attributes:
+        bad: Number of lines that could not be parsed.
     """
 
     def __init__(self, options: Any, rate_hz: float | None) -> None:
@@ -70,22 +73,22 @@ class Parser:
         self._parts: list[tuple[list[int], float, float]] = []  # columns, factor, offset
 
     def seconds(self, lines: Iterable[Sequence[str]]) -> Iterator[Samples]:
-        """Samples of a second at most at a time.
+        """Samples, at most a second at a time.
 
         Raises:
-            InputError: Columns, units or rate cannot be told; says which option is lacking.
+            InputError: Columns, units or rate are unknown; the message names the option to give.
         """
         lines, first = iter(lines), list[str]()
-        for some in lines:
-            first += some
-            if len(first) > _FIRST:
+        for batch in lines:
+            first += batch
+            if len(first) > _HEADER_LINES:
                 break
         if not first:
             return
         header = self._start(first)
         step = max(round(self.rate_hz or 1), 1)
-        for some in chain([first[header:]], lines):
-            rows = [row for row in map(self._row, some) if row]
+        for batch in chain([first[header:]], lines):
+            rows = [row for row in map(self._row, batch) if row]
             for start in range(0, len(rows), step):
                 table = np.array(rows[start : start + step])
                 yield [self._columns(table, *part) for part in self._parts]
@@ -97,29 +100,28 @@ class Parser:
         return None if not columns else values if len(columns) > 1 else values[:, 0]
 
     def _start(self, lines: Sequence[str]) -> int:
-        """Tell columns, units and rate from the first lines; returns how many are a header."""
+        """Infer columns, units and rate from the first lines; returns the length of the header."""
         from gyro_pipeline.readers import columns, file, scales, table  # noqa: PLC0415
 
-        header = self._tell_names(lines[0])
+        header = self._read_names(lines[0])
         rows = [row for row in map(self._row, lines[header:]) if row]
         if not rows:
             text = f"expected numbers in {len(self._names)} columns, got {lines[-1][:60]!r}"
-            raise InputError(f"stream: {text}; correct what sends them")
+            raise InputError(f"stream: {text}; correct the program that sends them")
         content = table.Table("stream", tuple(self._names), tuple(np.array(rows).T))
-        opened = file.File(content, self.options)
-        rates = list(columns.rate_columns(opened, None))
-        scale, _ = scales.scale_of(opened, rates)
-        opened.settle()
-        times, offset = _times(opened), -(self.options.offset or 0.0) * scale
+        log = file.File(content, self.options)
+        rates = list(columns.rate_columns(log, None))
+        scale, _ = scales.scale_of(log, rates)
+        log.settle()
+        times, offset = _times(log), -(self.options.offset or 0.0) * scale
         self._parts = [times, (rates, scale, offset)]
-        others = columns.acceleration_of(opened, rates), columns.temperature_of(opened)
-        for numbers, unit in others:
+        for numbers, unit in (columns.acceleration_of(log, rates), columns.temperature_of(log)):
             self._parts.append((list(numbers), unit.factor, unit.offset))
-        self._tell_rate(self._columns(np.array(rows), *times))
+        self._infer_rate(self._columns(np.array(rows), *times))
         self.bad = 0
         return header
 
-    def _tell_names(self, first: str) -> int:
+    def _read_names(self, first: str) -> int:
         if first.startswith("{"):
             self._names = list(json.loads(first))
             return 0
@@ -130,7 +132,7 @@ class Parser:
         return int(header)
 
     def _row(self, line: str) -> list[float] | None:
-        """Numbers of a line, NaN for what is none; None for a line of another shape."""
+        """Numbers of a line, NaN for cells that are none; None for a line of another shape."""
         cells: list[Any] = []
         if self._separator != "":
             cells = line.split(self._separator)
@@ -145,8 +147,8 @@ class Parser:
         self.bad += 1
         return None
 
-    def _tell_rate(self, times: NDArray[np.float64] | None) -> None:
-        """The rate of the first lines' times, where no option says it."""
+    def _infer_rate(self, times: NDArray[np.float64] | None) -> None:
+        """Set the rate from the times of the first lines, where no option gives it."""
         step = 0.0 if times is None else float(np.nanmedian(np.diff(times)))
         if self.rate_hz is None and not step > 0:
             text = "expected times that increase, in a column with a unit, or the rate, got neither"
@@ -155,7 +157,7 @@ class Parser:
 
 
 def _times(file: Any) -> tuple[list[int], float, float]:
-    """The column of times that the readers try first, if its unit is known."""
+    """The first column of times by the rules of the readers, if its unit is known."""
     from gyro_pipeline.readers.stamps import stated_unit_s, time_columns  # noqa: PLC0415
 
     for number, unit_s, by_name in time_columns(file):

@@ -1,4 +1,4 @@
-"""A stretch in one attitude: the filter, the test of rest, and the history with its conflict."""
+"""A stretch of rest in one attitude: filter, tests of rest, history, and conflict with it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -32,20 +32,20 @@ from gyro_pipeline.quality.rest import student_limits
 Mask = NDArray[np.bool_]
 
 CONFLICT = 120.0
-"""The e-value at which the history is dropped. Where it holds, that happens in at most one of as
-many calibrations (Ville), and in half of that as measured."""
+"""The e-value at which the history is dropped. A right history is dropped in at most one of this
+many calibrations (Ville's inequality); half as often in simulations."""
 
 BLOCK_S = 0.5
 
-_LEAST_SAMPLES = 5  # in a block: fewer do not tell the noise
-_WARMER_C = 0.5  # by which the temperature moves until the prior is looked up again
-_AHEAD = 64  # blocks that are looked ahead at a time
+_MIN_BLOCK_SAMPLES = 5  # fewer do not show the noise
+_TEMPERATURE_STEP_C = 0.5  # after which the prior is computed again
+_LOOKAHEAD_BLOCKS = 64  # that are predicted at a time
 _TWO_SIDED = 1.959964
 
 
 @dataclass
 class Setup:
-    """What is known before the first sample."""
+    """Everything that is known before the first sample."""
 
     device_type: DeviceType
     rate_hz: float
@@ -53,28 +53,29 @@ class Setup:
     now: Circumstances
 
     def __post_init__(self) -> None:
-        size = max(round(BLOCK_S * self.rate_hz), _LEAST_SAMPLES)  # samples in a block
+        size = max(round(BLOCK_S * self.rate_hz), _MIN_BLOCK_SAMPLES)  # samples in a block
         self.size, self.block_s, self.noise = size, size / self.rate_hz, self.device_type.noise
-        # N^2 over that of the type, (3,), and its degrees of freedom: infinite where it is known,
-        # 0 where it is not.
-        self.known = noise_of(self.history, self.device_type)
-        self.factor = np.sqrt(self.known[0])
-        self.white = self.factor * self.noise.white / np.sqrt(self.block_s)  # of a block's mean
-        # Where neither attitude nor temperature is known.
+        # N^2 relative to the type, (3,), and its degrees of freedom: infinite where N is known, 0
+        # where it is not.
+        self.noise_prior = noise_of(self.history, self.device_type)
+        self.noise_factor = np.sqrt(self.noise_prior[0])
+        # standard deviation of a block mean
+        self.white = self.noise_factor * self.noise.white / np.sqrt(self.block_s)
+        # for an unknown attitude and temperature
         self.unseen_prior = prior_of(self.history, self.device_type, self.now)
 
-    def prior(self, up: Array | None, celsius: float, believed: bool) -> Prior:
-        """What the history says; ``believed``: that a declared heading repeats."""
-        if up is None and np.isnan(celsius) and believed:
+    def prior(self, up: Array | None, celsius: float, trust_heading: bool) -> Prior:
+        """The prior at an attitude and a temperature, with or without the declared heading."""
+        if up is None and np.isnan(celsius) and trust_heading:
             return self.unseen_prior
-        known = celsius if np.isfinite(celsius) else None
-        same = self.now.same_heading and believed
-        now = replace(self.now, up=up, temperature_c=known, same_heading=same)
+        temperature_c = celsius if np.isfinite(celsius) else None
+        same_heading = self.now.same_heading and trust_heading
+        now = replace(self.now, up=up, temperature_c=temperature_c, same_heading=same_heading)
         return prior_of(self.history, self.device_type, now)
 
 
 class Temperature(NamedTuple):
-    """Of the blocks of a stretch, degrees Celsius; NaN where it is unknown."""
+    """Temperature of the blocks of a stretch, degrees Celsius; NaN where it is unknown."""
 
     blocks: int = 0
     mean: float = np.nan
@@ -83,7 +84,7 @@ class Temperature(NamedTuple):
     last: float = np.nan
 
     def add(self, value: float) -> "Temperature":
-        """One more block."""
+        """The temperature after one more block."""
         if np.isnan(value):
             return self._replace(last=value)
         mean = value if not self.blocks else self.mean + (value - self.mean) / (self.blocks + 1)
@@ -93,64 +94,64 @@ class Temperature(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """What is known from blocks at rest in one attitude; a block makes a new one."""
+    """The immutable state after blocks at rest in one attitude."""
 
     setup: Setup
     start_s: float  # seconds since the first sample
     filter: Filter
     monitor: RestMonitor
     prior: Prior
-    prior_c: float = np.nan  # temperature that the prior is of
-    believed: bool = True  # that a declared heading repeats
+    prior_c: float = np.nan  # temperature of the prior
+    trust_heading: bool = True  # whether a declared heading is believed to repeat
     dropped: Mask = field(default_factory=lambda: np.zeros(3, bool))
     notes: tuple[Reason, ...] = ()  # motions that were cut, conflicts
-    gravity: Array = field(default_factory=lambda: np.zeros(4))  # summed over blocks, and 1
+    gravity: Array = field(default_factory=lambda: np.zeros(4))  # sum over blocks, and their number
     temperature: Temperature = Temperature()
     last_mean: Array = field(default_factory=lambda: np.zeros(3))  # of the last block
 
     @classmethod
     def start(cls, setup: Setup, start_s: float) -> "Stretch":
-        """Before the first block; its history is as if attitude and temperature were not known."""
+        """The stretch before the first block, when attitude and temperature are unknown."""
         power_on_s = setup.now.since_power_on_s
         age_s = None if power_on_s is None else power_on_s + start_s
-        least = setup.device_type.least_change_mdps * MDPS
-        monitor = RestMonitor(setup.size, setup.block_s, least, setup.known[1])
+        least_dps = setup.device_type.least_change_mdps * MDPS
+        monitor = RestMonitor(setup.size, setup.block_s, least_dps, setup.noise_prior[1])
         start = Filter.start(setup.noise, setup.block_s, age_s)
         return cls(setup, start_s, start, monitor, setup.unseen_prior)
 
     @property
     def blocks(self) -> int:
-        """Blocks at rest that the estimate is from."""
+        """Number of blocks at rest that the estimate is from."""
         return int(self.filter.blocks)
 
     @property
     def seconds(self) -> float:
-        """Their length."""
+        """Seconds at rest that the estimate is from."""
         return self.blocks * self.setup.block_s
 
     @cached_property
     def up(self) -> Array | None:
-        """(3,), direction of the mean acceleration; None where it is not measured."""
+        """Direction of the mean acceleration, (3,); None where it is not measured."""
         return unit(self.gravity[:3]) if self.gravity[3] else None
 
     @cached_property
     def usable(self) -> Mask:
-        """(3,), axes with a history that was not dropped."""
+        """Whether an axis has a history that was not dropped, (3,)."""
         return np.isfinite(self.prior.narrow) & ~self.dropped
 
     @property
     def outcome(self) -> tuple[str, str, str]:
-        """What became of the history on each axis."""
-        kept = np.where(self.dropped, DROPPED, USED)
-        x, y, z = np.where(np.isfinite(self.prior.narrow), kept, NONE).tolist()
+        """How the history was treated on each axis."""
+        outcome = np.where(self.dropped, DROPPED, USED)
+        x, y, z = np.where(np.isfinite(self.prior.narrow), outcome, NONE).tolist()
         return x, y, z
 
-    def take(self, blocks: Blocks) -> tuple["Stretch", int, Alarm | None]:
-        """The stretch after some of the blocks; how many; and if that is none, the alarm.
+    def update(self, blocks: Blocks) -> tuple["Stretch", int, Alarm | None]:
+        """The stretch after the first blocks, their number, and the alarm if that is 0.
 
-        How they are dealt to calls changes no bit.
+        The result does not depend, bit for bit, on how blocks are divided among calls.
         """
-        before, blocks = self._prepared(blocks)
+        before, blocks = self._with_current_prior(blocks)
         filters, innovations, temperatures = [before.filter], [], [before.temperature]
         for mean, celsius in zip(blocks.mean, blocks.temperature.tolist(), strict=True):
             following, innovation = filters[-1].update(mean)
@@ -159,31 +160,31 @@ class Stretch:
             temperatures.append(temperatures[-1].add(celsius))
         monitor, count, alarm = before.monitor, len(innovations), None
         if not self.setup.now.known_still:
-            units = np.array(innovations) / self.setup.factor
+            units = np.array(innovations) / self.setup.noise_factor
             monitor, count, alarm = monitor.update(units, self.setup.white, blocks)
         if count == 0:
             return self, 0, alarm
-        conflict = before._conflicts(filters[1 : count + 1], temperatures[1:])
+        conflict = before._first_conflict(filters[1 : count + 1], temperatures[1:])
         if conflict is None and alarm is None or conflict == len(innovations) - 1:
-            after = before._with(blocks, filters[-1], monitor, temperatures[-1])
-            return (after if conflict is None else after._dropped()), len(innovations), None
-        return self.take(blocks.part(0, count if conflict is None else conflict + 1))
+            after = before._advance(blocks, filters[-1], monitor, temperatures[-1])
+            return (after if conflict is None else after._drop_history()), len(innovations), None
+        return self.update(blocks.part(0, count if conflict is None else conflict + 1))
 
-    def _prepared(self, blocks: Blocks) -> tuple["Stretch", Blocks]:
-        """With the prior at the attitude and temperature of the first block; the blocks it is of.
+    def _with_current_prior(self, blocks: Blocks) -> tuple["Stretch", Blocks]:
+        """The stretch with the prior of the first block, and the blocks for which it holds.
 
-        It is looked up at the first block of all, and where the temperature has moved since.
+        The prior is computed at the first block of a stretch, and where the temperature has moved.
         """
         before, celsius = self, blocks.temperature
-        if not self.blocks or _far(celsius[0], self.prior_c):
+        if not self.blocks or _temperature_moved(celsius[0], self.prior_c):
             up = self.up
             if up is None and np.isfinite(blocks.gravity[0]).all():
                 up = unit(blocks.gravity[0])
-            before = self._with_prior(up, float(celsius[0]), self.believed)
-        far = _far(celsius, before.prior_c)
-        return before, blocks.part(0, int(far.argmax()) if far.any() else None)
+            before = self._with_prior(up, float(celsius[0]), self.trust_heading)
+        moved = _temperature_moved(celsius, before.prior_c)
+        return before, blocks.part(0, int(moved.argmax()) if moved.any() else None)
 
-    def _with(
+    def _advance(
         self, blocks: Blocks, after: Filter, monitor: RestMonitor, temperature: Temperature
     ) -> "Stretch":
         measured = blocks.gravity[np.isfinite(blocks.gravity).all(axis=1)]
@@ -198,48 +199,50 @@ class Stretch:
         )
 
     def cut(self, seconds: float, motion: Reason | None) -> "Stretch":
-        """Move on over seconds without data, or over a motion."""
+        """The stretch after seconds without data, or after a motion."""
         if not self.blocks:
             return self
         moved = replace(self, filter=self.filter.skip(seconds))
         if motion is None:
             return moved
-        return replace(moved, notes=(*self.notes, motion), monitor=self.monitor.level_anew())
+        return replace(moved, notes=(*self.notes, motion), monitor=self.monitor.restart_slope())
 
-    def turned_deg(self, turned: Array, gravity: Array) -> float:
-        """By how much the device was turned over a motion: by its rates, or by gravity."""
-        known = self.up is not None and np.isfinite(gravity).all()
-        tilt = angle_deg(gravity, self.up) if known and self.up is not None else 0.0
-        return max(float(np.linalg.norm(turned)), tilt)
+    def turned_deg(self, rotation: Array, gravity: Array) -> float:
+        """The angle of a turn during a motion, from the integrated rates (3,) or from gravity."""
+        measured = self.up is not None and np.isfinite(gravity).all()
+        tilt = angle_deg(gravity, self.up) if measured and self.up is not None else 0.0
+        return max(float(np.linalg.norm(rotation)), tilt)
 
-    def _with_prior(self, up: Array | None, celsius: float, believed: bool) -> "Stretch":
-        prior = self.setup.prior(up, celsius, believed)
-        return replace(self, prior=prior, prior_c=celsius, believed=believed)
+    def _with_prior(self, up: Array | None, celsius: float, trust_heading: bool) -> "Stretch":
+        prior = self.setup.prior(up, celsius, trust_heading)
+        return replace(self, prior=prior, prior_c=celsius, trust_heading=trust_heading)
 
-    def _conflicts(self, filters: Sequence[Filter], temperatures: list[Temperature]) -> int | None:
-        """Number of the first filter at which the e-value says that the history is wrong."""
+    def _first_conflict(
+        self, filters: Sequence[Filter], temperatures: list[Temperature]
+    ) -> int | None:
+        """Number of the first filter whose e-value says that the history is wrong."""
         if not self.usable.any():
             return None
-        own = self.filter.stack(filters).estimate()
-        own = self._scaled(own, *self._noise_with(own))
-        warmer = [_degrees(self.prior_c, t.mean) for t in temperatures[: len(filters)]]
-        off = own.start - self.prior.mean - self.prior.slope * np.array(warmer)[:, None]
-        high = log_e(self._ratios(off, own.start_variance)) > np.log(CONFLICT)
+        estimate = self.filter.stack(filters).estimate()
+        estimate = self._scaled(estimate, *self._noise_with(estimate))
+        rise = [_temperature_rise(self.prior_c, t.mean) for t in temperatures[: len(filters)]]
+        off = estimate.start - self.prior.mean - self.prior.slope * np.array(rise)[:, None]
+        high = log_e(self._log_ratios(off, estimate.start_variance)) > np.log(CONFLICT)
         return int(high.argmax()) if high.any() else None
 
-    def _ratios(self, off: Array, variance: Array) -> Array:
+    def _log_ratios(self, off: Array, variance: Array) -> Array:
         ratios = log_ratios(off, variance, self.prior.narrow, self.prior.wide)
         return np.where(self.usable, ratios, 0.0)
 
-    def _dropped(self) -> "Stretch":
-        """Without the history on the axes that speak against it, for the rest of the stretch.
+    def _drop_history(self) -> "Stretch":
+        """The stretch without the history on the axes that contradict it.
 
-        A heading that one of them contradicts is no longer believed.
+        A heading that one of them contradicts is no longer trusted.
         """
-        own = self.estimate
-        off = own.start - self._prior_mean
-        axes = self.usable & (self._ratios(off, own.start_variance) > 0)
-        sigma = np.sqrt(self.prior.narrow + own.start_variance)
+        estimate = self.estimate
+        off = estimate.start - self._prior_mean
+        axes = self.usable & (self._log_ratios(off, estimate.start_variance) > 0)
+        sigma = np.sqrt(self.prior.narrow + estimate.start_variance)
         notes = [_conflict(axis, off[axis], sigma[axis]) for axis in np.flatnonzero(axes)]
         after = replace(self, dropped=self.dropped | axes, notes=(*self.notes, *notes))
         horizontal = axes if self.up is None else axes & (np.abs(self.up) < VERTICAL)
@@ -247,76 +250,76 @@ class Stretch:
 
     @cached_property
     def unscaled(self) -> Estimate:
-        """By the data alone, with the noise of the type."""
+        """The estimate from the data alone, with the noise of the type."""
         return self.filter.estimate()
 
     @cached_property
     def noise_scale(self) -> tuple[Array, Array]:
-        """N^2 over that of the type, and its degrees of freedom, this log's blocks included."""
+        """N^2 relative to the type, and its degrees of freedom, with the blocks of this log."""
         return self._noise_with(self.unscaled)
 
-    def _noise_with(self, own: Estimate) -> tuple[Array, Array]:
-        scale, freedom = self.setup.known
+    def _noise_with(self, estimate: Estimate) -> tuple[Array, Array]:
+        scale, freedom = self.setup.noise_prior
         if np.isinf(freedom).all():
             return scale, freedom
-        total = freedom + own.freedom
-        return (freedom * scale + own.squares) / np.maximum(total, 1e-9), total
+        total = freedom + estimate.freedom
+        return (freedom * scale + estimate.squares) / np.maximum(total, 1e-9), total
 
     @cached_property
     def estimate(self) -> Estimate:
-        """By the data alone, with the noise as known; the variances make limits of 1.96 sigma."""
+        """The estimate from the data alone; 1.96 sigma are its 95 % limits."""
         return self._scaled(self.unscaled, *self.noise_scale)
 
     def _scaled(self, estimate: Estimate, factor: Array, freedom: Array) -> Estimate:
-        """With Student's limits; over all attempts, where only this log tells the noise."""
+        """Scale variances to Student's limits, over all attempts if only this log tells N."""
         if not np.isinf(freedom).all():
-            attempts = self.setup.now.attempt if not self.setup.known[1].any() else 1
+            attempts = self.setup.now.attempt if not self.setup.noise_prior[1].any() else 1
             z = -NormalDist().inv_cdf(0.025 / attempts)
             student = student_limits(z, np.clip(freedom, 1e-3, 1e9))
             factor = np.where(freedom > 0, factor * (student / _TWO_SIDED) ** 2, np.inf)
-        own, start = estimate.variance * factor, estimate.start_variance * factor
-        return estimate._replace(variance=own, start_variance=start)
+        variance, start = estimate.variance * factor, estimate.start_variance * factor
+        return estimate._replace(variance=variance, start_variance=start)
 
     @cached_property
     def bias(self) -> Array:
-        """(3,), deg/s, as in the last block; what it settles to, where the device warms up."""
-        return self._posterior(self.estimate)[0] + self.prior.slope * self._warmer
+        """The bias in the last block, (3,), deg/s; the settled one where the device warms up."""
+        return self._posterior(self.estimate)[0] + self.prior.slope * self._rise_c
 
     @cached_property
     def variance(self) -> Array:
-        """(3,), of the bias."""
-        return self._posterior(self.estimate)[1] + (self.prior.slope_sigma * self._warmer) ** 2
+        """Variance of the bias, (3,), (deg/s)^2."""
+        return self._posterior(self.estimate)[1] + (self.prior.slope_sigma * self._rise_c) ** 2
 
     @property
-    def _warmer(self) -> float:
-        """By how much the last block is warmer than the mean, where both are known."""
-        return _degrees(self.temperature.mean, self.temperature.last)
+    def _rise_c(self) -> float:
+        """Temperature of the last block less the mean temperature, where both are known."""
+        return _temperature_rise(self.temperature.mean, self.temperature.last)
 
     @property
     def _prior_mean(self) -> Array:
-        """Mean of the prior at the mean temperature of the blocks, by its slope."""
-        warmer = _degrees(self.prior_c, self.temperature.mean)
-        return np.asarray(self.prior.mean + self.prior.slope * warmer)
+        """Mean of the prior, moved to the mean temperature of the blocks."""
+        rise = _temperature_rise(self.prior_c, self.temperature.mean)
+        return np.asarray(self.prior.mean + self.prior.slope * rise)
 
     def _posterior(self, estimate: Estimate) -> tuple[Array, Array]:
-        """Bias now and its variance, with the history where it is usable."""
+        """The current bias and its variance, with the history where it is usable."""
         usable, transfer = self.usable, estimate.transfer
         if not usable.any():
             return estimate.bias, estimate.variance
-        given = self._prior_mean, self.prior.narrow, self.prior.wide
-        mean, narrow, wide = (np.where(usable, x, 1.0) for x in given)
-        own = np.where(usable, estimate.start_variance, np.inf)
-        seen = mixture_posterior(estimate.start, own, mean, narrow, wide)
+        prior = self._prior_mean, self.prior.narrow, self.prior.wide
+        mean, narrow, wide = (np.where(usable, x, 1.0) for x in prior)
+        data = np.where(usable, estimate.start_variance, np.inf)
+        start = mixture_posterior(estimate.start, data, mean, narrow, wide)
         unknown = np.isinf(estimate.variance)
         with np.errstate(invalid="ignore"):
-            moved = estimate.bias + transfer * (seen.mean - estimate.start)
+            moved = estimate.bias + transfer * (start.mean - estimate.start)
             added = estimate.variance - transfer**2 * estimate.start_variance
-        bias = np.where(usable, np.where(unknown, seen.mean, moved), estimate.bias)
-        variance = np.where(unknown, 0.0, added) + transfer**2 * seen.charged
+        bias = np.where(usable, np.where(unknown, start.mean, moved), estimate.bias)
+        variance = np.where(unknown, 0.0, added) + transfer**2 * start.charged
         return bias, np.where(usable, variance, estimate.variance)
 
     def log_noise(self) -> tuple[Array | None, float]:
-        """N of this stretch alone, (3,), deg/s * sqrt(s), and its degrees of freedom."""
+        """N from this stretch alone, (3,), deg/s * sqrt(s), and its degrees of freedom."""
         freedom = float(self.unscaled.freedom[0])
         if freedom < 1:
             return None, 0.0
@@ -324,46 +327,44 @@ class Stretch:
 
     @property
     def floor_dps(self) -> Array:
-        """(3,), below which no average of the sensor comes."""
+        """Floor of the standard deviation of any average of the sensor, (3,), deg/s."""
         return np.asarray(self.setup.noise.floor_dps * np.sqrt(self.noise_scale[0]))
 
     def reached(self, target_dps: float) -> Mask:
-        """(3,), axes at the target, which is not below the sensor's floor without a history."""
+        """Whether an axis is at the target, (3,); below the floor only with a history."""
         below = (self.floor_dps > target_dps) & ~self.usable
         return np.asarray((self.variance <= target_dps**2) & ~below)
 
     def seconds_left(self, target_dps: float, most_s: float) -> Array:
-        """(3,), seconds at rest until the target; infinite where it is not within ``most_s``.
+        """Seconds at rest until the target, (3,); infinite where it takes more than ``most_s``.
 
-        The variances of blocks to come do not depend on the data. What does, the distance from the
-        history and the noise where it is unknown, is taken as it is now.
+        The variances of future blocks do not depend on the data. The distance from the history and
+        an unknown noise do, and are assumed to stay as they are now.
         """
         below = (self.floor_dps > target_dps) & ~self.usable
-        left = np.where(self.reached(target_dps), 0.0, np.inf)
+        seconds = np.where(self.reached(target_dps), 0.0, np.inf)
         start = self.estimate.start if self.blocks else np.where(self.usable, self.prior.mean, 0.0)
-        following, done = self.filter, 0
-        while np.any(np.isinf(left) & ~below) and done * self.setup.block_s < most_s:
-            following, stack = following.ahead(_AHEAD)
-            number = done + 1 + np.arange(_AHEAD)[:, None]
-            later = self._scaled(
-                stack.estimate(), self.noise_scale[0], self.noise_scale[1] + number
-            )
-            later = later._replace(start=np.broadcast_to(start, (_AHEAD, 3)))
+        (scale, freedom), following, count = self.noise_scale, self.filter, 0
+        while np.any(np.isinf(seconds) & ~below) and count * self.setup.block_s < most_s:
+            following, stack = following.ahead(_LOOKAHEAD_BLOCKS)
+            number = count + 1 + np.arange(_LOOKAHEAD_BLOCKS)[:, None]
+            later = self._scaled(stack.estimate(), scale, freedom + number)
+            later = later._replace(start=np.broadcast_to(start, (_LOOKAHEAD_BLOCKS, 3)))
             reached = self._posterior(later)[1] <= target_dps**2
-            first = np.where(reached.any(axis=0), done + 1 + reached.argmax(axis=0), np.inf)
-            left = np.minimum(left, first * self.setup.block_s)
-            done += _AHEAD
-        return np.where(below, np.inf, left)
+            first = np.where(reached.any(axis=0), count + 1 + reached.argmax(axis=0), np.inf)
+            seconds = np.minimum(seconds, first * self.setup.block_s)
+            count += _LOOKAHEAD_BLOCKS
+        return np.where(below, np.inf, seconds)
 
 
-def _degrees(then: float, now: float) -> float:
-    """From one to the other; 0 where one of them is not known."""
-    return 0.0 if np.isnan(now - then) else now - then
+def _temperature_rise(start: float, end: float) -> float:
+    """Change of temperature; 0 where one of the two is unknown."""
+    return 0.0 if np.isnan(end - start) else end - start
 
 
-def _far(now: ArrayLike, then: float) -> NDArray[np.bool_]:
-    """Where the temperature has moved, or is known at last."""
-    return np.isfinite(now) & ~(np.abs(np.subtract(now, then)) <= _WARMER_C)
+def _temperature_moved(now: ArrayLike, before: float) -> Mask:
+    """Whether the temperature has moved by a step, or has become known."""
+    return np.isfinite(now) & ~(np.abs(np.subtract(now, before)) <= _TEMPERATURE_STEP_C)
 
 
 def _conflict(axis: SupportsIndex, away: float, sigma: float) -> Reason:

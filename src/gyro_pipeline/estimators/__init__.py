@@ -1,6 +1,6 @@
-"""Estimators: a window in, a bias and its standard deviation out.
+"""Estimators: functions from a window to a bias and its standard deviation.
 
-Nothing is imported but the estimator that is asked for: a list of names costs no PyTorch.
+Only the estimator that is used is imported: a list of names does not need PyTorch.
 """
 
 import importlib
@@ -40,15 +40,15 @@ ESTIMATORS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "cnn": (f"{_LEARNING}network:CalibrationNetwork", {}),
     "cnn_shuffled": (f"{_LEARNING}network:CalibrationNetwork", {"shuffled": True}),
 }
-"""The class and the options of each estimator, by the name that runs and tables give it.
+"""The class and the options of each estimator, by its name in runs and tables.
 
 A class is an :class:`~gyro_pipeline.estimators.base.Estimator`, or an ``nn.Module``, which
 :class:`~gyro_pipeline.estimators.nn_module.ModuleEstimator` trains.
 """
 
 DEFAULT = "best_linear"
-"""What to use where nothing else is known: its sigma holds on coloured noise as well, and it models
-a warm-up if the recordings show one."""
+"""The default choice: its sigma holds on coloured noise as well, and it models a warm-up if the
+recordings show one."""
 
 ORIENTATION_NOTE = (
     "uses a stored prior, which holds only in the orientation and at the latitude it was learned in"
@@ -56,28 +56,28 @@ ORIENTATION_NOTE = (
 
 
 def entry(name: str) -> str:
-    """Where the class of an estimator is, as ``package.module:Class``.
+    """The path of the class of an estimator, ``package.module:Class``.
 
     Args:
-        name: One of ``ESTIMATORS``, or ``package.module:Class`` of an estimator or a network of
-            one's own; settings may follow, as in ``cnn learning_rate=0.001 channels=16``.
+        name: One of ``ESTIMATORS``, or ``package.module:Class`` of a user's estimator or network;
+            settings may follow, as in ``cnn learning_rate=0.001 channels=16``.
 
     Raises:
-        InputError: It is neither.
+        InputError: The name is neither.
     """
     word = name.partition(" ")[0]
     path, _ = ESTIMATORS.get(word, (word, {}))
     module, _, kind = path.partition(":")
     if not (module and kind):
         raise InputError(
-            f"unknown estimator {word!r}; there are {', '.join(ESTIMATORS)}, and those of your "
-            "own: package.module:Class"
+            f"unknown estimator {word!r}; expected one of {', '.join(ESTIMATORS)}, or your own as "
+            "package.module:Class"
         )
     return path
 
 
 def own_classes(names: Iterable[str]) -> list[str]:
-    """Which of some estimators are of one's own, each as ``package.module:Class``."""
+    """Paths of the estimators in a list that are a user's, ``package.module:Class``."""
     return sorted({entry(name) for name in names if name.partition(" ")[0] not in ESTIMATORS})
 
 
@@ -85,7 +85,7 @@ def named_settings(name: str) -> dict[str, Any]:
     """The settings that follow the word in the name of an estimator.
 
     Raises:
-        InputError: One is not of the form key=value.
+        InputError: A setting is not of the form key=value, or is there twice.
     """
     settings = {}
     for part in name.split()[1:]:
@@ -100,7 +100,7 @@ def named_settings(name: str) -> dict[str, Any]:
 
 
 def named_class(name: str) -> type:
-    """The class that a name stands for, an estimator's or a network's.
+    """The class of an estimator or a network.
 
     Args:
         name: As for :func:`entry`.
@@ -110,17 +110,17 @@ def named_class(name: str) -> type:
     """
     module, _, kind = entry(name).partition(":")
     try:
-        named: type = getattr(importlib.import_module(module), kind)
+        imported: type = getattr(importlib.import_module(module), kind)
     except (ModuleNotFoundError, AttributeError) as error:
         raise InputError(
             f"estimator {name!r}: {error}; expected package.module:Class, of a module that Python "
             "finds, such as a file in src"
         ) from error
-    return named
+    return imported
 
 
 def estimator_class(name: str) -> "type[Estimator]":
-    """The class of an estimator; of a network that of what trains it.
+    """The class of an estimator; for a network, the class that trains it.
 
     Args:
         name: As for :func:`entry`.
@@ -145,13 +145,13 @@ def estimator_class(name: str) -> "type[Estimator]":
 
 
 def make_estimator(name: str, training: "Training", seed: int) -> "Estimator":
-    """An estimator that is yet to be fitted.
+    """Make an estimator that is not fitted yet.
 
     Args:
-        name: As for :func:`entry`. Settings that ``training`` has change it, others are options of
-            the estimator or network.
-        training: Sizes and schedule of a network; only an estimator that is seeded gets them.
-        seed: Likewise.
+        name: As for :func:`entry`. Settings that are fields of ``training`` replace them; others
+            are options of the estimator or network.
+        training: Sizes and schedule of a network, used only by seeded estimators.
+        seed: Seed of a seeded estimator.
 
     Raises:
         InputError: There is no such estimator, or a setting is unknown.
@@ -164,16 +164,16 @@ def make_estimator(name: str, training: "Training", seed: int) -> "Estimator":
             return kind(**{**fixed, **options})
         changes = {key: options.pop(key) for key in [*options] if key in training.schedule}
         settings = training.model_validate(training.model_dump() | changes)
-        given = {} if issubclass(named_class(name), kind) else {"network": entry(name)}
-        made = kind(training=settings, seed=seed, **given, **fixed, **options)
+        network = {} if issubclass(named_class(name), kind) else {"network": entry(name)}
+        estimator = kind(training=settings, seed=seed, **network, **fixed, **options)
     except (TypeError, ValueError) as error:
         raise InputError(f"estimator {name!r}: {' '.join(str(error).split())}") from error
-    made.settings = made.settings or settings.model_dump()
-    return made
+    estimator.settings = estimator.settings or settings.model_dump()
+    return estimator
 
 
 def settings_of(name: str, training: "Training") -> dict[str, Any]:
-    """What a seeded estimator is made with, for runs to carry; nothing of any other.
+    """The settings of a seeded estimator, which are stored with runs; empty for any other.
 
     Args:
         name: As for :func:`entry`.

@@ -1,4 +1,4 @@
-"""Estimators that know nothing but the window."""
+"""Estimators that use the window alone."""
 
 from typing import ClassVar
 
@@ -14,7 +14,7 @@ from gyro_pipeline.estimators.training import TrainingSet
 class RunningMean(Estimator):
     """Zero-order calibration: the mean of the window (paper, section II), the running mean.
 
-    Sums are in float64. Usable without ``fit``, which only gives it sigma: N / sqrt(T0) for the
+    Sums are in float64. It can be used without ``fit``, which only sets sigma: N / sqrt(T0) for the
     bias and N sqrt(1 / T0 - 1 / T) for the mean of the recording, if the noise is white.
     """
 
@@ -31,7 +31,7 @@ class RunningMean(Estimator):
 
 
 class Median(Estimator):
-    """The median of the window; single samples far off do not move it. Its sigma is not known."""
+    """The median of the window, which single outliers do not move. Its sigma is unknown."""
 
     uses = NOTHING
     fewest_recordings = 0

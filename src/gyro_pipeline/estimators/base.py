@@ -1,4 +1,4 @@
-"""The one interface of all estimators, and what they share."""
+"""The interface of all estimators."""
 
 import copy
 import pickle
@@ -23,13 +23,13 @@ _FILE = "estimator.pkl"
 
 @dataclass(frozen=True)
 class Windows:
-    """What :meth:`Estimator.estimate` is asked, with a start for every window.
+    """The arguments of :meth:`Estimator.estimate`, with a start for every window.
 
     Attributes:
         samples: (n, gyroscopes, samples), deg/s.
         target: BIAS or RECORDING_MEAN.
         start_s: (n,), seconds after power-on.
-        recording: Number of the recording, or None.
+        recording: Number of the recording; None if it is later than all training recordings.
     """
 
     samples: NDArray[np.floating]
@@ -41,25 +41,25 @@ class Windows:
 class Estimator:
     """Base of all estimators: it is fitted to a training set and estimates biases from windows.
 
-    A subclass gives ``_estimate``, ``_fit`` if it learns more than the rate and the length of
-    recordings, and those of the attributes that differ. It must be picklable, and should keep none
-    of the training data: what it holds is stored with the run.
+    A subclass defines ``_estimate``, ``_fit`` if it learns more than the rate and the length of
+    recordings, and the attributes that differ. It must be picklable, and should keep none of the
+    training data: its attributes are stored with the run.
 
     A stored prior contains the Earth's rate, 4.2 mdps, as the sensing axes saw it. So an estimator
     with ``uses_prior`` holds only at the latitude and in the orientation of its training
-    recordings. Whoever shows one of its estimates says so: ``ORIENTATION_NOTE``.
+    recordings. ``ORIENTATION_NOTE`` says so wherever its estimates are shown.
 
     Attributes:
         uses: The part of a training set that it is fitted to: NOTHING, OWN, REAL or ALL.
-        seeded: Whether it is made with ``training`` (sizes and schedule) and ``seed``.
-        side_by_side: Whether it sees the windows of all IMUs of method 1; others see the device's.
-        fewest_recordings: How many training recordings it needs: of the device, or of all real
-            IMUs together where the device is unseen.
-        recommended: Whether it is one to use; the others are there to be compared with.
-        uses_prior: Whether what it learned about the bias enters its estimates.
-        engine: What fitted it.
-        history: Losses by epoch, of a network.
-        settings: Of a seeded one, what it was made with, but the seed; runs carry it.
+        seeded: Whether its arguments are ``training`` (sizes and schedule) and ``seed``.
+        side_by_side: Whether it sees the windows of all IMUs of method 1, not of the device alone.
+        fewest_recordings: Minimum number of training recordings: of the device, or of all real
+            IMUs together if the device is unseen.
+        recommended: Whether it is recommended for use; others serve for comparison.
+        uses_prior: Whether its estimates depend on biases that it has learned.
+        engine: Where it was fitted: ``cpu``, ``fused`` or ``batched``.
+        history: Losses of a network by epoch.
+        settings: Arguments of a seeded estimator except the seed; stored with runs.
     """
 
     uses: ClassVar[str] = OWN
@@ -78,7 +78,7 @@ class Estimator:
         """Learn from a training set, and from nothing else.
 
         Args:
-            training: Of which only the part is looked at that the estimator uses.
+            training: The training set, of which only the part in ``uses`` is read.
 
         Returns:
             Itself.
@@ -98,11 +98,15 @@ class Estimator:
         Raises:
             InputError: It has too few recordings.
         """
-        self._demand(training.recordings())
+        recordings = training.recordings()
+        if recordings < self.fewest_recordings:
+            raise InputError(
+                f"expected at least {self.fewest_recordings} training recordings, got {recordings}"
+            )
 
     @property
     def source(self) -> type:
-        """The class whose file is stored with the estimator where it is not of this package."""
+        """The class whose source file is stored with the estimator if it is a user's."""
         return type(self)
 
     def work(self, training: TrainingSet) -> float:
@@ -123,16 +127,16 @@ class Estimator:
             target: BIAS, or RECORDING_MEAN: the mean of the whole recording that the window is
                 part of, whose length is that of the training recordings.
             start_s: (n,) or one for all: when each window begins, seconds after power-on. Matters
-                to estimators that know a warm-up or a random walk.
+                to estimators that model a warm-up or a random walk.
             recording: Number of the recording that the windows are from; None for one after all
                 training recordings. Matters to estimators that use past calibrations in order.
 
         Returns:
             Two arrays (n, gyroscopes), deg/s: estimates, and the standard deviation of each
-            about the target; NaN where the method has none.
+            about the target; NaN if the method has none.
 
         Raises:
-            InputError: An unknown target, or windows of another length than it was fitted for.
+            InputError: The target is unknown, or the windows have another length than in training.
         """
         if target not in (RECORDING_MEAN, BIAS):
             raise InputError(f"target: expected {RECORDING_MEAN!r} or {BIAS!r}, got {target!r}")
@@ -144,53 +148,48 @@ class Estimator:
     def with_calibrations(
         self, numbers: NDArray[np.integer], labels: NDArray[np.float64]
     ) -> "Estimator":
-        """The estimator, told of calibrations of the device made since it was fitted.
+        """The estimator, updated with calibrations of the device made since it was fitted.
 
-        For a recording only those before it count; so it may be told of all that are judged.
+        An estimate for a recording uses only the calibrations before it, so all recordings that
+        are judged may be given at once.
 
         Args:
-            numbers: Of the recordings, (n,), increasing.
-            labels: Their means, (n, axes), deg/s.
+            numbers: Numbers of the recordings, (n,), increasing.
+            labels: Means of the recordings, (n, axes), deg/s.
 
         Returns:
-            Itself, if it does not use past calibrations in their order; else a copy.
+            A copy; the estimator itself if it does not use past calibrations in order.
         """
         return self
 
     def variants(self) -> Mapping[str, "Estimator"]:
-        """What is judged: itself, and of a validated network the weights of the best epoch too."""
+        """The estimators to judge: itself, and a validated network also at its best epoch."""
         return {LAST: self}
 
     def save(self, folder: Path) -> None:
-        """Write what is needed to load it; the losses by epoch are not among it."""
-        kept = copy.copy(self)
-        kept.history = None
+        """Write the estimator to a folder, without the losses by epoch."""
+        stored = copy.copy(self)
+        stored.history = None
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / _FILE).write_bytes(pickle.dumps(kept))
+        (folder / _FILE).write_bytes(pickle.dumps(stored))
 
     @staticmethod
     def load(folder: Path) -> "Estimator":
-        """An estimator of any class as it was saved; only from a folder that one trusts."""
+        """Load an estimator of any class from a folder, which must be trusted: it is a pickle."""
         loaded = pickle.loads((folder / _FILE).read_bytes())
         assert isinstance(loaded, Estimator)
         return loaded
 
     def _fit(self, training: TrainingSet) -> None:
-        """Nothing to learn."""
+        """Learn from the part of a training set that the estimator uses."""
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
-        """Biases and their sigma, of any shapes that broadcast to (n, gyroscopes)."""
+        """Biases and their sigma, in shapes that broadcast to (n, gyroscopes)."""
         raise NotImplementedError
-
-    def _demand(self, recordings: int) -> None:
-        if recordings < self.fewest_recordings:
-            raise InputError(
-                f"expected at least {self.fewest_recordings} training recordings, got {recordings}"
-            )
 
     @staticmethod
     def _demand_size(windows: Windows, size: int) -> None:
-        """Refuse windows of another length than those that were learned from."""
+        """Refuse windows of another length than the training windows."""
         if windows.samples.shape[-1] != size:
             raise InputError(
                 f"windows: expected {size} samples, as it was fitted to, "

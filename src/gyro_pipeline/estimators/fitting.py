@@ -1,4 +1,4 @@
-"""Fitting many estimators: in one process per core, and networks many at once on a GPU."""
+"""Fit many estimators: in a process per core, or networks in batches on a GPU."""
 
 import logging
 import time
@@ -23,13 +23,13 @@ class FitJob:
     """An estimator to fit.
 
     Attributes:
-        key: Whatever tells the caller which run it is of.
-        name: Of that run, for messages.
-        fold: Of the windows table.
-        estimator: As in :data:`gyro_pipeline.estimators.ESTIMATORS`, or of one's own.
-        settings: Sizes and schedule, of a network.
-        seed: Likewise.
-        training: What to fit it to.
+        key: Fingerprint of the run that the fit belongs to.
+        name: Name of the run, for messages.
+        fold: Fold of the windows table.
+        estimator: Name, as for :func:`gyro_pipeline.estimators.entry`.
+        settings: Sizes and schedule of a network.
+        seed: Seed of a network.
+        training: The training set.
     """
 
     key: str
@@ -41,7 +41,7 @@ class FitJob:
     training: TrainingSet
 
     def make(self) -> Estimator:
-        """The estimator, yet to be fitted."""
+        """The estimator, not fitted yet."""
         return make_estimator(self.estimator, self.settings, self.seed)
 
     @cached_property
@@ -52,7 +52,7 @@ class FitJob:
 
 @dataclass(frozen=True)
 class Fit:
-    """A fitted estimator, when its fit started and ended (seconds since 1970), and on what."""
+    """A fitted estimator, with the start and end of its fit, seconds since 1970, and its engine."""
 
     estimator: Estimator
     started: float
@@ -62,7 +62,7 @@ class Fit:
 
 @dataclass(frozen=True)
 class Failure:
-    """Why there is no fit; and the way to an error that nobody foresaw, else empty."""
+    """The reason why a fit failed, and the traceback of an unexpected error."""
 
     reason: str
     trace: str = ""
@@ -74,16 +74,16 @@ def run_fits(
     """Fit all estimators and yield each when it is fitted.
 
     Args:
-        jobs: Independent of each other.
-        execution: Which executor. ``batched``, and ``auto`` where there is a GPU, trains networks
-            many at once; all else is fitted in processes.
-        label: Names the work in progress lines.
+        jobs: Independent fits.
+        execution: The executor. ``batched``, and ``auto`` if there is a GPU, trains networks in
+            batches; everything else is fitted in processes.
+        label: Name of the work in progress lines.
 
     Yields:
         A job and its result.
 
     Raises:
-        InputError: Some cannot be fitted, after all others were; the message says which.
+        InputError: Some fits failed; it is raised after all others and names the first.
     """
     failures = []
     for job, fit in _attempts(jobs, execution, label):
@@ -95,36 +95,36 @@ def run_fits(
     if failures:
         raise InputError(
             f"{failures[0]} ({len(failures)} failed, the other {len(jobs) - len(failures)} are "
-            "fitted); leave it out of the study, or mend it and start again"
+            "fitted); leave it out of the study, or correct it and start again"
         )
 
 
 def _attempts(
     jobs: Sequence[FitJob], execution: Execution, label: str
 ) -> Iterator[tuple[FitJob, Fit | Failure]]:
-    """Each job with its fit, or with why there is none."""
+    """Each job with its fit or its failure."""
     networks = [job for job in jobs if _is_network(job)]
     if networks:
         from gyro_pipeline.learning import fused, trainings  # noqa: PLC0415 - take PyTorch
 
         device = trainings.batch_device(execution.executor)
         if device is None:
-            fused.available()  # compiled, or said why not, before the workers need it
+            fused.available()  # compiles it, or logs why not, before the workers start
         else:
-            yield from _trained_together(networks, device, label)
+            yield from _train_in_batches(networks, device, label)
             jobs = [job for job in jobs if not _is_network(job)]
     for group, fits in run_jobs(_groups(jobs), _fit_group, execution, label, "fits"):
         yield from zip(group.jobs, fits, strict=True)
 
 
-def _trained_together(
+def _train_in_batches(
     jobs: Sequence[FitJob], device: Any, label: str
 ) -> Iterator[tuple[FitJob, Fit | Failure]]:
-    """Networks that are trained many at once."""
+    """Train networks in batches on a device."""
     from gyro_pipeline.learning.trainings import run_trainings  # noqa: PLC0415 - takes PyTorch
 
     estimators: list[Any] = [job.make() for job in jobs]
-    trainings = [each.job(job.training) for each, job in zip(estimators, jobs, strict=True)]
+    trainings = [e.job(job.training) for e, job in zip(estimators, jobs, strict=True)]
     for number, trained in run_trainings(trainings, device, label):
         if isinstance(trained, Exception):
             yield jobs[number], Failure(str(trained))
@@ -135,7 +135,7 @@ def _trained_together(
 
 @dataclass(frozen=True)
 class _Group:
-    """Jobs of one estimator and recordings, whose windows differ: they share what they work out."""
+    """Jobs that one process fits, since they share intermediate results."""
 
     jobs: Sequence[FitJob]
 
@@ -145,12 +145,12 @@ class _Group:
 
 
 def _groups(jobs: Sequence[FitJob]) -> list[_Group]:
-    """Each seeded job on its own; others together where they learn from the same recordings."""
+    """A group for each seeded job, and one for all other jobs with the same recordings."""
     groups: dict[object, list[FitJob]] = {}
     for job in jobs:
-        alone = estimator_class(job.estimator).seeded
         recordings = job.training.recordings_key
-        key = id(job) if alone else (job.estimator, job.training.device, recordings)
+        seeded = estimator_class(job.estimator).seeded
+        key = id(job) if seeded else (job.estimator, job.training.device, recordings)
         groups.setdefault(key, []).append(job)
     return [_Group(group) for group in groups.values()]
 
@@ -160,17 +160,17 @@ def _fit_group(group: _Group) -> list[Fit | Failure]:
 
 
 def _fit(job: FitJob) -> Fit | Failure:
-    """A fit, or why there is none: others go on."""
+    """Fit an estimator; a failure must not stop the other fits."""
     started = time.time()
     try:
         estimator = job.make().fit(job.training)
     except (InputError, FloatingPointError) as error:
         return Failure(str(error))
-    except Exception as error:  # of a stranger's estimator it may be any
+    except Exception as error:  # a user's estimator may raise any
         return Failure(repr(error), f"\n{traceback.format_exc()}")
     return Fit(estimator, started, time.time(), estimator.engine)
 
 
 def _is_network(job: FitJob) -> bool:
-    """Whether it can be trained in a batch; a subclass may differ in anything."""
+    """Whether a job trains a network in the way of this package, so that it can be batched."""
     return estimator_class(job.estimator).__module__ == f"{__package__}.nn_module"

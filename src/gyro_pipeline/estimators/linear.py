@@ -25,32 +25,31 @@ from gyro_pipeline.physics.recording_model import (
 from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, fit_recording_model
 
 _FLAT = 1e3
-"""Prior standard deviation that tells nothing, deg/s."""
+"""Standard deviation of a flat prior, deg/s."""
 
 WIDE = 5e-3
-"""Standard deviation of the prior of a fallback, deg/s: the Earth's rate and some more."""
+"""Standard deviation of the wide prior of a fallback, deg/s: the Earth's rate and a margin."""
 
 _PENALTIES, _FOLDS = 41, 10
 
-
-_Place = tuple[int, int, int, str, int | None]
+_Key = tuple[int, int, int, str, int | None]
 """Axis, first sample, samples, target and number of the recording."""
 
 
 class _Linear(Estimator):
-    """Weighted sums of the block means of a window, by the axis and the place of the window."""
+    """Weighted sums of the block means of a window; weights depend on axis and start."""
 
     _by_start = True
     _by_recording = False
     """Whether the weights depend on when the window starts, and on which recording it is from."""
-    _memories: ClassVar[tuple[str, ...]] = ("_lines",)
+    _caches: ClassVar[tuple[str, ...]] = ("_lines",)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without the weights that were worked out on the way; they are worked out again."""
-        return {name: {} if name in self._memories else v for name, v in vars(self).items()}
+        """The state without cached weights."""
+        return {name: {} if name in self._caches else v for name, v in vars(self).items()}
 
     def _fit(self, training: TrainingSet) -> None:
-        self._lines: dict[_Place, LinearEstimate] = {}
+        self._lines: dict[_Key, LinearEstimate] = {}
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
         samples = windows.samples
@@ -59,61 +58,61 @@ class _Linear(Estimator):
         shape = len(starts), samples.shape[1]
         number = windows.recording if self._by_recording else None
         lines = [
-            self._remembered(axis, start, samples.shape[-1], windows.target, number)
+            self._cached_line(axis, start, samples.shape[-1], windows.target, number)
             for start in starts.tolist()
             for axis in range(shape[1])
         ]
         weights = np.stack([line.weights for line in lines]).reshape(*shape, -1)
         constants = np.reshape([line.constant for line in lines], shape)
         variance = np.reshape([line.variance for line in lines], shape)
-        sigma = np.sqrt(np.maximum(variance, 0.0))  # of a whole recording it is 0, but for rounding
+        sigma = np.sqrt(np.maximum(variance, 0.0))  # 0 for a whole recording, except rounding
         means = block_means(samples, lines[0].edges)
         return np.sum(means * weights[which], axis=-1) + constants[which], sigma[which]
 
-    def _remembered(self, *place: *_Place) -> LinearEstimate:
-        if place not in self._lines:
-            self._lines[place] = self._line(*place)
-        return self._lines[place]
+    def _cached_line(self, *key: *_Key) -> LinearEstimate:
+        if key not in self._lines:
+            self._lines[key] = self._line(*key)
+        return self._lines[key]
 
     def _line(
         self, axis: int, start: int, size: int, target: str, recording: int | None
     ) -> LinearEstimate:
-        """What is estimated at one place."""
+        """The linear estimate of a window, by axis, start, size, target and recording."""
         raise NotImplementedError
 
 
 class BestLinear(_Linear):
     """The best linear predictor under the fitted noise and prior, axis by axis.
 
-    White noise, bias instability, rate random walk, the turn-on spread and, if asked for, a
-    warm-up of random amplitude are fitted to whole training recordings
+    White noise, bias instability, rate random walk, the turn-on spread and, as an option, a warm-up
+    of random amplitude are fitted to whole training recordings
     (:mod:`gyro_pipeline.physics.reml`). The estimate of either target is its conditional mean
-    given the block means of the window (:mod:`gyro_pipeline.physics.recording_model`), with the
-    uncertainty of what was learned of the prior mean in it. On white noise this is empirical
-    Bayes; sigma holds on coloured noise as well. ``start_s`` matters: give it.
+    given the block means of the window (:mod:`gyro_pipeline.physics.recording_model`), including
+    the uncertainty of the prior mean. On white noise this is empirical Bayes; sigma holds on
+    coloured noise as well. The start of the window, ``start_s``, matters.
 
     The bias is the settled one, without the warm-up and the random walk since power-on.
 
-    For an unseen device the model is fitted to the recordings of all known ones, whose spread is
-    then that from unit to unit. Where fewer than three devices are known, the prior is flat.
+    For an unseen device the model is fitted to the recordings of all known devices, whose spread is
+    that from unit to unit. With fewer than three known devices the prior is flat.
 
-    With a fallback, the prior may be wrong: with a probability of 5 % it is wide on some axes, as
-    of a device that was turned or knocked (:mod:`gyro_pipeline.physics.mixture`). Each window then
-    weighs the estimates under both.
+    With a fallback, the prior is wrong with a probability of 5 %: it is then wide on some axes, as
+    for a device that was turned or knocked (:mod:`gyro_pipeline.physics.mixture`). Each window
+    weighs the estimates under both priors.
 
     Args:
-        warm_up: Whether the sensor warms up; None: if its recordings say so.
+        warm_up: Whether the sensor warms up; None: decided by its recordings.
         noise: ``"reml"``: N, B and K fitted together with the prior; ``"allan"``: from the Allan
-            fit, which does not know of warm-up.
-        history: Whether the prior of a recording follows from the device's calibrations before
-            it, in their order (:mod:`gyro_pipeline.physics.history`). For a bias that drifts from
-            one recording to the next.
+            fit, which ignores a warm-up.
+        history: Whether the prior of a recording follows from the earlier calibrations of the
+            device, in their order (:mod:`gyro_pipeline.physics.history`), for a bias that drifts
+            from one recording to the next.
         fallback: Whether the prior may be wrong; not together with ``history``.
     """
 
     uses_prior = True
     fewest_recordings = FEWEST_RECORDINGS
-    _memories = ("_lines", "_priors", "_windows", "_others")
+    _caches = ("_lines", "_priors", "_windows", "_others")
 
     def __init__(
         self,
@@ -126,7 +125,7 @@ class BestLinear(_Linear):
             raise InputError("fallback: expected no history; a prior that follows it is not tested")
         if noise not in ("reml", "allan"):
             raise InputError(f"noise: expected 'reml' or 'allan', got {noise!r}")
-        self.recommended = noise == "reml"  # the Allan fit knows nothing of warm-up
+        self.recommended = noise == "reml"  # the Allan fit ignores a warm-up
         self._warm_up, self._allan, self._by_recording = warm_up, noise == "allan", history
         self._fallback = fallback
 
@@ -138,19 +137,21 @@ class BestLinear(_Linear):
             fit_recording_model(rates, training.rate_hz, self._warm_up, figures)
             for rates, figures in zip(axes, noise, strict=True)
         ]
-        """What was fitted, one for each axis."""
+        """The fitted model of each axis."""
         self._histories: list[BiasHistory] = []
         if not training.seen:
-            self.models = [_of_unseen(model, len(training.known)) for model in self.models]
+            self.models = [_of_unseen(model, len(training.known_imus)) for model in self.models]
         elif self._by_recording:
             numbers, labels = training.labels
-            of_axes = zip(labels.T, self.models, strict=True)
-            self._histories = [BiasHistory.fit(numbers, *one) for one in of_axes]
+            self._histories = [
+                BiasHistory.fit(numbers, means, model)
+                for means, model in zip(labels.T, self.models, strict=True)
+            ]
         self._windows: dict[tuple[int, int, int, str], WindowModel] = {}
         self._forget()
 
     def _forget(self) -> None:
-        """Forget what was worked out from the priors."""
+        """Clear what was computed from the priors."""
         self._lines = {}
         self._priors: dict[tuple[int, int | None], RecordingModel] = {}
         self._others: dict[float, BestLinear] = {}
@@ -161,22 +162,18 @@ class BestLinear(_Linear):
         """See :meth:`Estimator.with_calibrations`."""
         if not self._histories:
             return self
-        told = copy.copy(self)
-        of_axes = zip(self._histories, labels.T, strict=True)
-        told._histories = [history.extended(numbers, own) for history, own in of_axes]
-        told._forget()
-        return told
+        updated = copy.copy(self)
+        pairs = zip(self._histories, labels.T, strict=True)
+        updated._histories = [history.extended(numbers, means) for history, means in pairs]
+        updated._forget()
+        return updated
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
         if not self._fallback:
             return super()._estimate(windows)
         narrow, wide, alone = (
-            tuple(map(np.asarray, self._widened(spread)._estimate(asked)))
-            for spread, asked in (
-                (0.0, windows),
-                (WIDE, windows),
-                (_FLAT, replace(windows, target=BIAS)),
-            )
+            tuple(map(np.asarray, self._widened(spread)._estimate(replace(windows, target=target))))
+            for spread, target in ((0.0, windows.target), (WIDE, windows.target), (_FLAT, BIAS))
         )
         means = np.array([model.mean[0] for model in self.models])
         variances = np.array([model.covariance[0, 0] for model in self.models])
@@ -189,12 +186,12 @@ class BestLinear(_Linear):
         return biases, np.sqrt((1 - weight) * squares[0] + weight * squares[1])
 
     def _widened(self, spread: float) -> "BestLinear":
-        """The estimator without fallback, of a prior with a further spread, deg/s."""
+        """The estimator without fallback, whose prior has an additional spread, deg/s."""
         if spread not in self._others:
             other = copy.copy(self)
             other._fallback = False
-            other.models = [_with_further(model, spread) for model in self.models]
-            other._windows = self._windows  # which do not depend on the prior
+            other.models = [_with_spread(model, spread) for model in self.models]
+            other._windows = self._windows  # they do not depend on the prior
             other._forget()
             self._others[spread] = other
         return self._others[spread]
@@ -210,7 +207,7 @@ class BestLinear(_Linear):
         return self._windows[key].best(prior.mean, prior.covariance)
 
     def _prior(self, axis: int, recording: int | None) -> RecordingModel:
-        """What is known before a window of this recording is seen."""
+        """The prior of a recording, from the calibrations before it if there is a history."""
         if not self._histories:
             return self.models[axis]
         if (axis, recording) not in self._priors:
@@ -220,15 +217,15 @@ class BestLinear(_Linear):
 
 
 def _of_unseen(model: RecordingModel, devices: int) -> RecordingModel:
-    """The model of a new device, from one fitted to the recordings of so many others."""
+    """The model of a new device, from a model fitted to the recordings of several devices."""
     covariance = model.covariance * (1 + 1 / devices)
     if devices < FEWEST_RECORDINGS:
         covariance[0, 0] = _FLAT**2
     return replace(model, covariance=covariance)
 
 
-def _with_further(model: RecordingModel, spread: float) -> RecordingModel:
-    """A model whose bias has a further spread, deg/s."""
+def _with_spread(model: RecordingModel, spread: float) -> RecordingModel:
+    """A model whose bias has an additional spread, deg/s."""
     covariance = model.covariance.copy()
     covariance[0, 0] += spread**2
     return replace(model, covariance=covariance)
@@ -237,18 +234,18 @@ def _with_further(model: RecordingModel, spread: float) -> RecordingModel:
 class Ridge(_Linear):
     """Ridge regression of the target on the block means of the window.
 
-    It knows no model: one regression per axis, from the training windows, towards the training
-    mean. The penalty is the one with the least error on left-out training recordings. The bias is
-    learned from the mean of the samples outside the window. It has no sigma.
+    It has no noise model: there is a regression per axis on the training windows, which shrinks
+    towards the training mean. The penalty has the least error on left-out training recordings. The
+    bias is learned from the mean of the samples outside the window. There is no sigma.
 
     Args:
-        same_time: One regression for each place of the window, from training windows of the same
-            time after power-on, which a sensor that warms up needs. A window at another place gets
-            that of the nearest one.
+        same_time: Whether there is a regression for each start of a window, on training windows of
+            the same time after power-on, which a sensor that warms up needs. A window with another
+            start uses the nearest one.
     """
 
     uses_prior = True
-    fewest_recordings = 2  # one of them is left out to choose the penalty
+    fewest_recordings = 2  # one is left out to choose the penalty
 
     def __init__(self, same_time: bool = False) -> None:
         self._by_start = same_time
@@ -257,13 +254,13 @@ class Ridge(_Linear):
         super()._fit(training)
         size, samples = training.size, training.real.sizes["sample"]
         edges = block_edges(size, round(BLOCK_S * self._rate_hz))
-        used = zip(training.rates, training.starts, strict=True)
-        blocks = [block_means(windows_at(rates, size, starts), edges) for rates, starts in used]
+        pairs = zip(training.rates, training.starts, strict=True)
+        blocks = [block_means(windows_at(rates, size, starts), edges) for rates, starts in pairs]
         inputs = np.concatenate(blocks, axis=1)  # (axes, windows, blocks)
         counts = list(map(len, training.starts))
         whole = np.repeat(training.labels[1], counts, axis=0).T  # (axes, windows)
         rest = (whole * samples - inputs @ np.diff(edges)) / max(samples - size, 1)
-        aims = {RECORDING_MEAN: whole, BIAS: rest if size < samples else whole}
+        targets = {RECORDING_MEAN: whole, BIAS: rest if size < samples else whole}
         groups, starts = np.repeat(np.arange(len(counts)), counts), np.concatenate(training.starts)
         self._size = size
         self._fitted: dict[tuple[int, str, int], LinearEstimate] = {}
@@ -271,9 +268,11 @@ class Ridge(_Linear):
             chosen = starts == start if self._by_start else starts >= 0
             if len(np.unique(groups[chosen])) < self.fewest_recordings:
                 continue
-            for axis, (target, aim) in product(range(len(inputs)), aims.items()):
-                given = inputs[axis, chosen], aim[axis, chosen], groups[chosen]
-                line = LinearEstimate(edges, *ridge_regression(*given), np.nan)
+            for axis, (target, values) in product(range(len(inputs)), targets.items()):
+                weights, constant = ridge_regression(
+                    inputs[axis, chosen], values[axis, chosen], groups[chosen]
+                )
+                line = LinearEstimate(edges, weights, constant, np.nan)
                 self._fitted[axis, target, start] = line
         if not self._fitted:
             raise InputError("expected two training recordings with windows at the same time")
@@ -285,41 +284,41 @@ class Ridge(_Linear):
     def _line(
         self, axis: int, start: int, size: int, target: str, recording: int | None
     ) -> LinearEstimate:
-        starts = [first for *of, first in self._fitted if of == [axis, target]]
-        return self._fitted[axis, target, min(starts, key=lambda first: abs(first - start))]
+        starts = [s for *key, s in self._fitted if key == [axis, target]]
+        return self._fitted[axis, target, min(starts, key=lambda s: abs(s - start))]
 
 
 def ridge_regression(
-    inputs: NDArray[np.float64], aims: NDArray[np.float64], groups: NDArray[np.integer]
+    inputs: NDArray[np.float64], targets: NDArray[np.float64], groups: NDArray[np.integer]
 ) -> tuple[NDArray[np.float64], float]:
-    """Ridge regression with the penalty that does best on left-out groups.
+    """Ridge regression with the penalty that has the least error on left-out groups.
 
     Args:
         inputs: (n, m).
-        aims: (n,).
-        groups: (n,); the windows of a group are left out together.
+        targets: (n,).
+        groups: Group of each window, (n,); windows of a group are left out together.
 
     Returns:
         Weights (m,), and the constant.
     """
-    scale = inputs.var(axis=0).sum() * aims.size
+    scale = inputs.var(axis=0).sum() * targets.size
     penalties = scale * np.geomspace(1e-4, 1e4, _PENALTIES)
-    there, numbers = np.unique(groups, return_inverse=True)
-    parts = numbers % min(len(there), _FOLDS)
+    distinct, numbers = np.unique(groups, return_inverse=True)
+    parts = numbers % min(len(distinct), _FOLDS)
     errors = np.zeros(_PENALTIES)
     for part in np.unique(parts):
         left, rest = parts == part, parts != part
-        weights, constants = _ridges(inputs[rest], aims[rest], penalties)
-        off = inputs[left] @ weights.T + constants - aims[left][..., None]
+        weights, constants = _ridges(inputs[rest], targets[rest], penalties)
+        off = inputs[left] @ weights.T + constants - targets[left][..., None]
         errors += np.sum(off**2, axis=0)
-    weights, constants = _ridges(inputs, aims, penalties[[np.argmin(errors)]])
+    weights, constants = _ridges(inputs, targets, penalties[[np.argmin(errors)]])
     return weights[0], float(constants[0])
 
 
 def _ridges(
     x: NDArray[np.float64], y: NDArray[np.float64], penalties: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Weights (penalties, m) and constants (penalties,)."""
+    """Ridge regressions: weights (penalties, m) and constants (penalties,)."""
     middle, level = x.mean(axis=0), y.mean()
     squares, axes = np.linalg.eigh((x - middle).T @ (x - middle))
     along = axes.T @ (x - middle).T @ (y - level)

@@ -1,4 +1,4 @@
-"""A network, any ``nn.Module`` of PyTorch, as an estimator."""
+"""A network, any PyTorch ``nn.Module``, as an estimator."""
 
 import copy
 from collections.abc import Hashable, Mapping
@@ -8,15 +8,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from gyro_pipeline.conventions import (
-    ALL,
-    BEST,
-    LAST,
-    ORIGIN_REAL,
-    TRAIN,
-    VALIDATION,
-    InputError,
-)
+from gyro_pipeline.conventions import ALL, BEST, LAST, ORIGIN_REAL, TRAIN, VALIDATION, InputError
 from gyro_pipeline.estimators.base import Estimator, Windows
 from gyro_pipeline.estimators.training import TrainingSet
 from gyro_pipeline.learning.design import Design, network_class, options_of
@@ -26,19 +18,19 @@ from gyro_pipeline.parameters import Training
 
 
 class ModuleEstimator(Estimator):
-    """A network trained as the paper's is (section III-D); it has no sigma.
+    """A network trained in the way of the paper (section III-D); it has no sigma.
 
-    It gives the same estimate for every target. Where the training set names IMUs side by side
-    (method 1) they are one input, and a window is used if all of them have it; else every IMU is a
-    device of its own. The device validates, with its windows of that role, and the others do not.
+    The estimate is the same for every target. If the training set has IMUs side by side (method 1)
+    they are one input, and a window is used if all of them have it; else every IMU is a device.
+    Only the windows of the estimated device validate.
 
     Args:
         network: ``package.module:Class``, see :class:`gyro_pipeline.learning.design.Design`.
-        training: Schedule, and the sizes of a network whose options have no defaults.
-        seed: Of the initial weights and the order of the examples.
+        training: Schedule, and sizes of the network for options without a default.
+        seed: Seed of the initial weights and of the order of examples.
         shuffled: Whether biases are permuted between training recordings, by the same seed: a leak
             detector, see :func:`gyro_pipeline.learning.examples.with_shuffled_labels`.
-        **options: Of the network.
+        **options: Options of the network.
 
     Raises:
         InputError: The network has no such option.
@@ -47,7 +39,7 @@ class ModuleEstimator(Estimator):
     uses = ALL
     seeded = True
     side_by_side = True
-    uses_prior = True  # the centres, and what it learned of the biases' spread
+    uses_prior = True  # the centres, and the learned spread of biases
 
     def __init__(
         self, network: str, training: Training, seed: int, shuffled: bool = False, **options: Any
@@ -60,12 +52,12 @@ class ModuleEstimator(Estimator):
         self._network: StoredNetwork | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without the network that the weights were put into."""
+        """The state without the built network."""
         return vars(self) | {"_network": None}
 
     @property
     def source(self) -> type:
-        """The network's class, whose file is stored with it where it is not of this package."""
+        """The class of the network, whose source file is stored if it is a user's."""
         return network_class(self._path)
 
     @property
@@ -75,10 +67,10 @@ class ModuleEstimator(Estimator):
         return epoch
 
     def check(self, training: TrainingSet) -> None:
-        """See :meth:`Estimator.check`; recordings that validate do not train it.
+        """See :meth:`Estimator.check`; validation recordings do not count.
 
         Raises:
-            InputError: No training recording of the device, or too few to learn from.
+            InputError: The device has no or too few training recordings.
         """
         devices = _devices(training, TRAIN)
         if not devices or training.device not in devices[0].imus:
@@ -95,18 +87,18 @@ class ModuleEstimator(Estimator):
         return self.job(training).work
 
     def job(self, training: TrainingSet) -> TrainingJob:
-        """The training itself; seeds of one training set share their examples."""
+        """The training job; jobs that differ only in their seeds share examples."""
         devices = _devices(training, TRAIN)
-        watched = _devices(training, VALIDATION, only_device=True)
+        validation = _devices(training, VALIDATION, only_device=True)
         cell: Hashable = training.key
         if self._shuffled:
             generator = np.random.default_rng(self._seed)
             devices = [with_shuffled_labels(device, generator) for device in devices]
-            cell = training.key, self._seed  # a seed has labels of its own
+            cell = training.key, self._seed  # labels depend on the seed
         return TrainingJob(
             design=self._design(devices[0], training),
             devices=devices,
-            validation=watched[0] if watched else None,
+            validation=validation[0] if validation else None,
             settings=self._settings,
             seed=self._seed,
             cell=cell,
@@ -117,12 +109,9 @@ class ModuleEstimator(Estimator):
         return Design(self._path, device.biases.shape[1], training.size, options)
 
     def trained(self, network: TrainedNetwork) -> Self:
-        """Take over what a training left."""
-        self._artifact, self.history, self.engine = (
-            network.artifact,
-            network.history,
-            network.engine,
-        )
+        """Take over the result of a training."""
+        self._artifact, self.history = network.artifact, network.history
+        self.engine = network.engine
         return self
 
     def variants(self) -> Mapping[str, Estimator]:
@@ -144,7 +133,7 @@ class ModuleEstimator(Estimator):
 
 
 def _devices(training: TrainingSet, role: str, only_device: bool = False) -> list[Device]:
-    """Each input with windows of a role: real IMUs before virtual ones, the device first of all."""
+    """All inputs with windows of a role: the device, other real IMUs, virtual IMUs."""
     windows = training.windows[(training.windows.role == role).to_numpy()]
     inputs = windows[["origin", "imu"]].drop_duplicates().to_numpy().tolist()
     together = training.side_by_side or (training.device,)
@@ -161,10 +150,10 @@ def _devices(training: TrainingSet, role: str, only_device: bool = False) -> lis
 
 
 def _windows_of_all(windows: pd.DataFrame, imus: tuple[int, ...]) -> pd.DataFrame:
-    """The windows that all of these real IMUs have, once."""
+    """The windows that all of the given real IMUs have."""
     real = (windows.origin == ORIGIN_REAL) & windows.imu.isin(imus)
-    places = windows.loc[real.to_numpy(), ["recording", "start"]]
-    shared = places.groupby(["recording", "start"]).size()
+    rows = windows.loc[real.to_numpy(), ["recording", "start"]]
+    shared = rows.groupby(["recording", "start"]).size()
     return shared[(shared == len(imus)).to_numpy()].index.to_frame(index=False)
 
 

@@ -1,4 +1,4 @@
-"""The model of a run as MLflow serves it: ``loader_module`` of a pyfunc model.
+"""The model of a run for MLflow: the ``loader_module`` of a pyfunc model.
 
 ``mlflow.pyfunc.load_model(uri).predict(windows)`` takes a float64 array of windows (n, gyroscopes,
 samples) in deg/s. Its parameters are ``target``, ``"bias"`` or ``"recording_mean"``, and
@@ -30,15 +30,15 @@ class ServedEstimator:
 
         Args:
             model_input: (n, gyroscopes, samples), deg/s.
-            params: ``target`` and ``start_s``.
+            params: ``target`` and ``start_s``, both optional.
 
         Returns:
             ``bias_dps`` and ``sigma_dps``, each (n, gyroscopes), deg/s; NaN where the estimator
             gives no standard deviation.
         """
-        asked = {"target": BIAS, "start_s": [0.0]} | dict(params or {})
+        options = {"target": BIAS, "start_s": [0.0]} | dict(params or {})
         bias, sigma = self.estimator.estimate(
-            np.asarray(model_input), target=asked["target"], start_s=asked["start_s"]
+            np.asarray(model_input), target=options["target"], start_s=options["start_s"]
         )
         return {"bias_dps": np.array(bias), "sigma_dps": np.array(sigma)}
 

@@ -1,4 +1,4 @@
-"""Estimators that know the device's past: a constant, the last calibration, empirical Bayes."""
+"""Estimators with a prior from past recordings: constant, last calibration, empirical Bayes."""
 
 import copy
 
@@ -15,7 +15,7 @@ from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, guarded_spread
 class TrainingMean(Estimator):
     """The mean of the training recordings' means: a constant that ignores the window.
 
-    For an unseen device it is the mean of the others, which is worth nothing; that is the point.
+    For an unseen device it is the mean of the other devices, which is useless, as it should be.
     """
 
     uses_prior = True
@@ -25,22 +25,21 @@ class TrainingMean(Estimator):
         self._labels = training.labels[1]
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
-        biases, of_estimate = self.constant(windows.recording)
+        biases, share = self.constant(windows.recording)
         scatter = self._labels.var(axis=0, ddof=1) if len(self._labels) > 1 else np.nan
-        own = self._noise**2 / self._recording_s if windows.target == BIAS else 0.0
-        return biases, np.sqrt(np.maximum(scatter - own, 0.0) + of_estimate * scatter)
+        averaging = self._noise**2 / self._recording_s if windows.target == BIAS else 0.0
+        return biases, np.sqrt(np.maximum(scatter - averaging, 0.0) + share * scatter)
 
     def constant(self, recording: int | None) -> tuple[NDArray[np.float64], float]:
-        """The estimate (3,), and its own variance in units of the scatter of the labels."""
+        """The estimate (3,), deg/s, and its variance in units of the scatter of the labels."""
         return self._labels.mean(axis=0), 1 / len(self._labels)
 
 
 class LastCalibration(TrainingMean):
-    """The mean of the device's preceding recording: the calibration it has stored.
+    """The mean of the device's preceding recording: its last stored calibration.
 
-    Before the first one nothing is stored, and it is the training mean. Sigma assumes that
-    power-ons are independent. A device that was never seen has no calibration: the training mean of
-    the others.
+    Without an earlier recording, and for an unseen device, it is the training mean. Sigma assumes
+    that power-ons are independent.
     """
 
     def _fit(self, training: TrainingSet) -> None:
@@ -51,10 +50,10 @@ class LastCalibration(TrainingMean):
         self, numbers: NDArray[np.integer], labels: NDArray[np.float64]
     ) -> Estimator:
         """See :meth:`Estimator.with_calibrations`."""
-        told = copy.copy(self)
+        updated = copy.copy(self)
         if self._calibrations is not None:
-            told._calibrations = merged_calibrations(*self._calibrations, numbers, labels)
-        return told
+            updated._calibrations = merged_calibrations(*self._calibrations, numbers, labels)
+        return updated
 
     def constant(self, recording: int | None) -> tuple[NDArray[np.float64], float]:
         """See :meth:`TrainingMean.constant`."""
@@ -71,17 +70,17 @@ class EmpiricalBayes(Estimator):
 
     The bias of a power-on is Normal(mu, tau^2) and the noise white. With N from the Allan fit, mu
     the mean of the n training labels and P = tau^2 + (tau^2 + N^2 / T) / n, the prior variance of
-    the next bias including what is not known of mu,
+    the next bias including the uncertainty of mu,
 
         bias = mu + beta (m - mu),    beta = P / (P + N^2 / T0)
 
     and the mean of the recording is r m + (1 - r) times that, r = T0 / T (Efron & Morris 1973; see
-    :mod:`gyro_pipeline.physics.ceiling`). Few recordings can show a tau of 0 by chance, and
-    everything would be pulled to mu: tau has a weak prior (:mod:`gyro_pipeline.physics.reml`).
-    Sigma is too small where noise is not white.
+    :mod:`gyro_pipeline.physics.ceiling`). With few recordings tau may be 0 by chance, and every
+    estimate would be mu; therefore tau has a weak prior (:mod:`gyro_pipeline.physics.reml`). Sigma
+    is too small where noise is not white.
 
-    An unseen device has the mean and spread of the known devices' means as its prior. Where fewer
-    than three labels are known, it is flat and the estimate is the running mean.
+    The prior of an unseen device is the mean and spread of the means of the known devices. With
+    fewer than three labels the prior is flat, and the estimate is the running mean.
     """
 
     recommended = True
@@ -95,17 +94,14 @@ class EmpiricalBayes(Estimator):
         self._prior = scatter + (scatter + averaging) / len(labels)
 
     def _labels(self, training: TrainingSet) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Labels (n, 3) of the prior and their averaging noise (3,): recordings or devices."""
+        """Labels of the prior (n, 3), recordings or devices, and their averaging variance (3,)."""
         if training.seen:
             return training.labels[1], self._noise**2 / self._recording_s
-        means = np.stack([one.means.mean(axis=0) for one in training.known])
+        means = np.stack([imu.means.mean(axis=0) for imu in training.known_imus])
         return means, np.zeros(len(self._noise))
 
     def _spread(
-        self,
-        training: TrainingSet,
-        labels: NDArray[np.float64],
-        averaging: NDArray[np.float64],
+        self, training: TrainingSet, labels: NDArray[np.float64], averaging: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """The tau of each axis, (3,)."""
         if len(labels) < FEWEST_RECORDINGS:
@@ -121,34 +117,32 @@ class EmpiricalBayes(Estimator):
         beta = 1 / (1 + averaging / self._prior)
         r = window_s / self._recording_s if windows.target == RECORDING_MEAN else 0.0
         variance = (1 - r) ** 2 * beta * averaging
-        if windows.target == RECORDING_MEAN:  # and what the rest is off from the bias
+        if windows.target == RECORDING_MEAN:  # noise of the samples outside the window
             variance += (1 - r) * self._noise**2 / self._recording_s
         biases = r * means + (1 - r) * (self._mean + beta * (means - self._mean))
         return biases, np.sqrt(variance)
 
 
 class PooledEmpiricalBayes(EmpiricalBayes):
-    """Empirical Bayes with one tau for all axes and IMUs; mu is always the axis' own.
+    """Empirical Bayes with the same tau for all axes and IMUs; each axis has its mu.
 
-    Better where they are alike, worse where they are not, as on the public Memsense recordings.
+    It is better where they are alike, and worse where they are not, as on the public Memsense
+    recordings.
     """
 
     uses = REAL
     recommended = False
 
     def _spread(
-        self,
-        training: TrainingSet,
-        labels: NDArray[np.float64],
-        averaging: NDArray[np.float64],
+        self, training: TrainingSet, labels: NDArray[np.float64], averaging: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         if not training.seen:
             return super()._spread(training, labels, averaging)
         scatter, freedom, noise = [], [], []
-        for one in training.imus.values():
-            white = np.array([figures.white for figures in fitted_noise([one])])
-            scatter.append(one.means.var(axis=0) * len(one.means))
-            freedom.append(np.full(len(white), len(one.means) - 1))
+        for imu in training.imus.values():
+            white = np.array([figures.white for figures in fitted_noise([imu])])
+            scatter.append(imu.means.var(axis=0) * len(imu.means))
+            freedom.append(np.full(len(white), len(imu.means) - 1))
             noise.append(white**2 / self._recording_s)
         if np.sum(freedom) < FEWEST_RECORDINGS - 1:
             return np.full(averaging.shape, np.inf)

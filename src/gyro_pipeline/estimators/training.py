@@ -1,4 +1,4 @@
-"""What estimators learn from: windows and recordings, and what several of them learn alike."""
+"""Training sets: windows and recordings to learn from, and figures that estimators share."""
 
 import hashlib
 from collections import OrderedDict
@@ -30,31 +30,31 @@ from gyro_pipeline.physics.allan import (
 )
 from gyro_pipeline.physics.bias import fill_masked
 
-_REMEMBERED_BYTES = 512 << 20
-"""Of recordings read from files, in each process."""
+_CACHE_BYTES = 512 << 20
+"""Limit of the recordings from files that are cached in each process."""
 
 Imu = tuple[str, int]
 """Origin and number of an IMU."""
 
 
 class TrainingSet:
-    """Windows to learn from, of real and virtual recordings, and the device to be estimated.
+    """Windows of real and virtual recordings to learn from, and the device to be estimated.
 
-    Nothing is read before it is asked for. Pickled, file-backed recordings are references.
+    Samples are read when they are needed. In a pickle, file-backed recordings are references.
 
     Args:
         real: ``angular_rate``, ``samples`` and ``recording_mean`` (imu, recording, axis), as in
-            :mod:`gyro_pipeline.conventions`, all of one length; may be backed by a file; not to be
-            changed afterwards.
-        virtual: The same of virtual IMUs, where there are windows of them.
+            :mod:`gyro_pipeline.conventions`, all of one length; may be backed by a file; must not
+            be changed afterwards.
+        virtual: Recordings of virtual IMUs, if there are windows of them.
         windows: Rows ``role`` (train or validation), ``origin, imu, recording, start``.
         size: Samples of a window.
-        device: The IMU whose windows will be seen. If none of its windows trains, or it is
-            UNSEEN, it is an unseen one, and the others tell what devices are like.
-        side_by_side: IMUs whose windows are seen together (method 1), the device first.
+        device: The IMU whose windows will be estimated. It is unseen if it is UNSEEN or none of
+            its windows trains; then estimators learn about devices from the others.
+        side_by_side: IMUs whose windows are one input (method 1), the device first.
 
     Attributes:
-        windows: Sorted: real before virtual ones, then by IMU, the device first, by recording and
+        windows: Rows sorted by origin, real first, by IMU, the device first, by recording and
             start.
         rate_hz: Samples per second.
         recording_s: T, seconds.
@@ -77,102 +77,101 @@ class TrainingSet:
             raise InputError("windows: some are of virtual gyroscopes, but there are none")
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without what was read and worked out."""
-        worked_out = ("imus", "noise_figures", "key")
-        return {name: value for name, value in vars(self).items() if name not in worked_out}
+        """The state without cached values."""
+        cached = ("imus", "noise_figures", "key")
+        return {name: value for name, value in vars(self).items() if name not in cached}
 
     def part(self, uses: str) -> "TrainingSet":
         """The part that an estimator uses.
 
         Args:
-            uses: NOTHING; OWN, the device's own windows, or those of all real IMUs where it is an
-                unseen one; REAL, those of all real IMUs; or ALL.
+            uses: NOTHING; OWN, the windows of the device, or of all real IMUs if it is unseen;
+                REAL, the windows of all real IMUs; or ALL.
         """
         if uses not in (NOTHING, OWN, REAL, ALL):
             raise InputError(f"uses: expected {NOTHING}, {OWN}, {REAL} or {ALL}, got {uses!r}")
-        of_real = (self.windows.origin == ORIGIN_REAL).to_numpy()
-        own = (self.windows.imu == self.device).to_numpy() if self.seen else True
-        kept = {NOTHING: of_real & False, OWN: of_real & own, REAL: of_real}.get(uses)
-        if kept is None or kept.all():
+        real = (self.windows.origin == ORIGIN_REAL).to_numpy()
+        device = (self.windows.imu == self.device).to_numpy() if self.seen else True
+        rows = {NOTHING: real & False, OWN: real & device, REAL: real}.get(uses)
+        if rows is None or rows.all():
             return self
-        virtual = self.virtual if uses == ALL else None
-        given = self.windows[kept], self.size, self.device, self.side_by_side
-        return TrainingSet(self.real, virtual, *given)
+        settings = self.windows[rows], self.size, self.device, self.side_by_side
+        return TrainingSet(self.real, None, *settings)
 
     @cached_property
     def key(self) -> str:
-        """Equal for training sets of the same windows of the same datasets in this process."""
+        """A key that is equal for the same windows of the same datasets in this process."""
         rows = pd.util.hash_pandas_object(self.windows, index=False).to_numpy()
         data = id(self.real), id(self.virtual), self.size, self.device, self.side_by_side
         return hashlib.sha256(rows.tobytes() + repr(data).encode()).hexdigest()
 
     @property
     def recordings_key(self) -> tuple[Hashable, ...]:
-        """Equal for training sets of the same recordings, whatever their windows."""
-        places = self.windows[["origin", "imu", "recording"]].drop_duplicates()
-        return (id(self.real), id(self.virtual), *places.itertuples(index=False, name=None))
+        """A key that is equal for the same recordings, whatever their windows."""
+        recordings = self.windows[["origin", "imu", "recording"]].drop_duplicates()
+        return (id(self.real), id(self.virtual), *recordings.itertuples(index=False, name=None))
 
     @property
     def seen(self) -> bool:
-        """Whether the device is among those that train."""
-        own = (self.windows.imu == self.device) & (self.windows.origin == ORIGIN_REAL)
-        return bool(own.any())
+        """Whether the device has windows in the training set."""
+        rows = (self.windows.imu == self.device) & (self.windows.origin == ORIGIN_REAL)
+        return bool(rows.any())
 
     @cached_property
     def imus(self) -> dict[Imu, "ImuRecordings"]:
-        """All that train or validate: real before virtual ones, the device first."""
-        found = {}
+        """All IMUs that train or validate, the device first, then real before virtual ones."""
+        imus = {}
         for origin, imu in self.windows[["origin", "imu"]].drop_duplicates().to_numpy().tolist():
             recordings = self.real if origin == ORIGIN_REAL else self.virtual
             assert recordings is not None
             rows = self.windows[(self.windows.origin == origin) & (self.windows.imu == imu)]
-            found[origin, imu] = ImuRecordings(recordings, imu, rows)
-        return found
+            imus[origin, imu] = ImuRecordings(recordings, imu, rows)
+        return imus
 
     @property
-    def known(self) -> list["ImuRecordings"]:
+    def known_imus(self) -> list["ImuRecordings"]:
         """IMUs to learn about the device from: itself, or all real ones if it is unseen."""
         if self.seen:
             return [self.imus[ORIGIN_REAL, self.device]]
-        return [one for (origin, _), one in self.imus.items() if origin == ORIGIN_REAL]
+        return [imu for (origin, _), imu in self.imus.items() if origin == ORIGIN_REAL]
 
     def recordings(self, role: str | None = None) -> int:
-        """How many recordings the known IMUs have: all, or those with windows of a role."""
+        """Number of recordings of the known IMUs: all, or those with windows of a role."""
         real = self.windows.origin == ORIGIN_REAL
-        own = self.windows.imu == self.device if self.seen else True
-        chosen = self.windows[real & own & (True if role is None else self.windows.role == role)]
+        device = self.windows.imu == self.device if self.seen else True
+        chosen = self.windows[real & device & (True if role is None else self.windows.role == role)]
         return len(chosen[["imu", "recording"]].drop_duplicates())
 
     @property
     def samples(self) -> int:
-        """Samples of all recordings, of three gyroscopes."""
-        places = self.windows[["origin", "imu", "recording"]].drop_duplicates()
-        return len(places) * self.real.sizes["sample"]
+        """Number of samples, of three gyroscopes, in all recordings."""
+        recordings = self.windows[["origin", "imu", "recording"]].drop_duplicates()
+        return len(recordings) * self.real.sizes["sample"]
 
     @property
     def rates(self) -> NDArray[np.floating]:
         """Samples of all recordings of the known IMUs, (recordings, axes, samples), deg/s.
 
-        Masked ones are the mean of the recording.
+        A masked sample is the mean of the recording.
         """
-        rates = [one.rates for one in self.known]
+        rates = [imu.rates for imu in self.known_imus]
         return rates[0] if len(rates) == 1 else np.concatenate(rates)
 
     @property
     def starts(self) -> list[NDArray[np.integer]]:
-        """First samples of the windows of each of these recordings."""
-        return [starts for one in self.known for starts in one.starts]
+        """First samples of the windows of each recording of the known IMUs."""
+        return [starts for imu in self.known_imus for starts in imu.starts]
 
     @property
     def labels(self) -> tuple[NDArray[np.integer], NDArray[np.float64]]:
-        """Numbers (n,), of each known IMU in order, and means (n, axes), deg/s, of recordings."""
-        numbers = np.concatenate([one.numbers for one in self.known])
-        return numbers, np.concatenate([one.means for one in self.known])
+        """Numbers (n,) and means (n, axes), deg/s, of the recordings of the known IMUs in order."""
+        numbers = np.concatenate([imu.numbers for imu in self.known_imus])
+        return numbers, np.concatenate([imu.means for imu in self.known_imus])
 
     @cached_property
     def noise_figures(self) -> list[NoiseFigures]:
-        """N, B and K of each axis, from the Allan variance of all recordings."""
-        return fitted_noise(self.known)
+        """N, B and K of each axis, from the Allan variances of all recordings."""
+        return fitted_noise(self.known_imus)
 
     @property
     def white_noise(self) -> NDArray[np.float64]:
@@ -181,19 +180,19 @@ class TrainingSet:
 
 
 class ImuRecordings:
-    """Recordings of one IMU that has windows in a training set.
+    """Recordings of an IMU that has windows in a training set.
 
-    What is read of a file, and what is worked out of single recordings, is remembered in this
-    process, so that the windows and folds of a study share it.
+    Samples from files and figures of single recordings are cached in this process, so that the
+    windows and folds of a study share them.
 
     Args:
-        recordings: Of all IMUs.
-        imu: Which.
-        windows: Its rows of the windows table, sorted.
+        recordings: Recordings of all IMUs.
+        imu: Number of the IMU.
+        windows: Rows of the IMU in the windows table, sorted.
 
     Attributes:
-        numbers: Of its recordings, (n,), increasing.
-        starts: First samples of the windows of each.
+        numbers: Numbers of the recordings, (n,), increasing.
+        starts: First samples of the windows of each recording.
     """
 
     def __init__(self, recordings: xr.Dataset, imu: int, windows: pd.DataFrame) -> None:
@@ -205,60 +204,60 @@ class ImuRecordings:
         self.sample_count = int(recordings.sizes["sample"])
         in_file = not recordings.angular_rate.variable._in_memory
         self._from_file = in_file and "data_hash" in recordings.attrs
-        self._memory = _OF_FILES if self._from_file else _Memory()
+        self._cache = _FILE_CACHE if self._from_file else _ArrayCache()
 
     @property
     def rates(self) -> NDArray[np.floating]:
-        """Samples, (recordings, axes, samples), deg/s; masked ones are the recording's mean."""
+        """Samples, (recordings, axes, samples), deg/s; a masked one is the recording's mean."""
         return fill_masked(np.stack(self._read()))
 
     @property
     def means(self) -> NDArray[np.float64]:
-        """Of the recordings, (n, axes), deg/s."""
-        return np.stack(self._worked_out("means", _mean))
+        """Means of the recordings, (n, axes), deg/s."""
+        return np.stack(self._cached("means", _mean))
 
     @property
     def variances(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Allan variances and their counts of differences, (recordings, axes, times)."""
-        both = np.stack(self._worked_out("variances", self._allan))
-        return both[:, 0], both[:, 1].astype(np.int64)
+        figures = np.stack(self._cached("variances", self._allan))
+        return figures[:, 0], figures[:, 1].astype(np.int64)
 
     @property
     def times_s(self) -> NDArray[np.float64]:
-        """Averaging times of the Allan variances."""
+        """Averaging times of the Allan variances, (times,), seconds."""
         times = averaging_times_s(self.sample_count, self.rate_hz)
         return times[times * self.rate_hz >= SHORTEST_FIT_SAMPLES * (1 - 1e-9)]
 
     def _allan(self, samples: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Variances and counts, (2, axes, times), of a recording."""
+        """Allan variances and counts of a recording, (2, axes, times)."""
         rows = [allan_variance(row, self.rate_hz, self.times_s) for row in samples]
         return np.array(rows, np.float64).swapaxes(0, 1)
 
-    def _worked_out(
-        self, what: str, work_out: Callable[[NDArray[np.floating]], NDArray[np.float64]]
+    def _cached(
+        self, name: str, compute: Callable[[NDArray[np.floating]], NDArray[np.float64]]
     ) -> list[NDArray[np.float64]]:
-        """Of each recording: remembered, or worked out now."""
-        keys = [(what, *self._key(number)) for number in self.numbers.tolist()]
-        remembered = self._memory.get(keys)
-        if remembered is None:
-            remembered = [work_out(samples) for samples in self._read()]
-            self._memory.put(keys, remembered)
-        return remembered
+        """A figure of each recording, from the cache or computed now."""
+        keys = [(name, *self._key(number)) for number in self.numbers.tolist()]
+        arrays = self._cache.get(keys)
+        if arrays is None:
+            arrays = [compute(samples) for samples in self._read()]
+            self._cache.put(keys, arrays)
+        return arrays
 
     def _read(self) -> list[NDArray[np.floating]]:
-        """Each recording, (axes, samples), NaN where masked."""
+        """The samples of each recording, (axes, samples), NaN where masked."""
         keys = [("samples", *self._key(number)) for number in self.numbers.tolist()]
-        remembered = self._memory.get(keys)
-        if remembered is None:
+        arrays = self._cache.get(keys)
+        if arrays is None:
             rates = self._recordings.angular_rate.sel(imu=self._imu)
             rows = rates.get_index("recording").get_indexer(pd.Index(self.numbers))
-            # what lies between them as well, as single ones are found far more slowly
+            # reading a range is far faster than reading single recordings
             part = rates.isel(recording=slice(int(rows.min()), int(rows.max()) + 1))
-            read = part.transpose("recording", "axis", "sample").to_numpy()
-            remembered = [read[row] for row in rows - rows.min()]
+            samples = part.transpose("recording", "axis", "sample").to_numpy()
+            arrays = [samples[row] for row in rows - rows.min()]
             if self._from_file:
-                self._memory.put(keys, [one.copy() for one in remembered])
-        return remembered
+                self._cache.put(keys, [array.copy() for array in arrays])
+        return arrays
 
     def _key(self, number: int) -> tuple[Hashable, ...]:
         data = self._recordings.attrs.get("data_hash"), self.sample_count, self.rate_hz
@@ -266,17 +265,18 @@ class ImuRecordings:
 
 
 def fitted_noise(imus: Sequence[ImuRecordings]) -> list[NoiseFigures]:
-    """N, B and K of each axis of IMUs that are taken as one, from their Allan variances."""
-    parts = zip(*(one.variances for one in imus), strict=True)
+    """N, B and K of each axis, fitted to the mean Allan variances of several IMUs."""
+    parts = zip(*(imu.variances for imu in imus), strict=True)
     variances, counts = (np.concatenate(part) for part in parts)
-    one = imus[0]
-    fitted = one.sample_count / one.rate_hz, SHORTEST_FIT_SAMPLES / one.rate_hz
+    first = imus[0]
+    recording_s = first.sample_count / first.rate_hz
+    shortest_s = SHORTEST_FIT_SAMPLES / first.rate_hz
     means = mean_variance(variances, counts)
-    return [fit_noise(one.times_s, variance, *fitted) for variance in means]
+    return [fit_noise(first.times_s, variance, recording_s, shortest_s) for variance in means]
 
 
 def _sorted(windows: pd.DataFrame, device: int) -> pd.DataFrame:
-    """Real before virtual ones, the device first."""
+    """Rows in order: real before virtual windows, the device first."""
     others = (windows.imu != device) | (windows.origin != ORIGIN_REAL)
     order = {"virtual": windows.origin == ORIGIN_VIRTUAL, "others": others}
     by = ["virtual", "others", "imu", "recording", "start"]
@@ -289,15 +289,15 @@ def _mean(samples: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.asarray(fill_masked(samples).mean(axis=-1, dtype=np.float64))
 
 
-class _Memory:
-    """Arrays by key; those that were not asked for longest are dropped where they get too many."""
+class _ArrayCache:
+    """Arrays by key; the least recently used ones are dropped beyond ``_CACHE_BYTES``."""
 
     def __init__(self) -> None:
         self._arrays: OrderedDict[Hashable, NDArray[Any]] = OrderedDict()
         self._bytes = 0
 
     def get(self, keys: Sequence[Hashable]) -> list[NDArray[Any]] | None:
-        """Arrays, if all of them are remembered."""
+        """Arrays, if all of them are cached."""
         if any(key not in self._arrays for key in keys):
             return None
         for key in keys:
@@ -305,13 +305,13 @@ class _Memory:
         return [self._arrays[key] for key in keys]
 
     def put(self, keys: Sequence[Hashable], arrays: Sequence[NDArray[Any]]) -> None:
-        """Remember arrays."""
+        """Store arrays."""
         for key, array in zip(keys, arrays, strict=True):
             self._bytes += array.nbytes - (self._arrays[key].nbytes if key in self._arrays else 0)
             self._arrays[key] = array
-        while self._bytes > _REMEMBERED_BYTES:
+        while self._bytes > _CACHE_BYTES:
             _, dropped = self._arrays.popitem(last=False)
             self._bytes -= dropped.nbytes
 
 
-_OF_FILES = _Memory()
+_FILE_CACHE = _ArrayCache()

@@ -1,8 +1,8 @@
-"""Networks of one kind trained at once, as one model with one more dimension.
+"""Networks of one kind trained together, as a model with an additional dimension.
 
-``torch.func.vmap`` turns the loss of one network into the losses of all. Every network keeps its
-own examples and their order, and gets the weights that
-:func:`gyro_pipeline.learning.trainer.train` gives it, up to rounding.
+``torch.func.vmap`` turns the loss of one network into the losses of all. Every network has its
+examples and their order, and ends with the weights of
+:func:`gyro_pipeline.learning.trainer.train`, up to rounding.
 """
 
 import copy
@@ -29,8 +29,8 @@ class Learner:
 
     Attributes:
         network: Initialised; it is not changed.
-        training: Its examples. Learners that name the same object share its memory.
-        validation: Examples to watch, never to train on; may be None.
+        training: Training examples; learners with the same object share its memory.
+        validation: Validation examples; may be None.
         shuffling: Draws the order of the examples; nothing else is random.
     """
 
@@ -43,25 +43,25 @@ class Learner:
 def train_together(
     learners: Sequence[Learner], schedule: Training, device: torch.device, label: str = ""
 ) -> list[Trained]:
-    """Train networks of one kind on equal numbers of examples, step by step together.
+    """Train networks of one kind together, on equal numbers of examples.
 
     Args:
-        learners: The networks; :func:`obstacle` must have nothing against them.
+        learners: The networks; :func:`obstacle` must return None for them.
         schedule: Epochs, batch size, learning rate and its decay.
-        device: Where to train.
-        label: Names the work beside a bar that counts epochs, on a terminal.
+        device: Device to train on.
+        label: Label of the progress bar on a terminal, which counts epochs.
 
     Raises:
         FloatingPointError: If a loss is no longer finite.
     """
     stack = _StackedNetworks([learner.network for learner in learners], device)
     training = _SharedExamples([learner.training for learner in learners], device)
-    watched = [learner.validation for learner in learners if learner.validation is not None]
-    validation = _SharedExamples(watched, device) if watched else None
+    parts = [learner.validation for learner in learners if learner.validation is not None]
+    validation = _SharedExamples(parts, device) if parts else None
     losses = [Losses() for _ in learners]
     rates = schedule.learning_rates(training.size).tolist()
     for rate in tqdm(rates, label, leave=False, unit="epoch", disable=None):
-        orders = [torch.randperm(training.size, generator=each.shuffling) for each in learners]
+        orders = [torch.randperm(training.size, generator=item.shuffling) for item in learners]
         means = stack.train(training, torch.stack(orders), rate, schedule.batch_size)
         val_means: Sequence[float | None] = [None] * len(learners)
         if validation is not None:
@@ -73,15 +73,15 @@ def train_together(
 
 
 def obstacle(network: nn.Module, shape: Sequence[int], device: torch.device) -> str | None:
-    """Why networks of this kind cannot be trained at once; None if they can.
+    """The reason why networks of a kind cannot be trained together; None if they can.
 
-    A step of two of them is tried. ``vmap`` must know all their operations, and these must neither
-    be random nor add up in an order that changes. Each window must be seen on its own.
+    A step of two networks is tried. ``vmap`` must support all operations, and these must be
+    deterministic. Outputs must not depend on other windows of the batch.
 
     Args:
         network: Initialised; it is not changed.
-        shape: Of its input for one window.
-        device: Where to train.
+        shape: Shape of the input for a window.
+        device: Device to train on.
     """
     inputs = torch.rand((2, 2, *shape), generator=torch.Generator().manual_seed(0)).to(device)
     stack = _StackedNetworks([network] * 2, device)
@@ -99,7 +99,7 @@ def obstacle(network: nn.Module, shape: Sequence[int], device: torch.device) -> 
 
 
 class _SharedExamples:
-    """Examples of equal numbers on the device; those of several networks are there once."""
+    """Examples of networks on the device, in equal numbers; shared examples are stored once."""
 
     def __init__(self, parts: Sequence[Examples], device: torch.device) -> None:
         distinct = {id(part): part for part in parts}
@@ -112,15 +112,15 @@ class _SharedExamples:
         self.size = len(parts[0].inputs)
 
     def __getitem__(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs and targets of each network's rows, (networks, n) or (1, n) for all."""
+        """Inputs and targets of the rows of each network, (networks, n), or of all, (1, n)."""
         return self._inputs[self._numbers, rows], self._targets[self._numbers, rows]
 
 
 class _StackedNetworks:
-    """Networks as one model. Every tensor has a row for each of them."""
+    """Networks as one model, whose tensors have a row for each network."""
 
     def __init__(self, networks: Sequence[nn.Module], device: torch.device) -> None:
-        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # what the next line asks for
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # required by the next line
         torch.use_deterministic_algorithms(True)
         self._device = device
         self._networks = [copy.deepcopy(network).to(device) for network in networks]
@@ -132,10 +132,10 @@ class _StackedNetworks:
     def train(
         self, examples: _SharedExamples, orders: Tensor, rate: float, batch_size: int
     ) -> list[float]:
-        """Make the steps of an epoch, in the order of each network, (networks, n).
+        """Train for an epoch, with the examples of each network in its order, (networks, n).
 
         Returns:
-            The mean loss of each network on the way.
+            The mean training loss of each network.
         """
         self._optimizer.param_groups[0]["lr"] = rate
         total = torch.zeros(len(orders), device=self._device)
@@ -149,7 +149,7 @@ class _StackedNetworks:
 
     @torch.no_grad()
     def validate(self, examples: _SharedExamples, batch_size: int) -> list[float]:
-        """The mean loss of each network."""
+        """The mean validation loss of each network."""
         rows = torch.arange(examples.size, device=self._device)[None].split(batch_size, 1)
         parts = [self._losses(*examples[batch]) * batch.shape[1] for batch in rows]
         return (torch.stack(parts).sum(0) / examples.size).tolist()
@@ -157,13 +157,13 @@ class _StackedNetworks:
     def outputs(self, inputs: Tensor) -> Tensor:
         """Outputs of each network for its windows, (networks, n, gyroscopes)."""
 
-        def alone(parameters: StateDict, buffers: StateDict, windows: Tensor) -> Tensor:
+        def single(parameters: StateDict, buffers: StateDict, windows: Tensor) -> Tensor:
             return functional_call(self._called, (parameters, buffers), (windows,))
 
-        return vmap(alone)(self._parameters, self._buffers, inputs)
+        return vmap(single)(self._parameters, self._buffers, inputs)
 
     def weights(self, number: int) -> StateDict:
-        """Those of one network."""
+        """The weights of a network."""
         rows = {name: row[number] for name, row in (self._parameters | self._buffers).items()}
         self._networks[number].load_state_dict(rows, strict=False)
         return weights_of(self._networks[number])

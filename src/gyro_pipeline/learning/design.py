@@ -1,4 +1,4 @@
-"""Which network is trained: its class, by name, and what it is made with."""
+"""The design of a network: its class, by name, and its arguments."""
 
 import importlib
 import inspect
@@ -14,7 +14,7 @@ from gyro_pipeline.learning.network import Architecture, CalibrationNetwork
 from gyro_pipeline.learning.packing import Layout
 from gyro_pipeline.parameters import NetworkSizes, Training
 
-_GIVEN = ("gyroscopes", "window", "rate_hz")
+_FIXED_ARGUMENTS = ("gyroscopes", "window", "rate_hz")
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class Design:
             whose ``forward`` takes scaled windows (n, gyroscopes, window) to biases
             (n, gyroscopes).
         gyroscopes: Channels of a window.
-        window: Samples.
-        options: All of its other arguments.
+        window: Samples of a window.
+        options: All other arguments.
     """
 
     path: str
@@ -37,7 +37,7 @@ class Design:
 
     @property
     def layout(self) -> Layout:
-        """How its windows lie in memory."""
+        """The memory layout of windows."""
         if network_class(self.path) is not CalibrationNetwork:
             return Layout(self.gyroscopes, self.window)
         packed = Architecture(self.gyroscopes, self.window, **self.options)
@@ -47,7 +47,7 @@ class Design:
         """The network with its initial weights, without touching the global random state.
 
         Raises:
-            InputError: The options or the window do not suit the class.
+            InputError: The class does not accept the options or the window.
         """
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -57,10 +57,10 @@ class Design:
                 raise InputError(f"{self}: {error}") from error
 
     def check(self) -> None:
-        """Refuse a network that cannot be built, or returns no bias for each gyroscope.
+        """Refuse a network that cannot be built or does not return a bias for each gyroscope.
 
         Raises:
-            InputError: Saying what was expected.
+            InputError: The error of the class, or the expected and the actual output.
         """
         windows = torch.zeros((2, self.gyroscopes, self.window))
         try:
@@ -73,7 +73,7 @@ class Design:
             raise InputError(f"{self}: expected an output of shape {expected}, got {shape}")
 
     def __str__(self) -> str:
-        """The class and what it is made with, as Python would show it."""
+        """The class with its arguments, as a Python expression."""
         options = "".join(f", {name}={value!r}" for name, value in self.options.items())
         return f"{self.path}({self.gyroscopes}, {self.window}{options})"
 
@@ -86,37 +86,41 @@ def network_class(path: str) -> type[nn.Module]:
 
 
 def is_network(kind: object) -> bool:
-    """Whether it is a class of networks."""
+    """Whether an object is a class of networks."""
     return isinstance(kind, type) and issubclass(kind, nn.Module)
 
 
 def options_of(
-    path: str, sizes: NetworkSizes, given: Mapping[str, Any], rate_hz: float | None = None
+    path: str, sizes: NetworkSizes, chosen: Mapping[str, Any], rate_hz: float | None = None
 ) -> dict[str, Any]:
-    """All that a network is made with, beside the shape of its windows.
+    """All arguments of a network besides the shape of its windows.
 
     Args:
-        path: Of its class.
-        sizes: Values of options that have no default: those that the paper leaves open.
-        given: Options that were asked for.
-        rate_hz: Samples per second, for a class that has an argument of this name.
+        path: Path of the class.
+        sizes: Values of options without a default, which the paper leaves open.
+        chosen: Options that the user chose.
+        rate_hz: Samples per second, for a class with an argument of this name.
 
     Raises:
         InputError: The class has no such option.
     """
     arguments = inspect.signature(network_class(path)).parameters.values()
-    any_number = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    named = [argument for argument in arguments if argument.kind not in any_number]
-    options = {argument.name: argument.default for argument in named if argument.name not in _GIVEN}
-    unknown = [] if len(named) < len(arguments) else [*given.keys() - options.keys()]
-    if twice := options.keys() & Training.model_fields.keys() - NetworkSizes.model_fields.keys():
-        raise InputError(f"{path}: {twice.pop()!r} is a setting of training; rename the option")
+    variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    named = [argument for argument in arguments if argument.kind not in variadic]
+    options = {
+        argument.name: argument.default
+        for argument in named
+        if argument.name not in _FIXED_ARGUMENTS
+    }
+    unknown = [] if len(named) < len(arguments) else [*chosen.keys() - options.keys()]
+    if clash := options.keys() & Training.model_fields.keys() - NetworkSizes.model_fields.keys():
+        raise InputError(f"{path}: {clash.pop()!r} is a setting of training; rename the option")
     if unknown:
         raise InputError(f"{path} has no option {unknown[0]!r}; it has {', '.join(options)}")
     for name, default in options.items():
         if default is inspect.Parameter.empty and name in NetworkSizes.model_fields:
             options[name] = getattr(sizes, name)
-    options |= given
+    options |= chosen
     lacking = [name for name, value in options.items() if value is inspect.Parameter.empty]
     if lacking:
         raise InputError(f"{path}: option {lacking[0]!r} has no default; give it a value")

@@ -1,4 +1,4 @@
-"""From recordings to scaled training examples, few recordings in memory at a time."""
+"""Scaled training examples from recordings, of which few are in memory at a time."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -12,20 +12,20 @@ from gyro_pipeline.learning.packing import Layout, aligned_zeros
 from gyro_pipeline.physics.bias import windows_at
 
 _READ_AT_ONCE = 16
-"""Recordings: enough that finding them in the file costs little, few enough to hold."""
+"""Number of recordings: enough for fast access to the file, few enough for the memory."""
 
 
 @dataclass(frozen=True)
 class Device:
-    """IMUs seen side by side as one input of the network, and their windows to use.
+    """IMUs side by side as one input of the network, and their windows.
 
     Attributes:
         recordings: ``angular_rate`` (imu, recording, axis, sample), of one length, NaN where
             masked; may be backed by a file.
-        imus: The IMUs side by side, one for Method 2.
-        numbers: Recording numbers to use.
-        biases: Biases of these recordings, shape (recordings, gyroscopes), deg/s.
-        starts: First samples of the windows to use of each recording, which may overlap.
+        imus: The IMUs side by side; a single one for Method 2.
+        numbers: Numbers of the recordings.
+        biases: Biases of the recordings, shape (recordings, gyroscopes), deg/s.
+        starts: First samples of the windows of each recording, which may overlap.
     """
 
     recordings: xr.DataArray
@@ -36,7 +36,7 @@ class Device:
 
     @property
     def windows(self) -> int:
-        """How many windows are used."""
+        """Number of windows."""
         return sum(map(len, self.starts))
 
     def samples(self) -> Iterator[np.ndarray]:
@@ -44,33 +44,33 @@ class Device:
         rows = self.recordings.get_index("recording").get_indexer(pd.Index(self.numbers))
         imus = self.recordings.get_index("imu").get_indexer(pd.Index(self.imus))
         for first in range(0, len(rows), _READ_AT_ONCE):
-            wanted = rows[first : first + _READ_AT_ONCE]
-            # what lies between them as well, as single ones are found far more slowly
-            part = self.recordings.isel(imu=_around(imus), recording=_around(wanted)).load()
-            read = part.transpose("recording", "imu", "axis", "sample").to_numpy()
-            for row in wanted - wanted.min():
-                yield read[row, imus - imus.min()].reshape(-1, read.shape[-1])
+            batch = rows[first : first + _READ_AT_ONCE]
+            # reading a range is far faster than reading single recordings
+            part = self.recordings.isel(imu=_around(imus), recording=_around(batch)).load()
+            samples = part.transpose("recording", "imu", "axis", "sample").to_numpy()
+            for row in batch - batch.min():
+                yield samples[row, imus - imus.min()].reshape(-1, samples.shape[-1])
 
 
 def with_shuffled_labels(device: Device, generator: np.random.Generator) -> Device:
-    """The device with its biases permuted between the recordings used: a leak detector.
+    """The device with its biases permuted between recordings: a leak detector.
 
-    Each gyroscope is permuted on its own. What a window says about its bias is then lost, and all
-    that is left to learn is the device's constant. A network that does better on test recordings
-    has seen something of them.
+    Each gyroscope is permuted independently. Windows then say nothing about their bias, and only
+    the constant of the device can be learned. A network that is better than that on test recordings
+    has information about them.
     """
     return replace(device, biases=generator.permuted(device.biases.T, axis=-1).T)
 
 
 @dataclass(frozen=True)
 class Scaling:
-    """Fitted on training data only: the network sees (x - centre) / scale.
+    """Scaling fitted to training data only: the network sees (x - centre) / scale.
 
     One scale for all gyroscopes keeps the paper's loss, the mean squared error in deg/s, up to a
     constant factor.
 
     Attributes:
-        centres: Subtracted from each device's gyroscopes, inputs and targets, deg/s.
+        centres: Values subtracted from inputs and targets, by device, (gyroscopes,), deg/s.
         input_scale: Root mean square of the centred samples, deg/s.
         target_scale: Root mean square of the centred biases, deg/s.
     """
@@ -89,7 +89,7 @@ class Examples:
 
 
 def device_centres(devices: Sequence[Device], centring: str) -> list[np.ndarray]:
-    """What to subtract from each device: its own gyroscopes' means, or one mean for all.
+    """The centres of devices: the means of their gyroscopes, or one mean for all.
 
     Args:
         devices: Training devices.
@@ -109,7 +109,7 @@ def device_centres(devices: Sequence[Device], centring: str) -> list[np.ndarray]
 def training_examples(
     devices: Sequence[Device], layout: Layout, centring: str
 ) -> tuple[Examples, Scaling]:
-    """All windows of the training devices, and the scaling that they fix."""
+    """All windows of the training devices, scaled, with the scaling fitted to them."""
     centres = device_centres(devices, centring)
     examples = _centred(devices, centres, layout)
     input_scale = _root_mean_square(examples.inputs, layout)
@@ -140,8 +140,8 @@ def _centred(devices: Sequence[Device], centres: Sequence[np.ndarray], layout: L
     targets = np.empty((n, layout.gyroscopes), np.float32)
     start = 0
     for device, centre in zip(devices, centres, strict=True):
-        used = zip(device.samples(), device.biases, device.starts, strict=True)
-        for samples, bias, starts in used:
+        recordings = zip(device.samples(), device.biases, device.starts, strict=True)
+        for samples, bias, starts in recordings:
             centred = samples - centre[:, None].astype(np.float32)
             rows = slice(start, start + len(starts))
             windows = windows_at(centred, layout.window, starts)
@@ -152,10 +152,11 @@ def _centred(devices: Sequence[Device], centres: Sequence[np.ndarray], layout: L
 
 
 def _around(positions: np.ndarray) -> slice:
+    """The smallest slice with all of the positions."""
     return slice(int(positions.min()), int(positions.max()) + 1)
 
 
 def _root_mean_square(inputs: np.ndarray, layout: Layout) -> float:
-    """Over samples, not over the zeros that pad them."""
+    """Root mean square of samples, without the zeros that pad them."""
     squares = sum(float(np.vdot(window, window)) for window in inputs)
     return float(np.sqrt(squares / (len(inputs) * layout.samples)))

@@ -1,7 +1,7 @@
-"""The training step in C, for one thread of a CPU: the packed path's results, several times faster.
+"""The training step in C for a CPU thread: the same results, several times faster.
 
-The source, ``fused.c``, is compiled at first use by the system's C compiler into the user's cache.
-Without a compiler nothing is lost but time: :func:`available` says no and training runs in PyTorch.
+The source, ``fused.c``, is compiled at first use by the C compiler of the system into the cache of
+the user. Without a compiler :func:`available` is false, and training runs in PyTorch, more slowly.
 """
 
 import ctypes
@@ -28,19 +28,19 @@ SOURCE = Path(__file__).with_name("fused.c")
 
 _CACHE = "GYRO_PIPELINE_CACHE"
 # Without -ffast-math: gcc would link code that flushes denormals to zero in the whole process, and
-# a loss that is not a number could pass for one.
+# NaN as a loss would not be detected.
 _FLAGS = "-std=gnu11 -O3 -ffp-contract=fast -fno-math-errno -fno-trapping-math -shared -fPIC"
 _NATIVE = ("-march=native", "-mcpu=native", "")
-"""What compilers call the processor of this machine; the last compiles for any of its kind."""
+"""Flags for the processor of this machine; the last one compiles for any processor."""
 _TIMEOUT_S = 120
 
-# Floats that fit a second cache of 1 MB beside all else; measured, and not critical.
+# Floats that fit into a second-level cache of 1 MB; measured, not critical.
 _WINDOW_CHUNK, _WINDOWS, _WEIGHTS = 20 << 10, 64 << 10, 128 << 10
 
 
 @functools.cache
 def available() -> bool:
-    """Whether the fused step can be used here; if not, the log says why, once."""
+    """Whether the fused step can be used; if not, the reason is logged once."""
     try:
         _check()
     except (OSError, RuntimeError, subprocess.SubprocessError) as reason:
@@ -50,7 +50,7 @@ def available() -> bool:
 
 
 class FusedEngine:
-    """The training of one network on one set of examples, with the state of its optimiser."""
+    """The training of a network on a set of examples, with the state of the optimiser."""
 
     def __init__(
         self, network: CalibrationNetwork, inputs: np.ndarray, targets: np.ndarray, batch_size: int
@@ -59,19 +59,19 @@ class FusedEngine:
 
         Args:
             network: On the CPU.
-            inputs: Packed windows, shape (n, blocks, width), float32, scaled and finite (a
-                maximum passes over what is not a number); used where they are.
-            targets: Shape (n, gyroscopes), float32, scaled; used where they are.
+            inputs: Packed windows, shape (n, blocks, width), float32, scaled and finite (the
+                maximum ignores NaN); used in place.
+            targets: Shape (n, gyroscopes), float32, scaled; used in place.
             batch_size: Examples per step.
 
         Raises:
             ValueError: If the examples do not fit the network, are of another type or not
                 contiguous.
-            RuntimeError: If the step could not be compiled; ask :func:`available` first.
+            RuntimeError: If the step could not be compiled; call :func:`available` first.
         """
         a = network.architecture
-        _demand("inputs", inputs, (len(inputs), *packed_shape(a)))
-        _demand("targets", targets, (len(inputs), a.gyroscopes))
+        _check_array("inputs", inputs, (len(inputs), *packed_shape(a)))
+        _check_array("targets", targets, (len(inputs), a.gyroscopes))
         self._library, self._batch_size, self._steps = _library(), batch_size, 0
         layout = _Layout(a, min(batch_size, len(inputs)))
         self._index = layout.index
@@ -87,25 +87,25 @@ class FusedEngine:
         self._engine = _Engine(**layout.sizes, **addresses)
 
     def epoch(self, order: np.ndarray, learning_rate: float) -> float:
-        """Train on examples in this order, in batches; the last one may be smaller.
+        """Train on examples in the given order, in batches; the last one may be smaller.
 
         Args:
             order: Indices of examples.
             learning_rate: Adam's.
 
         Returns:
-            Mean squared error over these examples, each as it was before its batch's step.
+            Mean squared error over the examples, each before the step of its batch.
 
         Raises:
-            IndexError: If there is no example of some index, or no index.
+            IndexError: If an index is out of range, or the order is empty.
         """
         examples, gyroscopes = self._arrays["targets"].shape
         if not (len(order) and 0 <= order.min() and order.max() < examples):
             raise IndexError(f"order: expected indices from 0 to {examples - 1}, got {order}")
-        followed = np.append(order, order[:1]).astype(np.int64)  # the C code looks one ahead
+        padded = np.append(order, order[:1]).astype(np.int64)  # the C code looks one ahead
         squares = self._library.fused_epoch(
             ctypes.byref(self._engine),
-            followed.ctypes.data,
+            padded.ctypes.data,
             len(order),
             self._batch_size,
             self._steps,
@@ -116,7 +116,7 @@ class FusedEngine:
 
     @torch.no_grad()
     def load_into(self, network: nn.Module) -> None:
-        """Copy the weights as they are now into a network of the same architecture."""
+        """Copy the current weights into a network of the same architecture."""
         for name, value in network.state_dict().items():
             value.copy_(torch.from_numpy(self._weights[self._index[name]]))
 
@@ -138,7 +138,7 @@ class _Engine(ctypes.Structure):
 
 
 class _Layout:
-    """Sizes and arrays as fused.c wants them, and the place of each parameter in ``weights``."""
+    """Sizes and arrays of fused.c, and the index of each parameter in ``weights``."""
 
     def __init__(self, architecture: Architecture, batch_size: int) -> None:
         s = _padded_sizes(architecture)
@@ -146,9 +146,9 @@ class _Layout:
         self.index: dict[str, np.ndarray] = {}
         self.starts: dict[str, int] = {}
         floats = 0
-        for name, (places, padded) in _parameters(architecture, s).items():
-            self.index[name], self.starts[name] = places + floats, floats
-            floats += padded
+        for name, (index, size) in _parameters(architecture, s).items():
+            self.index[name], self.starts[name] = index + floats, floats
+            floats += size
         self.seen = self.index["convolution.weight"][0] - self.starts["convolution.weight"]
         self.sizes = s | {"floats": floats}
         self.arrays = {
@@ -181,39 +181,33 @@ def _padded_sizes(architecture: Architecture) -> dict[str, int]:
 
 
 def _cache_sizes(sizes: dict[str, int], batch_size: int) -> dict[str, int]:
-    """Examples and pooled times that are worked on together, so that they stay in the cache."""
+    """Numbers of examples and pooled times that are processed together, to stay in the cache."""
     s = sizes
     by_window = _WINDOW_CHUNK // (s["pool"] * s["width"])
-    by_weights = _WEIGHTS // (4 * s["hidden"] * s["channels"])  # they, gradient and two means
+    by_weights = _WEIGHTS // (4 * s["hidden"] * s["channels"])  # weights, gradient and two means
     chunk = min(by_window, by_weights, s["pooled"] + 1)
-    # Windows of a tile are still there when they are needed again. Where the hidden weights are too
-    # many for the cache, to go through them once more for every tile would cost more than it saves.
+    # Windows of a tile are still in the cache when they are needed again. If the hidden weights do
+    # not fit into the cache, reading them again for every tile would cost more than it saves.
     few_weights = 4 * s["hidden"] * s["features"] <= _WEIGHTS
     by_tile = _WINDOWS // (s["blocks"] * s["width"]) + 1
     tile = min(batch_size, by_tile) if few_weights else batch_size
-    refetch = int(tile * s["blocks"] * s["width"] > 2 * _WINDOWS)  # gone when they are needed again
+    refetch = int(tile * s["blocks"] * s["width"] > 2 * _WINDOWS)  # no longer in the cache
     return {"tile": _up(tile, 4), "chunk": max(2, chunk // 2 * 2), "refetch": refetch}
 
 
 def _parameters(
     architecture: Architecture, sizes: dict[str, int]
 ) -> dict[str, tuple[np.ndarray, int]]:
-    """Places of each parameter's values in its padded array, and the size of that array."""
+    """Indices of the values of each parameter in its padded array, and the size of the array."""
     a, s = architecture, sizes
     unit, gyroscope, channel = (np.arange(n) for n in (a.hidden, a.gyroscopes, a.channels))
     feature = np.add.outer(np.arange(a.pooled) * s["channels"], channel).ravel()
     tap, sample = np.divmod(np.arange(a.kernel), a.stride)
     kernel = np.add.outer(gyroscope * a.stride, tap * s["width"] + sample)
     return {
-        "hidden.weight": (
-            np.add.outer(unit * s["features"], feature),
-            s["hidden"] * s["features"],
-        ),
+        "hidden.weight": (np.add.outer(unit * s["features"], feature), s["hidden"] * s["features"]),
         "hidden.bias": (unit, s["hidden"]),
-        "output.weight": (
-            np.add.outer(gyroscope * s["hidden"], unit),
-            a.gyroscopes * s["hidden"],
-        ),
+        "output.weight": (np.add.outer(gyroscope * s["hidden"], unit), a.gyroscopes * s["hidden"]),
         "output.bias": (gyroscope, _up(a.gyroscopes, CACHE_LINE)),
         "convolution.weight": (
             np.add.outer(channel * s["span"], kernel),
@@ -227,7 +221,7 @@ def _up(size: int, multiple: int) -> int:
     return -(-size // multiple) * multiple
 
 
-def _demand(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
+def _check_array(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
     if array.shape != shape or array.dtype != np.float32 or not array.flags.c_contiguous:
         raise ValueError(
             f"{name}: expected contiguous float32 of shape {shape}, "
@@ -237,7 +231,7 @@ def _demand(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
 
 @functools.cache
 def _library() -> ctypes.CDLL:
-    """The compiled step, from the cache if it is there."""
+    """The compiled step, from the cache if possible."""
     compiler = _compiler()
     native, described = _native(compiler)
     command = [*compiler, *_FLAGS.split(), *native]
@@ -245,7 +239,7 @@ def _library() -> ctypes.CDLL:
     key = hashlib.sha256(b"\0".join(parts)).hexdigest()
     name = f"fused-{key[:16]}"
     path = _compiled(name) or _compile(command, name)
-    library = ctypes.CDLL(str(path))  # lets go of the interpreter lock while it runs
+    library = ctypes.CDLL(str(path))  # releases the interpreter lock while it runs
     library.fused_epoch.restype = ctypes.c_double
     library.fused_epoch.argtypes = [
         *(ctypes.POINTER(_Engine), ctypes.c_void_p),
@@ -255,13 +249,13 @@ def _library() -> ctypes.CDLL:
 
 
 def _compiled(name: str) -> Path | None:
-    """The compiled step, if it is as this user compiled it: it is code that will be run."""
+    """The cached step if it belongs to this user and is undamaged, since its code will run."""
     for path in _cache().glob(f"{name}-*.so"):
-        own = not hasattr(os, "getuid") or path.stat().st_uid == os.getuid()
-        if own and path.stem == f"{name}-{_digest(path)}":
+        owned = not hasattr(os, "getuid") or path.stat().st_uid == os.getuid()
+        if owned and path.stem == f"{name}-{_digest(path)}":
             return path
         logger.warning("%s is damaged or another user's: the step is compiled again", path)
-        if own:
+        if owned:
             path.unlink(missing_ok=True)
     return None
 
@@ -271,18 +265,18 @@ def _digest(path: Path) -> str:
 
 
 def _compiler() -> list[str]:
-    """``$CC``, which may have arguments, or the first there is."""
-    asked = os.environ.get("CC", "").split()
-    for command in [asked] if asked else [["cc"], ["gcc"], ["clang"]]:
+    """``$CC``, which may have arguments, or the first of cc, gcc and clang."""
+    configured = os.environ.get("CC", "").split()
+    for command in [configured] if configured else [["cc"], ["gcc"], ["clang"]]:
         if shutil.which(command[0]):
             return command
-    raise RuntimeError(f"no C compiler: {' '.join(asked) or 'cc, gcc or clang'} not found")
+    raise RuntimeError(f"no C compiler: {' '.join(configured) or 'cc, gcc or clang'} not found")
 
 
 def _native(compiler: list[str]) -> tuple[list[str], bytes]:
-    """Flags for this processor, and what the compiler says of both: version and instructions.
+    """Flags for this processor, and the macros of the compiler: its version and instructions.
 
-    What it says is part of the cache's key, so another processor or compiler compiles anew.
+    The macros are part of the cache key, so another processor or compiler compiles the step again.
     """
     for flag in _NATIVE:
         command = [*compiler, *flag.split(), "-dM", "-E", "-x", "c", "-"]
@@ -293,16 +287,16 @@ def _native(compiler: list[str]) -> tuple[list[str], bytes]:
 
 
 def _compile(command: list[str], name: str) -> Path:
-    """Under a name of its own first, as other processes may be doing the same."""
+    """Compile into a temporary folder first, since other processes may do the same."""
     cache = _cache()
     cache.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=cache) as folder:
-        made = Path(folder) / "step.so"
-        command = [*command, str(SOURCE), "-lm", "-o", str(made)]
+        library = Path(folder) / "step.so"
+        command = [*command, str(SOURCE), "-lm", "-o", str(library)]
         done = _run(command)
         if done.returncode != 0:
             raise RuntimeError(_failure(command, done))
-        return made.replace(cache / f"{name}-{_digest(made)}.so")
+        return library.replace(cache / f"{name}-{_digest(library)}.so")
 
 
 def _run(command: list[str]) -> subprocess.CompletedProcess[bytes]:
@@ -311,18 +305,18 @@ def _run(command: list[str]) -> subprocess.CompletedProcess[bytes]:
 
 def _failure(command: list[str], done: subprocess.CompletedProcess[bytes]) -> str:
     lines = done.stderr.decode(errors="replace").splitlines() or [f"status {done.returncode}"]
-    told = next((line for line in lines if "error" in line), lines[-1])
-    return f"{' '.join(command)}: {told.strip()}"
+    message = next((line for line in lines if "error" in line), lines[-1])
+    return f"{' '.join(command)}: {message.strip()}"
 
 
 def _cache() -> Path:
-    if asked := os.environ.get(_CACHE):
-        return Path(asked)
+    if folder := os.environ.get(_CACHE):
+        return Path(folder)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gyro_pipeline"
 
 
 def _check() -> None:
-    """Train a small network that uses every part of the code, and compare with PyTorch."""
+    """Train a small network that runs all of the code, and compare it with PyTorch."""
     a = Architecture(gyroscopes=3, window=157, channels=19, kernel=19, stride=7, pool=3, hidden=18)
     random = np.random.default_rng(0)
     with torch.random.fork_rng(devices=[]):

@@ -1,4 +1,4 @@
-"""One training as a pure job: everything it needs comes in, everything it makes goes out."""
+"""A training as a pure function: all inputs are arguments, all results are returned."""
 
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -24,13 +24,13 @@ from gyro_pipeline.learning.packing import aligned_zeros
 from gyro_pipeline.learning.trainer import TorchEngine, Trained, nothing, predict, train
 from gyro_pipeline.parameters import Training
 
-# What a training costs, in samples of three gyroscopes (0.8 ns); measured in every cell.
+# Measured costs, in training samples of three gyroscopes (0.8 ns).
 _EPOCH_OVERHEAD = 800_000
-"""Of an epoch beside its training samples, mostly validation."""
+"""Cost of an epoch besides its training samples, mostly validation."""
 _LARGE = 15_000_000
-"""So many samples cost twice as much each as a few, which stay in the caches."""
+"""With this number of samples, each costs twice as much as with a few that stay in the caches."""
 _RECORDING_WORK = 500_000
-"""To read, scale and pack one."""
+"""Cost of reading, scaling and packing a recording."""
 
 
 @dataclass(frozen=True)
@@ -38,13 +38,13 @@ class TrainingJob:
     """A network to train.
 
     Attributes:
-        design: Its class, and what it is made with.
-        devices: Training devices and their windows; the first is the one that is estimated.
-        validation: The first device and its windows to validate on; None without.
+        design: Class and arguments of the network.
+        devices: Training devices and their windows; the first is the estimated device.
+        validation: The first device with its validation windows; None without validation.
         settings: The schedule.
-        seed: Of the initial weights and the order of examples.
-        cell: Equal for jobs of the same layout that differ in their seeds alone, so that they can
-            share examples; None where that is not known.
+        seed: Seed of the initial weights and the order of examples.
+        cell: A key that is equal for jobs that differ only in their seeds, which can share
+            examples; None if it is unknown.
     """
 
     design: Design
@@ -56,12 +56,17 @@ class TrainingJob:
 
     @property
     def windows(self) -> int:
-        """Training examples."""
+        """Number of training examples."""
         return sum(device.windows for device in self.devices)
 
     @property
+    def validation_windows(self) -> int:
+        """Number of validation examples."""
+        return self.validation.windows if self.validation else 0
+
+    @property
     def recordings(self) -> int:
-        """Read for training and validation; IMUs side by side count once."""
+        """Number of recordings to read; IMUs side by side count once."""
         used = [*self.devices, *([self.validation] if self.validation else [])]
         return sum(len(device.numbers) for device in used)
 
@@ -80,7 +85,7 @@ class TrainingJob:
 
 @dataclass(frozen=True)
 class TrainedNetwork:
-    """What a training leaves: an artifact to store, the losses, when it started, and on what."""
+    """The result of a training: an artifact to store, losses, start time and engine."""
 
     artifact: Mapping[str, Any]
     history: pd.DataFrame
@@ -89,14 +94,14 @@ class TrainedNetwork:
 
 
 def run_training(job: TrainingJob, after_epoch: Callable[[], None] = nothing) -> TrainedNetwork:
-    """Run one training on one thread of the processor.
+    """Run a training on one thread of the processor.
 
     Args:
-        job: What to train.
+        job: The training.
         after_epoch: Called after every epoch.
 
     Returns:
-        Weights at the last and the best validation epoch with all that an estimate needs.
+        Weights at the last and the best validation epoch, with everything that estimates need.
     """
     started = time.time()
     torch.set_num_threads(1)
@@ -105,7 +110,7 @@ def run_training(job: TrainingJob, after_epoch: Callable[[], None] = nothing) ->
     network = job.design.build(job.seed)
     compiled = type(network) is CalibrationNetwork and fused.available()
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(job.seed)  # of dropout and the like
+        torch.manual_seed(job.seed)  # for dropout and similar layers
         trained = train(
             network,
             examples,
@@ -120,7 +125,7 @@ def run_training(job: TrainingJob, after_epoch: Callable[[], None] = nothing) ->
 
 
 def prepared(job: TrainingJob) -> tuple[Examples, Examples | None, Scaling]:
-    """Training and validation examples, and the scaling of both; the same for every seed."""
+    """Training and validation examples with their scaling, which do not depend on the seed."""
     layout = job.design.layout
     examples, scaling = training_examples(job.devices, layout, job.settings.centring)
     if job.validation is None:
@@ -144,18 +149,18 @@ def stored(design: Design, scaling: Scaling, trained: Trained) -> dict[str, Any]
 
 
 def shuffling(seed: int) -> torch.Generator:
-    """Draws the order of the examples, and nothing else."""
+    """The generator of the order of examples."""
     return torch.Generator().manual_seed(seed)
 
 
 class StoredNetwork:
-    """A network from its artifact: windows in, biases out."""
+    """A network restored from its artifact, which estimates biases from windows."""
 
     def __init__(self, artifact: Mapping[str, Any], weights: str) -> None:
         """Restore a network.
 
         Args:
-            artifact: From :class:`TrainedNetwork`.
+            artifact: The artifact of a :class:`TrainedNetwork`.
             weights: ``last`` or ``best``.
         """
         self._scaling = artifact["scaling"]
@@ -165,7 +170,7 @@ class StoredNetwork:
         self._network.load_state_dict(artifact[weights])
 
     def biases(self, windows: np.ndarray) -> np.ndarray:
-        """Biases of all gyroscopes the network sees.
+        """Estimate the biases of all gyroscopes of windows.
 
         Args:
             windows: Shape (n, gyroscopes, window), deg/s.

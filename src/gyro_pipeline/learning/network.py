@@ -1,4 +1,4 @@
-"""The paper's network (section III-D), on windows as they are or packed for speed."""
+"""The paper's network (section III-D), for plain windows or windows packed for speed."""
 
 from dataclasses import dataclass
 from functools import wraps
@@ -9,12 +9,12 @@ from torch.nn import functional
 from gyro_pipeline.conventions import InputError
 
 SLOPE = 0.1
-"""Of the LeakyReLU (paper, section III-D)."""
+"""Negative slope of the LeakyReLU (paper, section III-D)."""
 
 
 @dataclass(frozen=True)
 class Architecture:
-    """Sizes of the network; all but the first two are left open by the paper."""
+    """Sizes of the network; the paper leaves all but the first two open."""
 
     gyroscopes: int
     window: int
@@ -25,10 +25,10 @@ class Architecture:
     hidden: int
 
     def __post_init__(self) -> None:
-        """Refuse windows that leave nothing to pool.
+        """Refuse windows that are too short for the pooling.
 
         Raises:
-            InputError: Naming the sizes.
+            InputError: It names the sizes.
         """
         if self.window < self.kernel or self.pooled < 1:
             raise InputError(
@@ -50,12 +50,12 @@ class Architecture:
 class CalibrationNetwork(nn.Module):
     """Convolution, LeakyReLU, max-pool, flatten, linear, LeakyReLU, linear.
 
-    LeakyReLU rises monotonically, so it gives the same after the pooling as before it, on a
-    quarter of the values; and features are flattened time by time, which packed windows have
-    without a copy. Neither changes the function the network computes.
+    LeakyReLU is monotonic, so it may follow the pooling, where it has only a quarter of the values;
+    and features are flattened time by time, which needs no copy for packed windows. Neither changes
+    the function that the network computes.
     """
 
-    def __init__(  # noqa: PLR0917 - what the paper leaves open
+    def __init__(  # noqa: PLR0917 - sizes that the paper leaves open
         self,
         gyroscopes: int,
         window: int,
@@ -112,10 +112,10 @@ class CalibrationNetwork(nn.Module):
 
 
 class SingleGyroscope(nn.Module):
-    """The paper's network with one channel in and one bias out, the same for every gyroscope.
+    """The paper's network with one input channel and one bias, shared by all gyroscopes.
 
-    The paper compares itself with such a predecessor (Engelsman & Klein, arXiv 2210.04568), whose
-    layers are not known to us, so here they are the paper's.
+    The paper compares itself with such a predecessor (Engelsman & Klein, arXiv 2210.04568). Its
+    layers are unknown to us, so they are those of the paper's network here.
     """
 
     @wraps(CalibrationNetwork.__init__)  # type: ignore[misc]
@@ -124,6 +124,6 @@ class SingleGyroscope(nn.Module):
         self.network = CalibrationNetwork(1, window, **sizes)
 
     def forward(self, windows: Tensor) -> Tensor:
-        """Biases of windows (n, gyroscopes, window), each gyroscope's from its own samples."""
-        alone = windows.flatten(0, 1).unsqueeze(1)
-        return self.network(alone).reshape(windows.shape[:2])
+        """Biases of windows (n, gyroscopes, window), each from the samples of its gyroscope."""
+        single = windows.flatten(0, 1).unsqueeze(1)
+        return self.network(single).reshape(windows.shape[:2])

@@ -1,8 +1,8 @@
-"""Windows packed for training: one block of ``stride`` samples of all gyroscopes per row.
+"""Windows packed for training: a row is a block of ``stride`` samples of all gyroscopes.
 
-In this layout the strided convolution over samples becomes one with stride 1 over blocks, with
-the samples of a block as channels that lie side by side in memory. It holds the same numbers,
-padded with zeros, and is faster the more the kernel overlaps itself.
+In this layout the strided convolution over samples becomes a convolution with stride 1 over blocks,
+whose samples are channels and adjacent in memory. The numbers are the same, padded with zeros; the
+more the kernel overlaps itself, the larger the gain in speed.
 """
 
 import math
@@ -13,7 +13,7 @@ import numpy as np
 from gyro_pipeline.learning.network import Architecture
 
 CACHE_LINE = 16
-"""Floats of one; as many as the widest registers hold. Rows are padded to a multiple of it."""
+"""Floats in a cache line and in the widest registers. Rows are padded to a multiple of it."""
 
 
 def packed_shape(architecture: Architecture) -> tuple[int, int]:
@@ -54,12 +54,12 @@ def pack(
 
 @dataclass(frozen=True)
 class Layout:
-    """How a network's windows lie in memory: packed for the paper's network, else as they are.
+    """Memory layout of windows: packed for the paper's network, plain for any other.
 
     Attributes:
         gyroscopes: Channels of a window.
-        window: Samples.
-        packed: Sizes of the paper's network; None of any other.
+        window: Samples of a window.
+        packed: Sizes of the paper's network; None for any other.
     """
 
     gyroscopes: int
@@ -68,14 +68,14 @@ class Layout:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Of one window."""
+        """Shape of one window."""
         return packed_shape(self.packed) if self.packed else (self.gyroscopes, self.window)
 
     @property
     def samples(self) -> int:
-        """How many of a window's samples the network sees, of all gyroscopes."""
-        seen = self.shape[0] * self.packed.stride if self.packed else self.window
-        return self.gyroscopes * min(self.window, seen)
+        """Number of samples of a window that the network sees, of all gyroscopes."""
+        covered = self.shape[0] * self.packed.stride if self.packed else self.window
+        return self.gyroscopes * min(self.window, covered)
 
     def write(self, windows: np.ndarray, out: np.ndarray) -> None:
         """Write windows (gyroscopes, n, window) into zeros of shape (n, *shape)."""
@@ -86,8 +86,8 @@ class Layout:
 
 
 def aligned_zeros(shape: tuple[int, ...]) -> np.ndarray:
-    """Float32 zeros that start with a cache line, so that no register is filled from two."""
+    """Float32 zeros aligned to a cache line, so that a register is filled from only one."""
     size = math.prod(shape)
-    room = np.zeros(size + CACHE_LINE, np.float32)
-    start = -(room.ctypes.data // room.itemsize) % CACHE_LINE
-    return room[start : start + size].reshape(shape)
+    buffer = np.zeros(size + CACHE_LINE, np.float32)
+    start = -(buffer.ctypes.data // buffer.itemsize) % CACHE_LINE
+    return buffer[start : start + size].reshape(shape)

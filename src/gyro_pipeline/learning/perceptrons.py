@@ -1,4 +1,4 @@
-"""Small networks trained side by side, each on its own part of the same examples."""
+"""Small networks trained together, each on its part of the same examples."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,7 +14,7 @@ _HIDDEN, _BATCH, _LEARNING_RATE, _WEIGHT_DECAY = 32, 256, 6e-3, 1e-2
 
 @dataclass(frozen=True)
 class Perceptrons:
-    """Networks with two hidden layers of 32 tanh units; K of them, float64.
+    """K networks with two hidden layers of 32 tanh units, float64.
 
     Attributes:
         layers: Weights (K, inputs, outputs) and offsets (K, 1, outputs) of each layer.
@@ -24,12 +24,12 @@ class Perceptrons:
 
     @torch.no_grad()
     def __call__(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Outputs of all networks for the same inputs, (n, d) to (K, n, outputs)."""
+        """Outputs (K, n, outputs) of all networks for the same inputs (n, d)."""
         networks = len(self.layers[0][0])
         return self.forward(torch.from_numpy(inputs).expand(networks, -1, -1)).numpy()
 
     def forward(self, values: Tensor) -> Tensor:
-        """(K, n, d) to (K, n, outputs)."""
+        """Outputs (K, n, outputs) of the networks for their inputs (K, n, d)."""
         *hidden, (weights, offsets) = self.layers
         for inner, inner_offsets in hidden:
             values = torch.tanh(torch.baddbmm(inner_offsets, values, inner))
@@ -38,7 +38,7 @@ class Perceptrons:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """On networks so small, more than one thread only wait for each other."""
+    """Use one thread: with more, networks of this size only wait."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -50,33 +50,33 @@ def _one_thread() -> Iterator[None]:
 @_one_thread()
 def train_perceptrons(
     inputs: NDArray[np.float64],
-    aims: NDArray[np.float64],
+    targets: NDArray[np.float64],
     used: NDArray[np.bool_],
     steps: int = 400,
     seed: int = 0,
 ) -> Perceptrons:
-    """Train networks with squared errors and AdamW, on a learning rate that rises and falls.
+    """Train networks with squared errors and AdamW, on the one-cycle learning rate.
 
     Args:
         inputs: (n, d), of the order of 1.
-        aims: (n, outputs), of the order of 1.
-        used: (K, n), which examples each network is trained on; at least one.
-        steps: Of the optimiser, with a batch of 256 drawn for each network.
-        seed: Of the weights and batches; nothing else is random.
+        targets: (n, outputs), of the order of 1.
+        used: Whether each network is trained on an example, (K, n); at least one is needed.
+        steps: Steps of the optimiser, with a random batch of 256 for each network.
+        seed: Seed of weights and batches; nothing else is random.
 
     Returns:
-        The networks; before training they give 0.
+        The networks; before training their output is 0.
     """
     generator = torch.Generator().manual_seed(seed)
-    x, y = torch.from_numpy(inputs), torch.from_numpy(aims)
-    rows = [torch.from_numpy(np.flatnonzero(one)) for one in used]
-    networks = Perceptrons(_initial(len(used), inputs.shape[1], aims.shape[1], generator))
-    parameters = [one for layer in networks.layers for one in layer]
+    x, y = torch.from_numpy(inputs), torch.from_numpy(targets)
+    rows = [torch.from_numpy(np.flatnonzero(mask)) for mask in used]
+    networks = Perceptrons(_initial(len(used), inputs.shape[1], targets.shape[1], generator))
+    parameters = [tensor for layer in networks.layers for tensor in layer]
     optimizer = torch.optim.AdamW(parameters, _LEARNING_RATE, weight_decay=_WEIGHT_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _LEARNING_RATE, total_steps=steps)
     for _ in range(steps):
-        drawn = [one[torch.randint(len(one), (_BATCH,), generator=generator)] for one in rows]
-        batch = torch.stack(drawn)
+        picks = [r[torch.randint(len(r), (_BATCH,), generator=generator)] for r in rows]
+        batch = torch.stack(picks)
         loss = torch.square(networks.forward(x[batch]) - y[batch]).mean(dim=(1, 2)).sum()
         optimizer.zero_grad()
         loss.backward()

@@ -1,4 +1,4 @@
-"""Networks that see a window as a sequence of means of short blocks of samples."""
+"""Networks whose input is the sequence of block means of a window."""
 
 import math
 
@@ -9,12 +9,12 @@ from gyro_pipeline.learning.network import SLOPE
 
 
 class BlockMeans(nn.Module):
-    """Means of blocks, scaled so that white noise keeps its variance; what is left over is cut off.
+    """Block means, scaled so that white noise keeps its variance; an incomplete block is cut off.
 
-    A sequence of all samples would take hours to train on.
+    Training on sequences of all samples would take hours.
 
     Args:
-        window: Samples.
+        window: Samples of a window.
         rate_hz: Samples per second.
         block_s: Length of a block, seconds.
     """
@@ -29,14 +29,14 @@ class BlockMeans(nn.Module):
 
 
 class LSTM(nn.Module):
-    """A long short-term memory, whose last output is mapped to the biases.
+    """A long short-term memory whose last output is mapped linearly to the biases.
 
     Args:
         gyroscopes: Channels of a window.
-        window: Samples.
+        window: Samples of a window.
         rate_hz: Samples per second.
-        units: Of each layer.
-        layers: One after the other.
+        units: Units of each layer.
+        layers: Number of layers.
         block_s: See :class:`BlockMeans`.
     """
 
@@ -63,14 +63,14 @@ class LSTM(nn.Module):
 class TCN(nn.Module):
     """A temporal convolutional network (Bai, Kolter & Koltun 2018, arXiv 1803.01271).
 
-    Every level has two causal convolutions and a connection past them, and sees twice as far back
-    as the one before; the last time is mapped to the biases. There is no dropout.
+    Every level has two causal convolutions and a residual connection, and twice the dilation of the
+    level before; the last time step is mapped linearly to the biases. There is no dropout.
 
     Args:
         gyroscopes, window, rate_hz, block_s: See :class:`LSTM`.
         filters: Channels of every level.
-        taps: Of every convolution.
-        levels: The last one's taps are ``2 ** (levels - 1)`` blocks apart.
+        taps: Kernel size of every convolution.
+        levels: Number of levels; the taps of the last one are ``2 ** (levels - 1)`` blocks apart.
     """
 
     def __init__(  # noqa: PLR0917 - its options
@@ -102,7 +102,7 @@ class TCN(nn.Module):
 
 
 def _causal(convolution: nn.Module, values: Tensor) -> Tensor:
-    """Outputs that see no later values than their own time."""
+    """Outputs of a causal convolution, which see no later values."""
     assert isinstance(convolution, nn.Conv1d)
     before = (convolution.kernel_size[0] - 1) * convolution.dilation[0]
     return functional.leaky_relu(convolution(functional.pad(values, (before, 0))), SLOPE)

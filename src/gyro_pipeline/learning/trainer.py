@@ -17,7 +17,7 @@ StateDict = dict[str, Tensor]
 
 
 def nothing() -> None:
-    """What is done after an epoch where nobody counts them."""
+    """Do nothing after an epoch."""
 
 
 _VALIDATION_BATCH = 1024
@@ -25,12 +25,12 @@ _VALIDATION_BATCH = 1024
 
 @dataclass(frozen=True)
 class Trained:
-    """Weights and the way to them.
+    """The result of a training: weights and losses.
 
     Attributes:
         last: Weights at the last epoch (the paper's).
         best: Weights at the epoch of the lowest validation loss; None without validation.
-        best_epoch: That epoch, counted from 1.
+        best_epoch: The epoch of ``best``, counted from 1.
         history: Columns ``epoch, learning_rate, train_loss`` and, if validated, ``val_loss``;
             losses are squared errors in units of the target scale.
     """
@@ -51,7 +51,7 @@ class Losses:
     def add(
         self, rate: float, loss: float, val_loss: float | None, weights: Callable[[], StateDict]
     ) -> None:
-        """Note an epoch; its weights are asked for if no validation loss was as low before.
+        """Add an epoch; ``weights`` is called if its validation loss is the lowest so far.
 
         Raises:
             FloatingPointError: If the training loss is not finite.
@@ -59,33 +59,33 @@ class Losses:
         epoch = len(self._rows) + 1
         if not np.isfinite(loss):
             raise FloatingPointError(f"the loss is {loss} in epoch {epoch}")
-        watched = {} if val_loss is None else {"val_loss": val_loss}
-        self._rows.append({"epoch": epoch, "learning_rate": rate, "train_loss": loss} | watched)
+        row = {"epoch": epoch, "learning_rate": rate, "train_loss": loss}
+        self._rows.append(row if val_loss is None else row | {"val_loss": val_loss})
         if val_loss is not None and val_loss < self._lowest:
             self._lowest, self._best = val_loss, {epoch: weights()}
 
     def trained(self, last: StateDict) -> Trained:
-        """The result, from the weights at the end."""
+        """The result, with the weights at the last epoch."""
         ((best_epoch, best),) = self._best.items() or [(None, None)]
         return Trained(last, best, best_epoch, pd.DataFrame(self._rows))
 
 
 class Engine(Protocol):
-    """Trains one network on one set of examples, an epoch at a time."""
+    """Trains a network on a set of examples, an epoch at a time."""
 
     def epoch(self, order: np.ndarray, learning_rate: float) -> float:
-        """Train on the examples in this order, batch by batch; the mean loss on the way."""
+        """Train on examples in the given order, batch by batch; returns the mean loss."""
 
     def load_into(self, network: nn.Module) -> None:
-        """Copy the weights as they are now into a network."""
+        """Copy the current weights into a network."""
 
 
 class TorchEngine:
-    """The reference: autograd and Adam in PyTorch, on the device the network is on.
+    """The reference engine: autograd and Adam in PyTorch, on the device of the network.
 
     Args:
         network: Trained in place.
-        inputs: Scaled windows as the network's layout has them; on the device for good.
+        inputs: Scaled windows in the layout of the network; they stay on the device.
         targets: Shape (n, gyroscopes), scaled.
         batch_size: Examples per step; the last one of an epoch may be smaller.
     """
@@ -131,12 +131,12 @@ def train(
 
     Args:
         network: Initialised; it is trained in place.
-        training: Examples, kept where they are for the whole training.
-        validation: Examples to watch, never to train on; may be None.
+        training: Training examples, used in place.
+        validation: Validation examples; may be None.
         schedule: Epochs, batch size, learning rate and its decay.
         shuffling: Draws the order of the examples; nothing else is random.
         after_epoch: Called after every epoch.
-        engine: What makes the steps.
+        engine: Class of the engine.
 
     Returns:
         Weights and history.
@@ -145,13 +145,13 @@ def train(
         FloatingPointError: If the loss is no longer finite.
     """
     steps = engine(network, training.inputs, training.targets, schedule.batch_size)
-    watched = None if validation is None else _tensors(validation, _device(network))
+    held_out = None if validation is None else _tensors(validation, _device(network))
     losses = Losses()
     for rate in schedule.learning_rates(len(training.inputs)).tolist():
         order = torch.randperm(len(training.inputs), generator=shuffling).numpy()
         loss = steps.epoch(order, rate)
         steps.load_into(network)
-        val_loss = None if watched is None else _loss(network, *watched)
+        val_loss = None if held_out is None else _loss(network, *held_out)
         losses.add(rate, loss, val_loss, lambda: weights_of(network))
         after_epoch()
     return losses.trained(weights_of(network))
@@ -159,19 +159,19 @@ def train(
 
 @torch.no_grad()
 def predict(network: nn.Module, inputs: Tensor) -> Tensor:
-    """A network's outputs for any number of inputs as its layout has them, (n, gyroscopes)."""
+    """Outputs of a network for inputs in its layout, (n, gyroscopes)."""
     forward = forward_of(network.eval())
     return torch.cat([forward(part) for part in inputs.split(_VALIDATION_BATCH)])
 
 
 def forward_of(network: nn.Module) -> Callable[[Tensor], Tensor]:
-    """What computes a network's outputs: of the paper's, its fast way for packed windows."""
+    """The forward function of a network; for the paper's, the fast one for packed windows."""
     forward: Callable[[Tensor], Tensor] = getattr(network, "forward_packed", network.forward)
     return forward
 
 
 def weights_of(network: nn.Module) -> StateDict:
-    """A copy on the CPU."""
+    """A copy of the weights on the CPU."""
     return {name: value.detach().cpu().clone() for name, value in network.state_dict().items()}
 
 

@@ -23,16 +23,16 @@ from gyro_pipeline.learning.jobs import (
 logger = logging.getLogger(__name__)
 
 _SHARE = 0.5
-"""Of the free memory that is planned for."""
+"""Share of the free memory that a batch may take."""
 _STEP = 20
-"""What a step keeps of a window, in sizes of that window. The paper's network needs 5 to 10."""
+"""Memory of a step for each window, in sizes of a window; the paper's network needs 5 to 10."""
 
 
 def batch_device(executor: str) -> torch.device | None:
-    """Where many networks are trained at once; None where they are trained in processes.
+    """The device on which networks are trained in batches; None to train them in processes.
 
     Args:
-        executor: ``auto`` is ``batched`` where there is a GPU.
+        executor: ``auto`` means ``batched`` if there is a GPU.
     """
     cuda = torch.cuda.is_available()
     if executor == "batched" or (executor == "auto" and cuda):
@@ -46,12 +46,12 @@ def run_trainings(
     """Train networks in batches, in this process.
 
     Args:
-        jobs: Independent of each other.
-        device: Where to train them.
-        label: Names the work in progress lines.
+        jobs: Independent trainings.
+        device: Device to train on.
+        label: Name of the work in progress lines.
 
     Yields:
-        The number of a job and its result, or why it has none, when its batch is finished.
+        The number of a job and its result or error, when its batch is finished.
     """
     numbers = {id(job): number for number, job in enumerate(jobs)}
     batches = in_batches(jobs, _SHARE * free_memory(device))
@@ -68,35 +68,34 @@ def run_trainings(
 
 
 def in_batches(jobs: Sequence[TrainingJob], memory: float) -> list[list[TrainingJob]]:
-    """Jobs of equal designs, schedules and numbers of windows, which can be trained step by step.
+    """Group jobs of equal designs, schedules and numbers of windows into batches.
 
     Args:
-        jobs: Any.
-        memory: Bytes that a batch may take. A training that takes more is a batch of its own.
+        jobs: Trainings of any kind.
+        memory: Bytes that a batch may take; a training that takes more is a batch alone.
     """
 
     def sizes(job: TrainingJob) -> str:
-        watched = job.validation.windows if job.validation else 0
-        return f"{job.design} {job.settings} {job.windows} {watched}"
+        return f"{job.design} {job.settings} {job.windows} {job.validation_windows}"
 
     batches = []
     for _, group in groupby(sorted(jobs, key=lambda job: (sizes(job), str(_cell(job)))), sizes):
-        alike = list(group)
-        count = max(1, int(memory / _bytes(alike[0])))
-        batches += [alike[first : first + count] for first in range(0, len(alike), count)]
+        members = list(group)
+        count = max(1, int(memory / _bytes(members[0])))
+        batches += [members[first : first + count] for first in range(0, len(members), count)]
     return batches
 
 
 def train_batch(
     batch: Sequence[TrainingJob], device: torch.device, label: str = ""
 ) -> list[TrainedNetwork]:
-    """Train the networks of a batch; the examples of a cell are prepared once for all its seeds.
+    """Train the networks of a batch; seeds of a cell share their examples.
 
-    Networks that cannot be trained at once are trained one by one; the log says why.
+    Networks that cannot be trained together are trained one by one, and the log says why.
 
     Args:
-        batch: One of :func:`in_batches`.
-        device: Where to train it.
+        batch: A batch from :func:`in_batches`.
+        device: Device to train on.
         label: See :func:`gyro_pipeline.learning.batched.train_together`.
     """
     started, first = time.time(), batch[0]
@@ -112,16 +111,13 @@ def train_batch(
         Learner(network, *examples[_cell(job)][:2], shuffling(job.seed))
         for job, network in zip(batch, networks, strict=True)
     ]
+    results = train_together(learners, first.settings, device, label)
+    engine = f"batched {device.type}"
     return [
         TrainedNetwork(
-            stored(job.design, examples[_cell(job)][2], trained),
-            trained.history,
-            started,
-            f"batched {device.type}",
+            stored(job.design, examples[_cell(job)][2], trained), trained.history, started, engine
         )
-        for job, trained in zip(
-            batch, train_together(learners, first.settings, device, label), strict=True
-        )
+        for job, trained in zip(batch, results, strict=True)
     ]
 
 
@@ -133,16 +129,16 @@ def _attempt(job: TrainingJob) -> TrainedNetwork | Exception:
 
 
 def free_memory(device: torch.device) -> float:
-    """Free bytes."""
+    """Free memory of a device, bytes."""
     if device.type == "cuda":
         return float(torch.cuda.mem_get_info(device)[0])
     return float(psutil.virtual_memory().available)
 
 
 def _bytes(job: TrainingJob) -> float:
-    """Estimate of what a training takes: its examples, and what a step keeps."""
+    """Estimated memory of a training: its examples, and the tensors of a step."""
     rows, columns = job.design.layout.shape
-    examples = job.windows + (job.validation.windows if job.validation else 0)
+    examples = job.windows + job.validation_windows
     return 4.0 * rows * columns * (2 * examples + _STEP * job.settings.batch_size)
 
 

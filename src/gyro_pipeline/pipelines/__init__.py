@@ -1,7 +1,7 @@
-"""The seven stages, one folder each; a stage never imports another.
+"""The seven stages, a folder for each; a stage never imports another one.
 
-Datasets are named as addresses (``sparkfun.ground_truth.bias``), nodes are grouped by stage. Kedro
-reserves dots for namespaces and warns of every such name; here they are meant.
+Names of datasets have the form ``sparkfun.ground_truth.bias``, and nodes are grouped by stage.
+Kedro reserves dots for namespaces and warns of every such name; here they are intended.
 """
 
 import warnings

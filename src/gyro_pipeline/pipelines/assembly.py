@@ -1,4 +1,4 @@
-"""The pipelines that the parameters ask for, put together from the stages: a table of contents."""
+"""The pipelines for the given parameters, assembled from the stages."""
 
 from collections.abc import Iterable
 
@@ -18,27 +18,27 @@ from gyro_pipeline.studies import used_sensors
 
 
 def assemble(parameters: Parameters) -> dict[str, Pipeline]:
-    """All pipelines; each study ends by writing its own tables and figures."""
-    left = used_sensors(parameters)
-    # where nothing is left, a check says so
+    """All pipelines; each study ends with its tables and figures."""
+    narrowed = used_sensors(parameters)
+    # a pipeline is never empty, so that a check can report that the filters leave no sensor
     whole = {
         name: study.sensors_among(parameters.sensors) for name, study in parameters.studies.items()
     }
     default = [name for name, study in parameters.studies.items() if study.default]
-    shown = left if any(left[name] for name in default) else whole
-    known = [name for name in parameters.sensors if parameters.only.sensor in (None, name)]
-    pipelines = {name: _study(parameters, {name: left[name] or whole[name]}) for name in whole}
-    pipelines["__default__"] = _study(parameters, {name: shown[name] for name in default})
+    studied = narrowed if any(narrowed[name] for name in default) else whole
+    sensors = [name for name in parameters.sensors if parameters.only.sensor in (None, name)]
+    pipelines = {name: _study(parameters, {name: narrowed[name] or whole[name]}) for name in whole}
+    pipelines["__default__"] = _study(parameters, {name: studied[name] for name in default})
     pipelines["reporting"] = Pipeline(
         [node for node in pipelines["__default__"].nodes if not _makes_runs(node)]
     )
     pipelines["ground_truth"] = sum(
-        (_measured(sensor) + ground_truth.create_report(sensor) for sensor in known), Pipeline([])
+        (_measured(sensor) + ground_truth.create_report(sensor) for sensor in sensors), Pipeline([])
     )
     pipelines["virtual_gyros"] = sum(
         (
             _measured(sensor) + virtual_gyros.create_pipeline(sensor)
-            for sensor in known
+            for sensor in sensors
             if sensor in _virtual_sensors(parameters, parameters.studies)
         ),
         Pipeline([]),
@@ -47,8 +47,8 @@ def assemble(parameters: Parameters) -> dict[str, Pipeline]:
 
 
 def _study(parameters: Parameters, studies: dict[str, list[str]]) -> Pipeline:
-    """From raw logs to the report of some studies; nothing where none is left."""
-    sensors = list(dict.fromkeys(sensor for own in studies.values() for sensor in own))
+    """From raw logs to the report of some studies; empty without sensors."""
+    sensors = list(dict.fromkeys(sensor for names in studies.values() for sensor in names))
     if not sensors:
         return Pipeline([])
     virtual = _virtual_sensors(parameters, studies)
@@ -80,7 +80,7 @@ def _measured(sensor: str) -> Pipeline:
 
 
 def _virtual_sensors(parameters: Parameters, studies: Iterable[str]) -> set[str]:
-    """Sensors of which some of these studies trains on virtual gyroscopes."""
+    """Sensors with virtual gyroscopes in at least one of the studies."""
     return {
         sensor
         for study in (parameters.studies[name] for name in studies)

@@ -1,6 +1,6 @@
-"""The test bench: windows of a sensor that test, on which every estimator is judged alike."""
+"""The test bench: the test windows of a sensor, on which all estimators are judged alike."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations, product
@@ -55,29 +55,21 @@ SCORES = ["weights", "truth", "windows", "score", "value", "lo", "hi"]
 """Columns of a table of scores."""
 
 SIGMAS = {"coverage_1sigma_pct": 1.0, "coverage_2sigma_pct": 2.0, "coverage_95_pct": 1.959964}
-"""Of stated standard deviations, within how many an error is counted."""
+"""Numbers of standard deviations within which errors are counted."""
 
 TARGETS = (RECORDING_MEAN, BIAS)
-_FEWEST_CORRELATED = 5
+_MIN_CORRELATED = 5
 
 
 @dataclass(frozen=True)
 class Bench:
-    """The windows of a sensor that test, of one length, on which every estimator is judged alike.
+    """The test windows of a sensor, of one length, on which all estimators are judged alike."""
 
-    Attributes:
-        recordings: All recordings of the sensor, of one length.
-        device: What is known of the IMUs that test, from :func:`describe_devices`.
-        tests: The rows of the windows table that test: ``fold, imu, recording, start``.
-        window_s: Calibration time T0, seconds.
-        labels: Means of the device's training recordings in each fold, (n, axes), deg/s; none of
-            unseen devices.
-    """
-
-    recordings: xr.Dataset
-    device: TestDevice
-    tests: pd.DataFrame
-    window_s: float
+    recordings: xr.Dataset  # all recordings of the sensor, of one length
+    device: TestDevice  # the tested IMUs
+    tests: pd.DataFrame  # test rows of the windows table: fold, imu, recording, start
+    window_s: float  # calibration time T0, seconds
+    # means of the device's training recordings by fold, (n, axes), deg/s; empty if unseen
     labels: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @cached_property
@@ -93,10 +85,10 @@ class Bench:
 
     @cached_property
     def tested(self) -> list[TestRecording]:
-        """The recordings that test, with what is needed to judge an estimate."""
-        drawn, tested = "true_bias" in self.recordings, []
-        for place, rows in self.tests.groupby(["imu", "recording"]):
-            imu, number = map(int, map(str, place))
+        """The test recordings, with their noise and starts of windows."""
+        simulated, tested = "true_bias" in self.recordings, []
+        for key, rows in self.tests.groupby(["imu", "recording"]):
+            imu, number = map(int, map(str, key))
             recording = self.recordings.sel(imu=imu, recording=number)
             tested.append(
                 TestRecording(
@@ -104,7 +96,7 @@ class Bench:
                     samples=recording.angular_rate.to_numpy(),
                     rate_hz=self.recordings.attrs["rate_hz"],
                     noise=self.device.figures[self._axes(imu)],
-                    true_bias=recording.true_bias.to_numpy() if drawn else None,
+                    true_bias=recording.true_bias.to_numpy() if simulated else None,
                     imu=imu,
                     tested=np.unique(rows.start.to_numpy()),
                 )
@@ -113,30 +105,30 @@ class Bench:
 
     @cached_property
     def _truths(self) -> list[dict[str, tuple[np.ndarray, np.ndarray]]]:
-        """The truths of each recording that tests."""
+        """The truths of each test recording."""
         return [recording.truths(recording.tested, self.size) for recording in self.tested]
 
     def _axes(self, imu: int) -> slice:
-        """Where the axes of an IMU are among those of ``device``."""
+        """Position of the axes of an IMU among those of ``device``."""
         first = len(AXES) * self.device.imus.index(imu)
         return slice(first, first + len(AXES))
 
     def errors(self, estimators: Mapping[str, Estimator], imus: int = 1) -> pd.DataFrame:
-        """Errors in all windows that test against all truths, each estimated by its fold's fit.
+        """Errors in all test windows against all truths, each estimated by the fit of its fold.
 
-        The estimator is asked for the target that each truth is about.
+        The target of an estimate is that of the truth.
 
         Args:
             estimators: The fit of each fold.
-            imus: IMUs that it sees side by side, the tested one first.
+            imus: Number of IMUs side by side, the tested one first.
 
         Raises:
-            InputError: There is no estimate for some window.
+            InputError: The estimate of a window is NaN.
         """
-        told = {fold: self._told(str(fold), fit) for fold, fit in estimators.items()}
+        fits = {fold: self._with_calibrations(str(fold), fit) for fold, fit in estimators.items()}
         parts = []
         for recording, truths in zip(self.tested, self._truths, strict=True):
-            estimates = self._estimates(told, recording, imus)
+            estimates = self._estimates(fits, recording, imus)
             parts += [
                 error_columns(recording, truth, value, *estimates[TARGET_OF[truth]])
                 for truth, value in truths.items()
@@ -150,8 +142,8 @@ class Bench:
             )
         return errors
 
-    def _told(self, fold: str, estimator: Estimator) -> Estimator:
-        """The fit of a fold, told of the recordings that test there: past ones to later ones."""
+    def _with_calibrations(self, fold: str, estimator: Estimator) -> Estimator:
+        """The fit of a fold with its test recordings as calibrations, for the later ones."""
         numbers = np.unique(self.tests.recording[self.tests.fold == fold])
         if len(self.device.imus) > 1:
             return estimator
@@ -161,46 +153,48 @@ class Bench:
     def _estimates(
         self, estimators: Mapping[str, Estimator], recording: TestRecording, imus: int
     ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Biases and sigma (windows, 3) of a recording's windows, by target."""
+        """Biases and sigma of the windows of a recording, (windows, 3), by target."""
         samples = recording.samples
         if imus > 1:
-            seen = self.recordings.angular_rate.isel(imu=slice(imus))
-            samples = np.concatenate(seen.sel(recording=recording.number).to_numpy())
+            rates = self.recordings.angular_rate.isel(imu=slice(imus))
+            samples = np.concatenate(rates.sel(recording=recording.number).to_numpy())
         rows = self._rows(recording)
         shape = (len(recording.tested), len(AXES))
         estimates = {t: (np.full(shape, np.nan), np.full(shape, np.nan)) for t in TARGETS}
-        for fold, own in rows.groupby("fold", observed=True):
-            starts = np.sort(own.start.to_numpy())
-            places = np.searchsorted(recording.tested, starts)
-            # whatever the IMUs beside the tested one lost
+        for fold, in_fold in rows.groupby("fold", observed=True):
+            starts = np.sort(in_fold.start.to_numpy())
+            positions = np.searchsorted(recording.tested, starts)
+            # even where the IMUs beside the tested one lost samples
             windows = windows_at(samples, self.size, starts).transpose(1, 0, 2)
-            when = starts / self.recordings.attrs["rate_hz"], recording.number
-            for target, of_target in estimates.items():
-                found = estimators[str(fold)].estimate(windows, target, *when)
-                for values, estimated in zip(of_target, found, strict=True):
-                    values[places] = estimated[:, : len(AXES)]
+            starts_s = starts / self.recordings.attrs["rate_hz"]
+            for target, arrays in estimates.items():
+                results = estimators[str(fold)].estimate(
+                    windows, target, starts_s, recording.number
+                )
+                for array, result in zip(arrays, results, strict=True):
+                    array[positions] = result[:, : len(AXES)]
         return estimates
 
     @cached_property
     def mean_errors(self) -> pd.DataFrame:
         """Errors of the running mean."""
-        mean = RunningMean()
-        return self.errors(dict.fromkeys(map(str, self.tests.fold.unique()), mean))
+        folds = map(str, self.tests.fold.unique())
+        return self.errors(dict.fromkeys(folds, RunningMean()))
 
     @cached_property
     def _means(self) -> dict[tuple[str, str], SquaredErrors]:
-        """Squares of the running mean's errors by truth and windows."""
+        """Squared errors of the running mean by truth and windows."""
         return _by_view(self.mean_errors)
 
     @cached_property
     def _references(self) -> dict[str, dict[tuple[str, str], SquaredErrors]]:
-        """Squares of the oracle's and the constant's errors on these windows, if they are known."""
-        known = {"oracle": self.oracle_errors, "constant": self.constant_errors}
-        return {name: _by_view(errors) for name, errors in known.items() if errors is not None}
+        """Squared errors of the oracle and the constant, if they exist."""
+        tables = {"oracle": self.oracle_errors, "constant": self.constant_errors}
+        return {name: _by_view(errors) for name, errors in tables.items() if errors is not None}
 
     @cached_property
     def _weights(self) -> np.ndarray:
-        """Of the recordings, leaving one out in turn."""
+        """Weights of recordings, with each left out in turn."""
         return leave_one_out(int(clusters(self.mean_errors).nunique()))
 
     @cached_property
@@ -211,99 +205,100 @@ class Bench:
 
     @cached_property
     def curves(self) -> dict[tuple[str, str], WeightedCurve]:
-        """The same by truth and windows, leaving one recording out in turn."""
+        """The running-mean curve by truth and windows, with each recording left out in turn."""
         views = product(self.curve.truth.unique(), (FIRST, ALL))
         return {view: curve_errors(self.curve, *view).of(self._weights) for view in views}
 
     @cached_property
     def oracle_errors(self) -> pd.DataFrame | None:
-        """Errors of the best possible estimator for each truth; None where it is not known."""
+        """Errors of the best possible estimator for each truth; None on measured data."""
         if self.device.unit_bias is None:
             return None
-        parts = []
-        for recording, truths in zip(self.tested, self._truths, strict=True):
-            for truth, known in truths.items():
-                best = self._best(recording, truth)
-                sigma = np.full(best.shape, np.nan)
-                parts.append(error_columns(recording, truth, known, best, sigma))
-        return stack_columns(parts)
+        return self._errors_without_sigma(self._oracle_estimates)
 
     @cached_property
     def constant_errors(self) -> pd.DataFrame | None:
-        """Errors of the mean of the training recordings; None of devices that none is of."""
+        """Errors of the mean of the training recordings; None for unseen devices."""
         if not self.labels:
             return None
+
+        def constants(recording: TestRecording, truth: str) -> np.ndarray:
+            rows = self._rows(recording).sort_values("start").drop_duplicates("start")
+            return np.stack([self.labels[fold].mean(axis=0) for fold in rows.fold])
+
+        return self._errors_without_sigma(constants)
+
+    def _errors_without_sigma(
+        self, estimate: Callable[[TestRecording, str], np.ndarray]
+    ) -> pd.DataFrame:
         parts = []
         for recording, truths in zip(self.tested, self._truths, strict=True):
-            rows = self._rows(recording).sort_values("start").drop_duplicates("start")
-            constants = np.stack([self.labels[fold].mean(axis=0) for fold in rows.fold])
-            none = np.full(constants.shape, np.nan)
-            parts += [
-                error_columns(recording, truth, known, constants, none)
-                for truth, known in truths.items()
-            ]
+            for truth, value in truths.items():
+                biases = estimate(recording, truth)
+                sigma = np.full(biases.shape, np.nan)
+                parts.append(error_columns(recording, truth, value, biases, sigma))
         return stack_columns(parts)
 
     @cached_property
     def prior_p(self) -> dict[str, float]:
-        """How probable the tested recordings are, by axis, if they are like those that train.
+        """P values by axis that the tested recordings have the distribution of the training ones.
 
-        The least of all folds, corrected for their number.
+        The least p value of all folds is corrected for their number.
         """
         if not self.labels:
             return {}
-        means = {(one.imu, one.number): one.mean for one in self.tested}
-        chances = []
+        means = {(recording.imu, recording.number): recording.mean for recording in self.tested}
+        p_values = []
         for fold, rows in self.tests.groupby("fold", observed=True):
-            places = rows[["imu", "recording"]].drop_duplicates().itertuples(index=False, name=None)
-            tested = np.stack([means[place] for place in places])
-            chances.append(prior_conflict(self.labels[str(fold)], tested))
-        least = np.minimum(len(chances) * np.min(chances, axis=0), 1.0)
+            keys = rows[["imu", "recording"]].drop_duplicates().itertuples(index=False, name=None)
+            tested = np.stack([means[key] for key in keys])
+            p_values.append(prior_conflict(self.labels[str(fold)], tested))
+        least = np.minimum(len(p_values) * np.min(p_values, axis=0), 1.0)
         return dict(zip(AXES, least.tolist(), strict=True))
 
     def _rows(self, recording: TestRecording) -> pd.DataFrame:
-        """Windows of a recording that test."""
-        own = (self.tests.imu == recording.imu) & (self.tests.recording == recording.number)
-        return self.tests[own]
+        """Test windows of a recording."""
+        tests = self.tests
+        return tests[(tests.imu == recording.imu) & (tests.recording == recording.number)]
 
-    def _best(self, recording: TestRecording, truth: str) -> np.ndarray:
-        """Estimates by one who knows what was drawn, (windows, 3), deg/s."""
+    def _oracle_estimates(self, recording: TestRecording, truth: str) -> np.ndarray:
+        """Estimates of the oracle, which knows the drawn values, (windows, 3), deg/s."""
         device, size = self.device, self.size
         if device.models is None:
             assert device.unit_bias is not None
             means = recording.window_means(recording.tested, size)
             axes = self._axes(recording.imu)
-            known = (device.unit_bias[axes], device.spread[0, axes], device.noise[axes])
-            return oracle(means, *known, self.window_s, self.recording_s, truth)
+            prior = device.unit_bias[axes], device.spread[0, axes], device.noise[axes]
+            return oracle(means, *prior, self.window_s, self.recording_s, truth)
         starts = recording.tested
         windows = cut_windows(recording.samples, size, starts)
         estimates = [
             [
-                self._line(model, axis, start, truth)(one[None])[0]
-                for start, one in zip(starts.tolist(), rows, strict=True)
+                self._line(model, axis, start, truth)(window[None])[0]
+                for start, window in zip(starts.tolist(), rows, strict=True)
             ]
             for rows, (axis, model) in zip(windows, self._models(recording), strict=True)
         ]
         return np.stack(estimates, axis=-1)
 
     def _models(self, recording: TestRecording) -> list[tuple[int, RecordingModel]]:
-        """The device's models for one recording: with the time constants of its power-on.
+        """The models of the device, with the time constants of a recording.
 
-        Each with the number of its axis among those of ``device``.
+        Each comes with the number of its axis among those of ``device``.
         """
         assert self.device.models is not None
         axes = self._axes(recording.imu)
         models = self.device.models[axes]
-        drawn = self.recordings.get("true_time_constant")
-        if drawn is not None:
-            constants_s = drawn.sel(imu=recording.imu, recording=recording.number)
-            both = zip(models, constants_s.to_numpy().tolist(), strict=True)
-            models = tuple(replace(model, time_constant_s=constant) for model, constant in both)
+        time_constants = self.recordings.get("true_time_constant")
+        if time_constants is not None:
+            constants_s = time_constants.sel(imu=recording.imu, recording=recording.number)
+            pairs = zip(models, constants_s.to_numpy().tolist(), strict=True)
+            models = tuple(replace(model, time_constant_s=constant) for model, constant in pairs)
         return list(enumerate(models, axes.start))
 
     @cached_property
     def _distinct(self) -> dict[tuple[int, float], RecordingModel]:
-        """All models that differ, by axis and time constant."""
+        """All distinct models, by axis and time constant."""
         if self.device.models is None:
             return {}
         return {
@@ -317,7 +312,7 @@ class Bench:
         return {}
 
     def _line(self, model: RecordingModel, axis: int, start: int, truth: str) -> LinearEstimate:
-        """The best linear estimate of a window under the model of its axis, worked out once."""
+        """The best linear estimate of a window under the model of its axis, cached."""
         key = axis, model.time_constant_s, start, truth
         if key not in self._lines:
             self._lines[key] = best_linear(model, start, self.size, truth)
@@ -325,27 +320,27 @@ class Bench:
 
     @cached_property
     def ceilings(self) -> Ceilings:
-        """What can be expected of the best."""
+        """The least expected errors."""
         distinct = [(axis, model) for (axis, _), model in self._distinct.items()]
         samples, rate_hz = self.recordings.sizes["sample"], self.recordings.attrs["rate_hz"]
         return Ceilings(self.device, distinct, self.size, samples, rate_hz)
 
     def scores(self, errors: pd.DataFrame, weights: str) -> pd.DataFrame:
-        """All figures of merit of one set of errors; only finite ones.
+        """All finite scores of a table of errors.
 
         Args:
-            errors: From :meth:`errors`.
-            weights: ``last`` or ``best``, of a network.
+            errors: Errors from :meth:`errors`.
+            weights: ``last``, or ``best`` for a network.
 
         Returns:
-            Columns ``weights, truth, windows, score, value, lo, hi``; the ends are those of the
-            95 % interval, None where there is none.
+            Columns ``weights, truth, windows, score, value, lo, hi``; ``lo`` and ``hi`` are the
+            ends of the 95 % interval, None without an interval.
         """
         rows = []
         for truth, windows in product(errors.truth.unique(), (FIRST, ALL)):
-            own, mean = squared_errors(errors, truth, windows), self._means[truth, windows]
+            squares, mean = squared_errors(errors, truth, windows), self._means[truth, windows]
             curve = self.curves[truth, windows]
-            scores = score(own, mean, curve, self.window_s, self._weights)
+            scores = score(squares, mean, curve, self.window_s, self._weights)
             if weights == LAST:
                 scores |= self.ceilings.of(truth, windows) | self._realised(truth, windows)
             if truth != DISJOINT:
@@ -354,7 +349,7 @@ class Bench:
                 for name, sigmas in SIGMAS.items():
                     scores[name] = Estimate(100 * coverage(errors, truth, sigmas))
             if "oracle" in self._references and len(self._weights) > 1:
-                p = beats_oracle(own, self._references["oracle"][truth, windows])
+                p = beats_oracle(squares, self._references["oracle"][truth, windows])
                 scores["beats_oracle_p"] = Estimate(p)
             if (truth, windows) == (PAPER, ALL):
                 scores |= {f"prior_p_{axis}": Estimate(p) for axis, p in self.prior_p.items()}
@@ -367,7 +362,7 @@ class Bench:
         return pd.DataFrame(rows, columns=SCORES)
 
     def _realised(self, truth: str, windows: str) -> dict[str, Estimate]:
-        """What the oracle and the constant reach on the same windows."""
+        """Scores of the oracle and the constant on the same windows."""
         scores, mean = {}, self._means[truth, windows].mean(self._weights)
         for name, squares in self._references.items() if truth != DISJOINT else ():
             square = squares[truth, windows].mean(self._weights)
@@ -380,19 +375,19 @@ class Bench:
         """A of each axis."""
         scores = {}
         for axis in AXES:
-            own, mean = (
+            square, mean = (
                 squared_errors(table[table.axis == axis], truth, windows).mean(self._weights)
                 for table in (errors, self.mean_errors)
             )
             with np.errstate(divide="ignore", invalid="ignore"):
-                ratio = with_interval(np.sqrt(own / mean), positive=True)
+                ratio = with_interval(np.sqrt(square / mean), positive=True)
             scores[f"accuracy_gain_pct_{axis}"] = gain_pct(ratio)
         return scores
 
     def _turn_on_correlations(self) -> dict[str, Estimate]:
-        """Of the means of training recordings, between axes, with intervals (Fisher 1915)."""
+        """Correlations of the training labels between axes, with intervals (Fisher 1915)."""
         labels = max(self.labels.values(), key=len, default=np.empty(0))
-        if len(labels) < _FEWEST_CORRELATED:
+        if len(labels) < _MIN_CORRELATED:
             return {}
         scores, half = {}, 1.96 / np.sqrt(len(labels) - 3)
         for (i, first), (j, second) in combinations(enumerate(AXES), 2):

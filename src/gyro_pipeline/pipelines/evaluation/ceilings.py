@@ -1,4 +1,4 @@
-"""What can be expected of the best estimator on a device, by the premise that it rests on."""
+"""Ceilings: the least expected errors on a device, and their premises."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,49 +19,41 @@ from gyro_pipeline.pipelines.evaluation.device import TestDevice
 from gyro_pipeline.scoring.scores import CONFIDENCE_PCT, Estimate, WeightedCurve
 
 PREMISE = "linear, axis by axis, recordings exchangeable, no history"
-"""What the ceiling of measured data is: honest estimators can be better where it does not hold."""
+"""Premise of the ceiling on measured data; where it does not hold, estimators can be better."""
 
 _CURVE_POINTS = 30  # of the expected running mean, to interpolate between
 
 
 @dataclass(frozen=True)
 class Ceilings:
-    """Least expected errors on a device, for windows of one length.
+    """Least expected errors on a device, for windows of one length."""
 
-    Attributes:
-        device: What is known of the device that tests.
-        distinct: Its models, by axis and time constant, where noise is not white or a bias warms
-            up.
-        size: Samples of a window.
-        samples: Of a recording.
-        rate_hz: Samples per second.
-    """
-
-    device: TestDevice
+    device: TestDevice  # the tested device
+    # distinct models by axis and time constant, unless noise is white without warm-up
     distinct: Sequence[tuple[int, RecordingModel]]
-    size: int
-    samples: int
-    rate_hz: float
+    size: int  # samples of a window
+    samples: int  # samples of a recording
+    rate_hz: float  # samples per second
 
     @property
     def basis(self) -> str:
-        """In words, what the ceilings are computed from."""
+        """The basis of the ceilings, in words."""
         if self.device.unit_bias is None:
             noise = "white noise" if self.device.models is None else "fitted N, B and K"
             return f"estimated from recordings, {noise}; {PREMISE}"
         if self.device.models is not None and len(self.distinct) > len(self.device.models):
             return (
-                "drawn values, the time constant of each warm-up among them: nobody who must learn "
-                "it from the window can come this far"
+                "drawn values, the time constant of each warm-up among them: an estimator that "
+                "must learn it from the window cannot be as good"
             )
         return "drawn values"
 
     def of(self, truth: str, windows: str) -> dict[str, Estimate]:
-        """RMSE, A and, for the paper's truth, S of the best; also jointly over axes, with history.
+        """RMSE, A and, for the paper's truth, S of the best; also joint over axes and with history.
 
-        On measured data each has the interval that what is not known of the turn-on spread leaves.
-        Nothing is returned for the mean outside the window where noise is coloured or a bias warms
-        up: estimators are asked for the bias, which is something else there.
+        On measured data intervals follow from the uncertainty of the turn-on spread. For the mean
+        outside the window the result is empty if noise is coloured or a bias warms up: estimators
+        estimate the bias, from which that mean then differs.
 
         Args:
             truth: PAPER, DISJOINT or TRUE.
@@ -69,12 +61,12 @@ class Ceilings:
         """
         if truth == DISJOINT and self.device.models is not None:
             return {}
-        if (truth, windows) not in self._made:
-            self._made[truth, windows] = self._of(truth, windows)
-        return self._made[truth, windows]
+        if (truth, windows) not in self._cache:
+            self._cache[truth, windows] = self._of(truth, windows)
+        return self._cache[truth, windows]
 
     @cached_property
-    def _made(self) -> dict[tuple[str, str], dict[str, Estimate]]:
+    def _cache(self) -> dict[tuple[str, str], dict[str, Estimate]]:
         return {}
 
     def _of(self, truth: str, windows: str) -> dict[str, Estimate]:
@@ -101,9 +93,9 @@ class Ceilings:
             others["joint"] = np.mean(squares, axis=0), mean[0]
         if device.history is not None:
             others["history"] = self._expected(truth, windows, self.size, device.history[None])
-        for name, (square, of_mean) in others.items():
+        for name, (square, mean_square) in others.items():
             limits[f"ceiling_{name}_rmse_dps"] = with_draws(np.sqrt(square))
-            gain = 100 * best_gain(np.sqrt(square / of_mean))
+            gain = 100 * best_gain(np.sqrt(square / mean_square))
             limits[f"ceiling_{name}_accuracy_gain_pct"] = with_draws(gain)
         return limits
 
@@ -120,10 +112,10 @@ class Ceilings:
             truth: PAPER, DISJOINT or TRUE.
             windows: ``first`` or ``all``.
             size: Samples of the window.
-            variances: Of the prior of the bias, (n, axes), (deg/s)^2.
+            variances: Prior variances of the bias, (n, axes), (deg/s)^2.
 
         Returns:
-            Two of (n,), (deg/s)^2.
+            Two arrays (n,), (deg/s)^2.
         """
         device = self.device
         if device.models is None:
@@ -140,12 +132,12 @@ class Ceilings:
         return best, mean
 
     def _saving(self, windows: str, ratio: np.ndarray, limit: np.ndarray) -> np.ndarray:
-        """1 - T0 / t*, where the running mean of t* is expected to be as good as the limit."""
+        """1 - T0 / t*, where the running mean of t* has the expected error ``limit``."""
         if self.device.models is None:
             return best_saving(ratio, self.size / self.samples)
         sizes = np.unique(np.geomspace(self.size, self.samples, _CURVE_POINTS).astype(int))
         first = self.device.spread[:1] ** 2
-        # of the whole recording it is 0, but for rounding
+        # 0 for the whole recording, except rounding
         curve = [max(self._expected(PAPER, windows, int(n), first)[1][0], 0.0) for n in sizes]
         falling = WeightedCurve(sizes.astype(float), np.sqrt([curve]), np.ones(sizes.size)).falling
         reached = np.interp(-limit, -falling, sizes)
@@ -153,14 +145,14 @@ class Ceilings:
 
 
 def _priors(model: RecordingModel, variances: np.ndarray) -> np.ndarray:
-    """Covariances of a model's prior with each of the variances of the bias, (n, k, k)."""
+    """Prior covariances of a model for several variances of the bias, (n, k, k)."""
     covariances = np.repeat(model.covariance[None], len(variances), axis=0)
     covariances[:, 0, 0] = variances
     return covariances
 
 
 def with_draws(values: np.ndarray) -> Estimate:
-    """The first value, with the central 95 % of the others as its interval, if there are any."""
+    """The first value, with the central 95 % of any others as its interval."""
     if len(values) == 1:
         return Estimate(float(values[0]))
     tails = 50 + np.array([-CONFIDENCE_PCT, CONFIDENCE_PCT]) / 2

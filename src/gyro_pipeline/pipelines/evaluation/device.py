@@ -1,4 +1,4 @@
-"""What is known of a device that is tested: its noise, and how its bias scatters."""
+"""The description of tested devices: their noise, and the spread of their bias."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,38 +16,33 @@ from gyro_pipeline.physics.recording_model import RecordingModel
 from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, fit_recording_model
 
 UNIT_SPREAD = 1.0
-"""Standard deviation of the bias from unit to unit, deg/s: 0.7 to 1.9 on the public DOT files."""
+"""Standard deviation of the bias from unit to unit, deg/s; 0.7 to 1.9 on the public DOT files."""
 
 _DRAWS = 400
-_PLACE = ["imu", "recording"]
+_KEYS = ["imu", "recording"]
 
 
 @dataclass(frozen=True)
 class TestDevice:
-    """What is known of the test IMU, per axis: drawn if simulated, else from its recordings.
+    """The tested IMU, axis by axis: the drawn values if simulated, else from its recordings.
 
-    Of several unseen devices, the axes of one after the other.
-
-    Attributes:
-        imus: The IMUs that test, in order.
-        noise: N, shape (axes,), deg/s sqrt(s).
-        spread: Turn-on spread tau, shape (1 + draws, axes), deg/s: the estimate, then what the
-            recordings allow; of an unseen device, that of units.
-        unit_bias: Drawn prior mean, shape (axes,), deg/s; None on measured data.
-        models: Of each axis, where its noise is not white or its bias warms up; drawn if simulated
-            (a time constant is then that of the recording at hand), else fitted.
-        joint: Covariance of the turn-on bias of all axes, (1 + draws, axes, axes), (deg/s)^2; None
-            where few recordings do not tell, and of drawn values, where axes are independent.
-        history: Variance of the next bias given the calibrations before it, (axes,), mean over
-            the recordings that test, (deg/s)^2; None likewise.
+    The axes of several unseen devices follow one another.
     """
 
-    imus: tuple[int, ...]
-    noise: np.ndarray
+    imus: tuple[int, ...]  # the tested IMUs, in order
+    noise: np.ndarray  # N, (axes,), deg/s sqrt(s)
+    # Turn-on spread tau, (1 + draws, axes), deg/s: the estimate, then draws of its uncertainty; for
+    # an unseen device, the spread of units.
     spread: np.ndarray
-    unit_bias: np.ndarray | None
+    unit_bias: np.ndarray | None  # drawn prior mean, (axes,), deg/s; None on measured data
+    # The model of each axis, if its noise is not white or its bias warms up: drawn if simulated
+    # (with the time constant of a single recording), else fitted.
     models: tuple[RecordingModel, ...] | None = None
+    # Covariance of the turn-on bias of all axes, (1 + draws, axes, axes), (deg/s)^2; None with few
+    # recordings, and on simulated data, where axes are independent.
     joint: np.ndarray | None = None
+    # Variance of the next bias given the calibrations before it, mean over the test recordings,
+    # (axes,), (deg/s)^2; None likewise.
     history: np.ndarray | None = None
 
     @property
@@ -61,29 +56,29 @@ class TestDevice:
 def describe_devices(
     recordings: xr.Dataset, bias: pd.DataFrame, allan: xr.Dataset, table: pd.DataFrame
 ) -> TestDevice:
-    """What is known of the devices that test, from the recordings that do not test with them.
+    """Describe the tested devices by the recordings that do not test in the same folds.
 
     Args:
-        recordings: With the drawn values on simulated data.
+        recordings: Recordings, with the drawn values on simulated data.
         bias: Ground truth.
         allan: Allan variances.
-        table: A windows table. A device is known if some fold in which it tests trains on it.
+        table: A windows table. A device is known if a fold in which it tests trains on it.
     """
     imus = sorted(table.imu[table.role == TEST].unique().tolist())
-    places = table[table.origin == ORIGIN_REAL].drop_duplicates(["fold", "role", *_PLACE])
-    learned = places[places.role != TEST]
-    tests = places[places.role == TEST].groupby("imu").fold.unique()
-    own = [learned[(learned.imu == imu) & learned.fold.isin(tests[imu])] for imu in imus]
-    if len(imus) == 1 and len(own[0]):
+    rows = table[table.origin == ORIGIN_REAL].drop_duplicates(["fold", "role", *_KEYS])
+    learning = rows[rows.role != TEST]
+    tests = rows[rows.role == TEST].groupby("imu").fold.unique()
+    training = [learning[(learning.imu == imu) & learning.fold.isin(tests[imu])] for imu in imus]
+    if len(imus) == 1 and len(training[0]):
         if recordings.attrs["simulated"]:
             return _describe_drawn(recordings, imus[0])
         of_imu = bias[bias.imu == imus[0]]
         means = of_imu.pivot(index="recording", columns="axis", values="bias_dps")
-        tested = places.recording[places.role == TEST].unique()
-        trained = means.loc[means.index.isin(own[0].recording)]
+        tested = rows.recording[rows.role == TEST].unique()
+        trained = means.loc[means.index.isin(training[0].recording)]
         return _describe_known(recordings, trained, means.loc[sorted(tested)], allan, imus[0])
-    others = learned[learned.fold.isin(tests.explode())][_PLACE].drop_duplicates()
-    return _describe_unseen(recordings, allan, sorted(map(tuple, others.to_numpy().tolist())), imus)
+    keys = learning[learning.fold.isin(tests.explode())][_KEYS].drop_duplicates()
+    return _describe_unseen(recordings, allan, sorted(map(tuple, keys.to_numpy().tolist())), imus)
 
 
 def training_labels(bias: pd.DataFrame, table: pd.DataFrame) -> dict[str, np.ndarray]:
@@ -94,52 +89,50 @@ def training_labels(bias: pd.DataFrame, table: pd.DataFrame) -> dict[str, np.nda
         table: A windows table.
 
     Returns:
-        By fold, of those that test; empty where a fold has none, or several devices test.
+        Means by test fold; empty if a fold has no training recording, or several devices test.
     """
-    places = table[table.origin == ORIGIN_REAL].drop_duplicates(["fold", "role", *_PLACE])
-    tested = places.imu[places.role == TEST].unique().tolist()
+    rows = table[table.origin == ORIGIN_REAL].drop_duplicates(["fold", "role", *_KEYS])
+    tested = rows.imu[rows.role == TEST].unique().tolist()
     if len(tested) > 1:
         return {}
     means = bias[bias.imu == tested[0]].pivot(index="recording", columns="axis", values="bias_dps")
-    own = places[(places.imu == tested[0]) & (places.role != TEST)]
+    training = rows[(rows.imu == tested[0]) & (rows.role != TEST)]
     labels = {
-        str(fold): means.loc[sorted(own.recording[own.fold == fold].unique())].to_numpy()
-        for fold in places.fold[places.role == TEST].unique()
+        str(fold): means.loc[sorted(training.recording[training.fold == fold].unique())].to_numpy()
+        for fold in rows.fold[rows.role == TEST].unique()
     }
     return labels if all(map(len, labels.values())) else {}
 
 
 def _describe_unseen(
-    recordings: xr.Dataset,
-    allan: xr.Dataset,
-    places: Sequence[tuple[int, int]],
-    imus: Sequence[int],
+    recordings: xr.Dataset, allan: xr.Dataset, keys: Sequence[tuple[int, int]], imus: Sequence[int]
 ) -> TestDevice:
-    """Several devices, as one knows them who has never seen them.
+    """Describe several devices without their recordings.
 
-    All that is known of their bias is the spread of units, for which that of the public DOT files
-    is taken. It is so large that the ceiling is the running mean if the noise is white. Noise is
-    that of all devices together, of which single ones have few recordings.
+    The prior of their bias is the spread of units on the public DOT files. It is so large that the
+    ceiling is the running mean if the noise is white. The noise is fitted to all devices together,
+    since single ones have few recordings.
 
     Args:
-        recordings: With the drawn values on simulated data.
+        recordings: Recordings, with the drawn values on simulated data.
         allan: Allan variances.
-        places: IMU and number of the recordings to learn the noise from.
+        keys: IMU and number of the recordings to fit the noise to.
         imus: The devices.
 
     Returns:
-        The axes of one IMU after those of another, in order. There is no interval.
+        A description without intervals, in which the axes of IMUs follow one another.
     """
     if recordings.attrs["simulated"]:
         noise = recordings.true_noise.to_numpy()
-        drawn = [_drawn_models(recordings.sel(imu=imu)) or () for imu in imus]
-        models = tuple(_with_prior(model, 0.0, UNIT_SPREAD) for own in drawn for model in own)
+        by_imu = [_drawn_models(recordings.sel(imu=imu)) or () for imu in imus]
+        models = tuple(_with_prior(model, 0.0, UNIT_SPREAD) for axes in by_imu for model in axes)
     else:
-        fits = _allan_fits(recordings, allan, [allan.sel(imu=i, recording=n) for i, n in places])
+        fits = _allan_fits(recordings, allan, [allan.sel(imu=i, recording=n) for i, n in keys])
         noise = np.array([figures.white for figures in fits])
-        fitted = _fitted_models(recordings, places) or ()
-        own = tuple(_with_prior(model, float(model.mean[0]), UNIT_SPREAD) for model in fitted)
-        models = own * len(imus)
+        fitted = _fitted_models(recordings, keys) or ()
+        models = len(imus) * tuple(
+            _with_prior(model, float(model.mean[0]), UNIT_SPREAD) for model in fitted
+        )
     axes = np.tile(noise, len(imus))
     bias = np.zeros(axes.size) if recordings.attrs["simulated"] else None
     spread = np.full((1, axes.size), UNIT_SPREAD)
@@ -147,14 +140,14 @@ def _describe_unseen(
 
 
 def _with_prior(model: RecordingModel, mean: float, spread: float) -> RecordingModel:
-    """A model with another prior of the bias, which is independent of the warm-up."""
+    """A model with another prior of the bias, independent of the warm-up."""
     means, covariance = model.mean.copy(), np.diag(np.diag(model.covariance))
     means[0], covariance[0, 0] = mean, spread**2
     return replace(model, mean=means, covariance=covariance)
 
 
 def _describe_drawn(recordings: xr.Dataset, imu: int) -> TestDevice:
-    """A simulated IMU, of which everything is known."""
+    """Describe a simulated IMU by its drawn values."""
     return TestDevice(
         imus=(imu,),
         noise=recordings.true_noise.to_numpy(),
@@ -167,14 +160,14 @@ def _describe_drawn(recordings: xr.Dataset, imu: int) -> TestDevice:
 def _describe_known(
     recordings: xr.Dataset, means: pd.DataFrame, tested: pd.DataFrame, allan: xr.Dataset, imu: int
 ) -> TestDevice:
-    """Noise and turn-on spread of an IMU.
+    """Describe a measured IMU by its recordings.
 
     Args:
-        recordings: Measured ones.
-        means: Of the recordings to learn from, a row each; none of a hold-out's test ones.
-        tested: Of those that test.
+        recordings: Measured recordings.
+        means: Means of the training recordings, a row each.
+        tested: Means of the test recordings.
         allan: Allan variances.
-        imu: Which.
+        imu: Number of the IMU.
     """
     labels = means.to_numpy()
     duration_s = recordings.sizes["sample"] / recordings.attrs["rate_hz"]
@@ -185,16 +178,17 @@ def _describe_known(
     models = _fitted_models(recordings, [(imu, number) for number in numbers])
     averaging = np.square(noise) / duration_s + _beyond_white(models, duration_s)
     spread = np.vstack([turn_on_spread(labels, averaging), spread_draws(labels, averaging, _DRAWS)])
-    further = {} if models is None else {"history": _history(models, means, tested)}
-    if len(labels) > len(AXES) and models is not None:
-        further["joint"] = joint_draws(labels, averaging, _DRAWS)
-    return TestDevice((imu,), noise, spread, None, models, **further)
+    joint = history = None
+    if models is not None:
+        history = _history(models, means, tested)
+        joint = joint_draws(labels, averaging, _DRAWS) if len(labels) > len(AXES) else None
+    return TestDevice((imu,), noise, spread, None, models, joint, history)
 
 
 def _history(
     models: Sequence[RecordingModel], means: pd.DataFrame, tested: pd.DataFrame
 ) -> np.ndarray:
-    """Variance of a bias given the calibrations before it, mean over the tested ones, (axes,)."""
+    """Variance of a bias given the calibrations before it, mean over test recordings, (axes,)."""
     variances = []
     for model, axis in zip(models, AXES, strict=True):
         fitted = BiasHistory.fit(means.index.to_numpy(), means[axis].to_numpy(), model)
@@ -209,55 +203,47 @@ def _allan_fits(
 ) -> list[NoiseFigures]:
     """N, B and K of each axis from the Allan variances of some recordings."""
     variances, counts = (
-        np.stack([one[name].to_numpy() for one in chosen])
+        np.stack([part[name].to_numpy() for part in chosen])
         for name in ("allan_variance", "differences")
     )
-    recording_s = recordings.sizes["sample"] / recordings.attrs["rate_hz"]
-    durations_s = recording_s * (counts > 0).mean(axis=0)
-    shortest_s, times_s = (
-        SHORTEST_FIT_SAMPLES / recordings.attrs["rate_hz"],
-        allan.time_s.to_numpy(),
-    )
+    rate_hz, times_s = recordings.attrs["rate_hz"], allan.time_s.to_numpy()
+    durations_s = recordings.sizes["sample"] / rate_hz * (counts > 0).mean(axis=0)
+    shortest_s = SHORTEST_FIT_SAMPLES / rate_hz
     mean = mean_variance(variances, counts[:, None])
     return [fit_noise(times_s, variance, durations_s, shortest_s) for variance in mean]
 
 
 def _drawn_models(recordings: xr.Dataset) -> tuple[RecordingModel, ...] | None:
-    """What each axis of an IMU was drawn from; None for white noise without a warm-up."""
-    drawn = {
-        name: float(recordings.get(f"true_{name}", 0.0)) for name in ("flicker", "random_walk")
-    }
+    """The models that the axes of an IMU were drawn from; None for white noise without warm-up."""
+    flicker, walk = (
+        float(recordings.get(f"true_{name}", 0.0)) for name in ("flicker", "random_walk")
+    )
     warms_up = "true_amplitude" in recordings
-    if not any(drawn.values()) and not warms_up:
+    if not (flicker or walk or warms_up):
         return None
     models = []
     for axis in recordings.axis.to_numpy():
-        one = recordings.sel(axis=axis)
-        noise = NoiseFigures(float(one.true_noise), drawn["flicker"], drawn["random_walk"])
-        mean, spread = [float(one.true_unit_bias)], [float(one.true_turn_on_spread)]
+        values = recordings.sel(axis=axis)
+        noise = NoiseFigures(float(values.true_noise), flicker, walk)
+        mean, spread = [float(values.true_unit_bias)], [float(values.true_turn_on_spread)]
         if warms_up:
-            mean.append(float(one.true_amplitude_mean))
-            spread.append(float(one.true_amplitude_spread))
+            mean.append(float(values.true_amplitude_mean))
+            spread.append(float(values.true_amplitude_spread))
         covariance = np.diag(np.square(spread))
-        place = recordings.sizes["sample"], float(recordings.attrs["rate_hz"])
-        models.append(RecordingModel(*place, noise, np.array(mean), covariance))
+        samples, rate_hz = recordings.sizes["sample"], float(recordings.attrs["rate_hz"])
+        models.append(RecordingModel(samples, rate_hz, noise, np.array(mean), covariance))
     return tuple(models)
 
 
 def _fitted_models(
-    recordings: xr.Dataset, places: Sequence[tuple[int, int]]
+    recordings: xr.Dataset, keys: Sequence[tuple[int, int]]
 ) -> tuple[RecordingModel, ...] | None:
-    """Models of the axes; None of too few recordings.
-
-    Args:
-        recordings: All.
-        places: IMU and number of those to fit to.
-    """
-    if len(places) < FEWEST_RECORDINGS:
+    """Models of the axes, fitted to recordings by IMU and number; None with too few of them."""
+    if len(keys) < FEWEST_RECORDINGS:
         return None
-    rates = [recordings.angular_rate.sel(imu=imu, recording=number) for imu, number in places]
+    rates = [recordings.angular_rate.sel(imu=imu, recording=number) for imu, number in keys]
     samples = np.stack(
-        [fill_masked(one.transpose("axis", "sample").to_numpy()) for one in rates], 1
+        [fill_masked(part.transpose("axis", "sample").to_numpy()) for part in rates], 1
     )
     models = []
     for axis in samples:
@@ -267,7 +253,7 @@ def _fitted_models(
 
 
 def _beyond_white(models: tuple[RecordingModel, ...] | None, duration_s: float) -> np.ndarray:
-    """Variance by which recordings' means scatter beyond tau and N^2 / T, by axis."""
+    """Variance of the means of recordings beyond tau^2 and N^2 / T, (axes,)."""
     if models is None:
         return np.zeros(len(AXES))
-    return np.array([one.averaging_variance() - one.noise.white**2 / duration_s for one in models])
+    return np.array([m.averaging_variance() - m.noise.white**2 / duration_s for m in models])

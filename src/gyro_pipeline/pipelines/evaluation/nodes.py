@@ -9,39 +9,20 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from gyro_pipeline.conventions import (
-    ALL,
-    FIRST,
-    LAST,
-    MDPS,
-    PAPER,
-    TEST,
-    TRUE,
-)
+from gyro_pipeline.conventions import ALL, FIRST, LAST, MDPS, PAPER, TEST, TRUE
 from gyro_pipeline.estimators import ORIENTATION_NOTE
 from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.fingerprints import code_hash, data_hash, fingerprint
 from gyro_pipeline.pipelines.evaluation.bench import Bench
 from gyro_pipeline.pipelines.evaluation.ceilings import PREMISE
-from gyro_pipeline.pipelines.evaluation.device import (
-    TestDevice,
-    describe_devices,
-    training_labels,
-)
+from gyro_pipeline.pipelines.evaluation.device import TestDevice, describe_devices, training_labels
 from gyro_pipeline.scoring.truths import CURVE_STEP_S
 from gyro_pipeline.studies import MEAN, RunSpec, possible_runs
-from gyro_pipeline.tracking import (
-    CURVE,
-    ERRORS,
-    EVALUATED_WITH,
-    SCORES,
-    EvaluatedRun,
-    StoredRun,
-)
+from gyro_pipeline.tracking import CURVE, ERRORS, EVALUATED_WITH, SCORES, EvaluatedRun, StoredRun
 
 logger = logging.getLogger(__name__)
 
-_CONFLICT = 1e-3  # of a p value: axes of a few sensors and lengths are looked at
+_CONFLICT = 1e-3  # p value; small, as several axes, sensors and window lengths are tested
 
 METRICS = {
     "rmse_mdps": ("test_rmse_dps", "value", ALL),
@@ -56,7 +37,7 @@ METRICS = {
     "accuracy_gain_pct_first": ("accuracy_gain_pct", "value", FIRST),
     "time_saving_pct_first": ("time_saving_pct", "value", FIRST),
 }
-"""Metrics of a run: the score, its column and the windows; last epoch, the paper's truth."""
+"""Score, column and windows of each metric of a run, at the last epoch for the paper's truth."""
 
 
 def evaluate(
@@ -67,7 +48,7 @@ def evaluate(
     bias: pd.DataFrame,
     allan: xr.Dataset,
 ) -> Iterator[EvaluatedRun]:
-    """Judge every run of the plan that was not judged this way before.
+    """Evaluate every run of the plan that was not evaluated with this code and data before.
 
     Args:
         plan: The runs that the study needs.
@@ -78,24 +59,24 @@ def evaluate(
         allan: Allan variances.
 
     Yields:
-        Metrics, scores and the errors of each window, to be added to each run.
+        Metrics, scores and the errors of each window, to be added to the run.
     """
     truths = [
         data_hash(pd.util.hash_pandas_object(bias, index=False).to_numpy(), None),
         data_hash(allan.allan_variance.load().to_numpy(), None),
     ]
-    judged_with = fingerprint([code_hash(__name__), truths])
+    evaluated_with = fingerprint([code_hash(__name__), truths])
     specs, stored = possible_runs(plan), {run.fingerprint: run for run in reversed(runs)}
     benches = Benches(recordings, windows, bias, allan)
-    judged = 0
+    evaluated = 0
     for key, spec in sorted(specs.items(), key=lambda item: _bench_key(item[1])):
         run = stored[key]
-        if run.finished and run.tags.get(EVALUATED_WITH) == judged_with:
+        if run.finished and run.tags.get(EVALUATED_WITH) == evaluated_with:
             continue
-        yield _judge(run, spec, benches.of(spec), judged_with)
-        judged += 1
+        yield _evaluate_run(run, spec, benches.of(spec), evaluated_with)
+        evaluated += 1
     label = recordings.attrs["sensor"]
-    logger.info("%s: %d runs evaluated, %d skipped", label, judged, len(specs) - judged)
+    logger.info("%s: %d runs evaluated, %d skipped", label, evaluated, len(specs) - evaluated)
 
 
 def _bench_key(spec: RunSpec) -> tuple[str, float, float]:
@@ -103,49 +84,44 @@ def _bench_key(spec: RunSpec) -> tuple[str, float, float]:
 
 
 class Benches:
-    """The benches of a study on a sensor, of which the last one is kept.
+    """The benches of a study on a sensor; only the last one is kept in memory.
 
     Args:
         recordings, windows, bias, allan: As :func:`evaluate` takes them.
     """
 
     def __init__(
-        self,
-        recordings: xr.Dataset,
-        windows: pd.DataFrame,
-        bias: pd.DataFrame,
-        allan: xr.Dataset,
+        self, recordings: xr.Dataset, windows: pd.DataFrame, bias: pd.DataFrame, allan: xr.Dataset
     ) -> None:
         self._recordings, self._bias, self._allan = recordings, bias, allan
         key = ["protocol", "window_s", "window_stride_s"]
         self._tables = dict(iter(windows.groupby(key, observed=True)))
         self._devices: dict[str, TestDevice] = {}
-        self._made: dict[Any, Bench] = {}
+        self._cache: dict[Any, Bench] = {}
 
     def of(self, spec: RunSpec) -> Bench:
-        """The bench on which a run is judged."""
+        """The bench on which a run is evaluated."""
         key = _bench_key(spec)
-        if key not in self._made:
+        if key not in self._cache:
             table = self._tables[key]
             columns = ["fold", "imu", "recording", "start"]
             tests = table[table.role == TEST][columns].astype({"fold": str})
             device = self._device(table)
             labels = training_labels(self._bias, table)
             bench = Bench(self._recordings, device, tests, spec.window_s, labels)
-            self._made = {key: bench}
-        return self._made[key]
+            self._cache = {key: bench}
+        return self._cache[key]
 
     def _device(self, table: pd.DataFrame) -> TestDevice:
-        """What is known of the devices that test; the same for most windows."""
-        places = table[["fold", "role", "origin", "imu", "recording"]].drop_duplicates()
-        key = fingerprint(places.astype(str).to_numpy().tolist())
+        """The description of the tested devices, which is the same for most windows."""
+        roles = table[["fold", "role", "origin", "imu", "recording"]].drop_duplicates()
+        key = fingerprint(roles.astype(str).to_numpy().tolist())
         if key not in self._devices:
-            given = self._recordings, self._bias, self._allan
-            self._devices[key] = describe_devices(*given, table)
+            self._devices[key] = describe_devices(self._recordings, self._bias, self._allan, table)
         return self._devices[key]
 
 
-def _judge(run: StoredRun, spec: RunSpec, bench: Bench, judged_with: str) -> EvaluatedRun:
+def _evaluate_run(run: StoredRun, spec: RunSpec, bench: Bench, evaluated_with: str) -> EvaluatedRun:
     fits = {fold: run.load_fit(fold) for fold in bench.tests.fold.unique()}
     first = next(iter(fits.values()))
     imus = spec.real_imus if spec.method == 1 else 1
@@ -157,12 +133,12 @@ def _judge(run: StoredRun, spec: RunSpec, bench: Bench, judged_with: str) -> Eva
         scores.append(bench.scores(table, weights))
     table = pd.concat(scores, ignore_index=True)
     metrics = _metrics(table)
-    # of an earlier evaluation, and none now: the store can replace metrics, and not remove them
+    # the store cannot remove metrics of an earlier evaluation that are missing now
     metrics |= {name: np.nan for name in METRICS if name in run.metrics and name not in metrics}
     artifacts = {ERRORS: pd.concat(errors, ignore_index=True), SCORES: table}
     if spec.estimator == MEAN:
         artifacts[CURVE] = bench.curve
-    tags = {EVALUATED_WITH: judged_with, "ceiling": bench.ceilings.basis}
+    tags = {EVALUATED_WITH: evaluated_with, "ceiling": bench.ceilings.basis}
     tags |= {"recommended": str(first.recommended)} | _off_the_curve(metrics)
     tags |= below_the_ceiling(table)
     if first.uses_prior:
@@ -176,7 +152,7 @@ def _judge(run: StoredRun, spec: RunSpec, bench: Bench, judged_with: str) -> Eva
 
 
 def _metrics(scores: pd.DataFrame) -> dict[str, float]:
-    """The metrics of a run, of which each is there if it is finite."""
+    """The finite metrics of a run."""
     values = {
         name: _value(scores, score, windows, column) / (MDPS if name.endswith("_mdps") else 1)
         for name, (score, column, windows) in METRICS.items()
@@ -185,7 +161,7 @@ def _metrics(scores: pd.DataFrame) -> dict[str, float]:
 
 
 def _value(scores: pd.DataFrame, score: str, windows: str, column: str = "value") -> float:
-    """A score at the last epoch against the mean of the recording; NaN where it is not there."""
+    """A score at the last epoch against the mean of the recording; NaN if it is missing."""
     chosen = scores[
         (scores.score == score)
         & (scores.windows == windows)
@@ -196,22 +172,22 @@ def _value(scores: pd.DataFrame, score: str, windows: str, column: str = "value"
 
 
 def below_the_ceiling(scores: pd.DataFrame) -> dict[str, str]:
-    """In words, where a result's interval lies wholly beyond the ceiling's.
+    """A warning where the interval of a result lies wholly beyond that of the ceiling.
 
     Args:
-        scores: From :meth:`gyro_pipeline.pipelines.evaluation.bench.Bench.scores`.
+        scores: Scores from :meth:`gyro_pipeline.pipelines.evaluation.bench.Bench.scores`.
 
     Returns:
-        The tag ``below_ceiling``, or none.
+        The tag ``below_ceiling``; empty without such a result.
     """
     gains = scores[scores.weights == LAST].set_index(["truth", "windows", "score"])
     below = []
     for truth, windows in product((PAPER, TRUE), (FIRST, ALL)):
-        own = (truth, windows, "accuracy_gain_pct")
+        gain = (truth, windows, "accuracy_gain_pct")
         limit = (truth, windows, "ceiling_accuracy_gain_pct")
-        if {own, limit} <= set(gains.index):
+        if {gain, limit} <= set(gains.index):
             highest = gains.hi[limit] if pd.notna(gains.hi[limit]) else gains.value[limit]
-            if gains.lo[own] > highest:
+            if gains.lo[gain] > highest:
                 below.append(f"{windows} windows, truth {truth}")
     if not below:
         return {}
@@ -222,24 +198,24 @@ def below_the_ceiling(scores: pd.DataFrame) -> dict[str, str]:
 
 
 def _conflict(scores: pd.DataFrame, run: StoredRun) -> dict[str, str]:
-    """In words, where tested recordings contradict the prior, and what the mean gives."""
+    """A warning where tested recordings contradict the prior, with the error of the mean."""
     chances = scores[scores.score.str.startswith("prior_p_") & (scores.weights == LAST)]
     names = chances.score.str[-1].tolist()
     axes = {axis: p for axis, p in zip(names, chances.value, strict=True) if p < _CONFLICT}
     if not axes:
         return {}
-    shown = ", ".join(f"{axis} (p = {p:.1g})" for axis, p in axes.items())
-    own, mean = (_value(scores, f"{name}_rmse_dps", ALL) / MDPS for name in ("test", "mean"))
+    listed = ", ".join(f"{axis} (p = {p:.1g})" for axis, p in axes.items())
+    rmse, mean = (_value(scores, f"{name}_rmse_dps", ALL) / MDPS for name in ("test", "mean"))
     text = (
-        f"test recordings contradict the prior on {shown}: turned, or a bias that moved on. RMSE "
-        f"{own:.3g} mdps; the running mean gives {mean:.3g}"
+        f"test recordings contradict the prior on {listed}: turned, or a bias that moved on. RMSE "
+        f"{rmse:.3g} mdps; the running mean gives {mean:.3g}"
     )
     logger.warning("%s %s: %s", run.study, run.tags["mlflow.runName"], text)
     return {"prior_conflict": text}
 
 
 def _off_the_curve(metrics: Mapping[str, float]) -> dict[str, str]:
-    """In words, why an equivalent time is none."""
+    """The reason why a run has no equivalent time."""
     if "rmse_mdps" not in metrics or np.isfinite(metrics.get("equivalent_time_s", np.nan)):
         return {}
     worse = metrics["rmse_mdps"] > metrics["mean_rmse_mdps"]

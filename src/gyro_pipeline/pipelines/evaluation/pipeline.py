@@ -6,23 +6,16 @@ from gyro_pipeline.pipelines.evaluation.nodes import evaluate
 
 
 def create_pipeline(study: str, sensor: str) -> Pipeline:
-    """Evaluation of one study's runs on one sensor."""
-    return Pipeline(
-        [
-            Node(
-                evaluate,
-                {
-                    "plan": f"{study}.{sensor}.training.plan",
-                    "runs": f"{study}.{sensor}.training.runs",
-                    "recordings": f"{sensor}.windowed_splits.recordings",
-                    "windows": f"{study}.{sensor}.windowed_splits.windows",
-                    "bias": f"{sensor}.windowed_splits.bias",
-                    "allan": f"{sensor}.ground_truth.allan",
-                },
-                f"{study}.{sensor}.evaluation.runs",
-                name=f"evaluate_{study}_{sensor}",
-                namespace="evaluation",
-                tags=[study, sensor],
-            )
-        ]
-    )
+    """The evaluation of the runs of a study on a sensor."""
+    stage, splits = f"{study}.{sensor}", f"{sensor}.windowed_splits"
+    inputs = {
+        "plan": f"{stage}.training.plan",
+        "runs": f"{stage}.training.runs",
+        "recordings": f"{splits}.recordings",
+        "windows": f"{stage}.windowed_splits.windows",
+        "bias": f"{splits}.bias",
+        "allan": f"{sensor}.ground_truth.allan",
+    }
+    name, tags = f"evaluate_{study}_{sensor}", [study, sensor]
+    output = f"{stage}.evaluation.runs"
+    return Pipeline([Node(evaluate, inputs, output, name=name, namespace="evaluation", tags=tags)])

@@ -32,8 +32,8 @@ def measure_allan_variance(recordings: xr.Dataset) -> xr.Dataset:
 
     Returns:
         ``allan_variance`` (imu, recording, axis, time_s), (deg/s)^2, up to a fifth of the longest
-        recording, and ``differences`` (imu, recording, time_s), of how many it is the mean; NaN
-        and 0 for recordings that are absent or too short.
+        recording, and ``differences`` (imu, recording, time_s), their number; NaN and 0 for
+        recordings that are missing or too short.
     """
     rate_hz = recordings.attrs["rate_hz"]
     times_s = averaging_times_s(int(recordings["samples"].max()), rate_hz)
@@ -42,28 +42,27 @@ def measure_allan_variance(recordings: xr.Dataset) -> xr.Dataset:
     variance = xr.DataArray(np.full((*shape, len(times_s)), np.nan), labels | {"time_s": times_s})
     differences = xr.zeros_like(variance.isel(axis=0, drop=True), np.int64)
     for imu, number, samples in iterate_recordings(recordings):
-        place = {"imu": imu, "recording": number}
+        label = {"imu": imu, "recording": number}
         axes = [allan_variance(axis, rate_hz, times_s) for axis in samples]
-        variance.loc[place] = [values for values, _ in axes]
-        differences.loc[place] = axes[0][1]  # masked alike, so all have the same counts
+        variance.loc[label] = [values for values, _ in axes]
+        differences.loc[label] = axes[0][1]  # equal on all axes, which share a mask
     return xr.Dataset({"allan_variance": variance, "differences": differences})
 
 
 def measure_bias(
     recordings: xr.Dataset, allan: xr.Dataset, ground_truth: GroundTruth
 ) -> pd.DataFrame:
-    """The ground truth of the paper, the mean of each whole recording, and how good it is.
+    """The ground truth of the paper, the mean of each whole recording, and its accuracy.
 
     Args:
         recordings: Angular rates, deg/s.
-        allan: From :func:`measure_allan_variance`.
+        allan: Allan variances from :func:`measure_allan_variance`.
         ground_truth: The tolerance of the settling time.
 
     Returns:
-        The rows of :func:`~gyro_pipeline.recordings.bias_rows`, and of each bias its
-        standard error N / sqrt(T), ``standard_error_dps``, where T is the time of all samples that
-        are not masked; and ``settling_time_s``, after which the running mean stays within the
-        tolerance.
+        The rows of :func:`~gyro_pipeline.recordings.bias_rows`, with ``standard_error_dps``, the
+        standard error N / sqrt(T), where T is the time of all samples that are not masked; and
+        ``settling_time_s``, after which the running mean stays within the tolerance.
     """
     rate_hz, tolerance_dps = recordings.attrs["rate_hz"], ground_truth.tolerance_mdps * MDPS
     noise = _noise_figures(recordings, allan)
@@ -81,12 +80,12 @@ def measure_bias(
 def measure_noise(recordings: xr.Dataset, allan: xr.Dataset, bias: pd.DataFrame) -> pd.DataFrame:
     """Noise of every gyroscope, over all its recordings.
 
-    Where their Allan variances allow no fit, the log says so once and the figures are NaN.
+    Where Allan variances cannot be fitted, figures are NaN and a warning is logged.
 
     Args:
-        recordings: For their lengths.
-        allan: From :func:`measure_allan_variance`.
-        bias: From :func:`measure_bias`.
+        recordings: Recordings with their lengths.
+        allan: Allan variances from :func:`measure_allan_variance`.
+        bias: Ground truth from :func:`measure_bias`.
 
     Returns:
         A row per sensor, imu and axis: ``sample_sigma_dps``, ``white_dps_rts`` (N),
@@ -113,7 +112,7 @@ def measure_noise(recordings: xr.Dataset, allan: xr.Dataset, bias: pd.DataFrame)
 def _noise_figures(
     recordings: xr.Dataset, allan: xr.Dataset
 ) -> dict[int, tuple[NDArray[np.float64], str]]:
-    """N, B and K of each IMU, (axes, 3), from all its recordings, or NaN and why."""
+    """N, B and K of each IMU, (axes, 3), from all its recordings; or NaN and the reason."""
     rate_hz, times_s = recordings.attrs["rate_hz"], allan.time_s.to_numpy()
     shortest_s, figures = SHORTEST_FIT_SAMPLES / rate_hz, {}
     for imu in recordings.imu.to_numpy().tolist():

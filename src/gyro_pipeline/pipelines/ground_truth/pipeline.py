@@ -15,14 +15,14 @@ from gyro_pipeline.pipelines.ground_truth.report import report_biases
 
 
 def create_report(sensor: str) -> Pipeline:
-    """The biases, on the terminal."""
+    """The report of the biases on the terminal."""
     logs = f"{sensor}.raw_logs"
     inputs = [f"{logs}.recordings", f"{sensor}.ground_truth.bias", f"{logs}.quality"]
     return Pipeline([_node("report_biases", report_biases, inputs, None, sensor, ALWAYS)])
 
 
 def create_pipeline(sensor: str) -> Pipeline:
-    """Bias and noise of one sensor's gyroscopes."""
+    """Bias and noise of the gyroscopes of a sensor."""
     recordings, stage = f"{sensor}.raw_logs.recordings", f"{sensor}.ground_truth"
     allan, bias, noise = f"{stage}.allan", f"{stage}.bias", f"{stage}.noise"
     settings = "params:ground_truth"
@@ -36,9 +36,9 @@ def create_pipeline(sensor: str) -> Pipeline:
 
 
 def _node(
-    name: str, make: Callable[..., Any], inputs: list[str], made: str | None, *tags: str
+    name: str, make: Callable[..., Any], inputs: list[str], output: str | None, *tags: str
 ) -> Node:
-    """A node of the first tag's sensor."""
+    """A node with the sensor as its first tag."""
     return Node(
-        make, inputs, made, name=f"{name}_{tags[0]}", namespace="ground_truth", tags=[*tags]
+        make, inputs, output, name=f"{name}_{tags[0]}", namespace="ground_truth", tags=[*tags]
     )

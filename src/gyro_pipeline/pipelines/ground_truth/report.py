@@ -1,4 +1,4 @@
-"""What the ground-truth stage prints."""
+"""The report of the ground-truth stage on the terminal."""
 
 import logging
 
@@ -12,7 +12,7 @@ from gyro_pipeline.quality.rejections import reasons
 
 logger = logging.getLogger(__name__)
 
-_PLACE = ["imu", "recording"]
+_KEYS = ["imu", "recording"]
 
 
 def report_biases(
@@ -21,20 +21,20 @@ def report_biases(
     """Print the bias of every recording and axis with its standard error, in deg/s.
 
     Args:
-        recordings: For the sensor and its sample rate.
+        recordings: Recordings with the name and the rate of the sensor.
         bias: The ground truth of all recordings.
-        quality: A row per recording: its outcome, which rows are used and how many masked.
-        most: Number of biases that are printed; more are counted. Of the rejected recordings each
-            reason is printed once.
+        quality: A row per recording with its outcome, the rows used and how many are masked.
+        most: Maximum number of recordings that are printed; the others are counted. Each reason
+            for a rejection is printed once.
     """
     sensor, rate_hz = recordings.attrs["sensor"], recordings.attrs["rate_hz"]
     texts = list(map(_with_error, bias.bias_dps, bias.standard_error_dps))
-    table = bias.assign(text=texts).pivot(index=_PLACE, columns="axis", values="text")
-    table = table.reset_index().merge(quality, on=_PLACE)
+    table = bias.assign(text=texts).pivot(index=_KEYS, columns="axis", values="text")
+    table = table.reset_index().merge(quality, on=_KEYS)
     table["seconds"] = [f"{rows / rate_hz:.2f}" for rows in table["stop"] - table["start"]]
-    columns = [*_PLACE, *AXES, "seconds", "outcome", *table.columns.intersection(["masked"])]
-    whole = table[columns].head(most).convert_dtypes()  # counts are floats beside rejected rows
-    lines = [whole.to_string(index=False)]
+    columns = [*_KEYS, *AXES, "seconds", "outcome", *table.columns.intersection(["masked"])]
+    first = table[columns].head(most).convert_dtypes()  # counts are floats beside rejected rows
+    lines = [first.to_string(index=False)]
     if bias.standard_error_dps.isna().any():
         lines.append("± –: no standard error, the recordings are too short to fit their noise")
     if len(table) > most:
@@ -44,7 +44,7 @@ def report_biases(
 
 
 def _with_error(value: float, error: float) -> str:
-    """A value and its standard error, of which two digits are given."""
+    """A value and its standard error, with two digits of the error."""
     if not error > 0:
         return f"{value:.5f} ± –"
     digits = max(0, 1 - int(np.floor(np.log10(error))))

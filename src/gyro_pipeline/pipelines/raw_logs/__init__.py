@@ -1,4 +1,4 @@
-"""Logs in, labelled recordings out."""
+"""Labelled recordings from raw logs."""
 
 from gyro_pipeline.pipelines.raw_logs.pipeline import create_pipeline
 

@@ -22,12 +22,12 @@ from gyro_pipeline.splits import split_recordings
 
 logger = logging.getLogger(__name__)
 
-_WORTH_PROCESSES = 10**8
-"""Bytes to read; fewer are read by this process before others have started."""
-_AT_ONCE, _BYTES_AT_ONCE = 16, 16 * 10**6
-"""Recordings, and bytes of them, that go to a process together, and come back so."""
-_OF_USED = ["start", "stop", "masked"]
-"""What the table says of recordings that are used, and lacks of others."""
+_MIN_PARALLEL_BYTES = 10**8
+"""Fewer bytes are read by this process before other processes could start."""
+_BATCH, _BATCH_BYTES = 16, 16 * 10**6
+"""Maximum number of recordings, and their bytes, that go to a process together."""
+_USED_COLUMNS = ["start", "stop", "masked"]
+"""Columns of the quality table that are empty for rejected recordings."""
 
 
 def inspect_logs(
@@ -37,15 +37,16 @@ def inspect_logs(
 
     Args:
         files: The recordings that the source lists.
-        earlier: Those that were read before, and are there to go on from.
-        quality: How they are judged.
-        execution: In how many processes.
+        earlier: Recordings that were read in an earlier, perhaps interrupted, run.
+        quality: Settings of quality control.
+        execution: Number of processes.
 
     Yields:
-        What there is to read, then the recordings that were not read before, in any order.
+        The list of recordings, then the recordings that were not read before, in any order.
     """
     code = code_hash("gyro_pipeline.quality", inspection.__name__)
-    judged_by = quality.model_dump(mode="json", exclude={"needed_pct"})  # which is of all together
+    # needed_pct concerns all recordings together
+    judged_by = quality.model_dump(mode="json", exclude={"needed_pct"})
     jobs = {
         (entry.imu, entry.recording): Inspection(
             *(entry, files.rate_hz, quality),
@@ -53,35 +54,36 @@ def inspect_logs(
         )
         for entry in files.entries
     }
-    yield Listing({place: job.key for place, job in jobs.items()})
-    there = {recording.labels: recording.key for recording in earlier}
-    missing = [job for place, job in jobs.items() if there.get(place) != job.key]
+    yield Listing({number: job.key for number, job in jobs.items()})
+    stored = {recording.labels: recording.key for recording in earlier}
+    missing = [job for number, job in jobs.items() if stored.get(number) != job.key]
     if len(missing) < len(jobs):
-        before = len(jobs) - len(missing)
-        logger.info("%s: %d of %d recordings were read before", files.sensor, before, len(jobs))
+        count = len(jobs) - len(missing)
+        logger.info("%s: %d of %d recordings were read before", files.sensor, count, len(jobs))
     sizes = [job.entry.size for job in missing]
-    if sum(sizes) < _WORTH_PROCESSES:
+    if sum(sizes) < _MIN_PARALLEL_BYTES:
         yield from map(judge, missing)
     else:
-        at_once = int(np.clip(_BYTES_AT_ONCE // max(sizes), 1, _AT_ONCE))
-        read = run_jobs(missing, judge, execution, files.sensor, "recordings", at_once)
-        yield from (recording for _, recording in read)
+        batch = int(np.clip(_BATCH_BYTES // max(sizes), 1, _BATCH))
+        results = run_jobs(missing, judge, execution, files.sensor, "recordings", batch)
+        yield from (recording for _, recording in results)
 
 
 def quality_table(files: Logs, inspected: Sequence[Recording]) -> pd.DataFrame:
-    """How each recording was found; one that is there under two numbers is rejected once.
+    """The quality table: outcome and findings of each recording; a duplicate is rejected.
 
     Args:
-        files: For the sensor's name.
+        files: The source, with the name of the sensor.
         inspected: All recordings, by IMU and number.
 
     Returns:
-        A row per IMU and recording: ``sensor, imu, recording, file, outcome``; ``rows`` that the
-        reading did not leave out; of these, counted from 0, those that are used, from ``start`` to
-        before ``stop``, and how many of them are ``masked``; ``rate_hz``, measured; ``findings``,
-        which count the rows of the file.
+        A row per IMU and recording: ``sensor, imu, recording, file, outcome``; ``rows``, the number
+        of rows read; the rows used, counted from 0, from ``start`` to before ``stop``, and how many
+        of them are ``masked``; ``rate_hz``, measured; and ``findings``, which count the rows of the
+        file.
     """
-    columns = ["imu", "recording", "where", "outcome", "rows", *_OF_USED, "rate_hz", "findings"]
+    labels = "imu recording where outcome rows".split()
+    columns = [*labels, *_USED_COLUMNS, "rate_hz", "findings"]
     table = pd.DataFrame(map(vars, _without_copies(inspected)))[columns]
     table.insert(0, "sensor", files.sensor)
     table["findings"] = [
@@ -89,7 +91,7 @@ def quality_table(files: Logs, inspected: Sequence[Recording]) -> pd.DataFrame:
         for findings in table.findings
     ]
     table["rate_hz"] = table.rate_hz.map(_rounded)
-    table[_OF_USED] = table[_OF_USED].astype("Int64").mask(table.outcome == REJECTED)
+    table[_USED_COLUMNS] = table[_USED_COLUMNS].astype("Int64").mask(table.outcome == REJECTED)
     return table.rename(columns={"where": "file"})
 
 
@@ -100,18 +102,18 @@ def label_recordings(
     quality: Quality,
     splits: Splits,
 ) -> xr.Dataset:
-    """Labels of the recordings that are used, once enough of them remain.
+    """Label the usable recordings, if enough of them remain.
 
     Args:
         files: The source.
         inspected: All recordings, by IMU and number.
-        table: From :func:`quality_table`.
-        quality: How many of those listed must remain.
+        table: The table from :func:`quality_table`.
+        quality: Settings of quality control, with the percentage that must remain.
         splits: How recordings are held out.
 
     Returns:
-        What :mod:`gyro_pipeline.conventions` describes, but what was measured. The rate is the
-        median of those measured from timestamps, or the expected one where there are none.
+        The dataset of :mod:`gyro_pipeline.conventions` without measured samples. Its rate is the
+        median of the rates measured from timestamps, or the expected rate without timestamps.
 
     Raises:
         InputError: Fewer than ``quality.needed_pct`` percent remain, of all or of the tested IMU.
@@ -122,9 +124,9 @@ def label_recordings(
     lengths = (used["stop"] - used["start"]).unstack(fill_value=0)
     samples = lengths.reindex(index=imus, columns=numbers, fill_value=0).to_numpy(np.int64)
     coordinates: dict[str, Any] = {"imu": imus, "recording": numbers, "axis": list(AXES)}
-    given = {entry.recording: entry.split for entry in files.entries if entry.split}
-    of_tested = used.loc[[used.index[0][0]]].index.get_level_values("recording").tolist()
-    split = split_recordings(numbers, of_tested, splits, given or None)
+    fixed = {entry.recording: entry.split for entry in files.entries if entry.split}
+    tested = used.loc[[used.index[0][0]]].index.get_level_values("recording").tolist()
+    split = split_recordings(numbers, tested, splits, fixed or None)
     if split is not None:
         coordinates["split"] = ("recording", [split[number] for number in numbers])
     measured = used.rate_hz.dropna()
@@ -132,7 +134,7 @@ def label_recordings(
         "sensor": files.sensor,
         "source": files.source,
         "simulated": int(files.simulated),
-        # the reader has rejected those whose rate is far from the expected one
+        # recordings with a rate far from the expected one were rejected
         "rate_hz": _rounded(measured.median()) if len(measured) else files.rate_hz,
     }
     contents = [[*item.labels, item.content] for item in inspected if item.labels in used.index]
@@ -144,36 +146,36 @@ def label_recordings(
 
 
 def require_enough(table: pd.DataFrame, quality: Quality) -> None:
-    """Stop where too many recordings were rejected, so that a study never shrinks unseen.
+    """Stop if too many recordings were rejected, so that a study never shrinks unnoticed.
 
     Args:
-        table: From :func:`quality_table`.
-        quality: How many of those listed must remain.
+        table: The table from :func:`quality_table`.
+        quality: Settings of quality control, with the percentage that must remain.
 
     Raises:
         InputError: Fewer than ``quality.needed_pct`` percent remain, of all or of the tested IMU.
     """
     sensor, first, counts = table.sensor.iloc[0], table.imu.min(), Counter(table.outcome)
-    ends = ", ".join(f"{counts[outcome]} {outcome}" for outcome in (KEPT, REPAIRED, REJECTED))
-    logger.info("%s: %d recordings, %s", sensor, len(table), ends)
+    outcomes = ", ".join(f"{counts[outcome]} {outcome}" for outcome in (KEPT, REPAIRED, REJECTED))
+    logger.info("%s: %d recordings, %s", sensor, len(table), outcomes)
     tested = table[table.imu == first]
     for label, listed in ((sensor, table), (f"{sensor}, the tested IMU {first}", tested)):
-        bad = listed[listed.outcome == REJECTED]
-        remain = len(listed) - len(bad)
+        rejected = listed[listed.outcome == REJECTED]
+        remain = len(listed) - len(rejected)
         if 100 * remain < quality.needed_pct * len(listed):
             raise InputError(
                 f"{label}: {remain} of {len(listed)} recordings can be used, quality.needed_pct "
                 f"asks for {quality.needed_pct:g} %. Repair or remove the others, or lower it:\n  "
-                + "\n  ".join(reasons(bad))
+                + "\n  ".join(reasons(rejected))
             )
     lost = sorted(set(table.imu) - set(table.imu[table.outcome != REJECTED]))
     if lost:
-        shown = ", ".join(map(str, lost[:NAMED])) + (", …" if len(lost) > NAMED else "")
-        logger.warning("%s: no recording is left of IMU %s", sensor, shown)
+        named = ", ".join(map(str, lost[:NAMED])) + (", …" if len(lost) > NAMED else "")
+        logger.warning("%s: no recording is left of IMU %s", sensor, named)
 
 
 def _without_copies(inspected: Sequence[Recording]) -> Iterator[Recording]:
-    """Reject recordings that are there before under another number."""
+    """Reject recordings whose samples have occurred before under another number."""
     first = dict[str, Recording]()
     for recording in inspected:
         same = first.setdefault(recording.content, recording)
@@ -186,5 +188,5 @@ def _without_copies(inspected: Sequence[Recording]) -> Iterator[Recording]:
 
 
 def _rounded(rate_hz: float | None) -> float | None:
-    """To a millionth, which is better than any logger's clock."""
+    """A rate rounded to a millionth, which is more accurate than the clock of any logger."""
     return None if rate_hz is None else float(f"{rate_hz:.6g}")

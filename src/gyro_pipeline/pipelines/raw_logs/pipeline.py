@@ -9,7 +9,7 @@ from gyro_pipeline.pipelines.raw_logs.nodes import inspect_logs, label_recording
 
 
 def create_pipeline(sensor: str) -> Pipeline:
-    """Recordings of one sensor."""
+    """The recordings of a sensor."""
     stage, quality, settings = f"{sensor}.raw_logs", "params:quality", "params:execution"
     files, inspected, table = f"{stage}.files", f"{stage}.inspected", f"{stage}.quality"
     labelled = [files, inspected, table, quality, "params:splits"]
@@ -20,7 +20,7 @@ def create_pipeline(sensor: str) -> Pipeline:
     ]
     return Pipeline(
         [
-            Node(make, inputs, made, name=f"{name}_{sensor}", namespace="raw_logs", tags=[sensor])
-            for name, make, inputs, made in nodes
+            Node(make, inputs, output, name=f"{name}_{sensor}", namespace="raw_logs", tags=[sensor])
+            for name, make, inputs, output in nodes
         ]
     )

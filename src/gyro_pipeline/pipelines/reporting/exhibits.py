@@ -1,6 +1,6 @@
-"""What a report is made from, and what one of its tables or figures is."""
+"""The data that a report is made from, and the tables and figures that it consists of."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PREMISE = "white noise without drift"
-"""Of the ceiling, to be named wherever it is."""
+"""Premise of the ceiling, named wherever the ceiling is shown."""
 
 _LABELS = {
     MEAN: "running mean",
@@ -28,7 +28,7 @@ _LABELS = {
     CONSTANT: "constant",
     "cnn_best": "network at its best epoch",
 }
-_STUDIES_OF = {
+STUDIES_OF = {
     "three_gyroscopes": "augmentation",
     "multiple_gyroscopes": "augmentation",
     "generalization": "real2real",
@@ -43,78 +43,61 @@ _KEYS = ["sensor", "real_gyros", "virtual_gyros", "window_s"]
 
 @dataclass(frozen=True)
 class Exhibit:
-    """A table or figure of the report.
+    """A table or figure of the report."""
 
-    Attributes:
-        name: Of its files.
-        title: A few words.
-        caption: What is to be seen, for a reader who has not read the paper.
-        content: The table or figure.
-        shown: Columns of the table that the page shows, all by default; the files hold the rest.
-    """
-
-    name: str
-    title: str
-    caption: str
+    name: str  # name of its files
+    title: str  # a few words
+    caption: str  # explanation for a reader who has not read the paper
     content: "pd.DataFrame | Figure"
-    shown: Sequence[str] | None = None
+    shown: Sequence[str] | None = None  # columns of the table that the page shows, all by default
 
 
 @dataclass(frozen=True)
 class Material:
-    """All that the tables and figures of one source are made from.
+    """The data that the tables and figures of a source are made from."""
 
-    Attributes:
-        source: Where the logs come from.
-        published: What the paper states.
-        results: Of all studies, with the column ``study``.
-        curves: Running-mean curves, likewise.
-        leaks: Results of the leak study, which have columns of their own.
-        sensors: A row per sensor, from ``describe``.
-        quality: The table of quality, all sensors.
-        signals: Lines of figures, with the column ``sensor``.
-    """
-
-    source: str
-    published: Published
-    results: pd.DataFrame
-    curves: pd.DataFrame
-    leaks: pd.DataFrame
-    sensors: pd.DataFrame
-    quality: pd.DataFrame
-    signals: pd.DataFrame
+    source: str  # where the logs come from
+    published: Published  # results and specifications that the paper states
+    results: pd.DataFrame  # results of all studies, with the column study
+    curves: pd.DataFrame  # running-mean curves, with the column study
+    leaks: pd.DataFrame  # results of the leak study, which have other columns
+    sensors: pd.DataFrame  # a row per sensor, from describe
+    quality: pd.DataFrame  # the quality table of all sensors
+    signals: pd.DataFrame  # lines of figures, with the column sensor
 
     @cached_property
-    def made(self) -> pd.DataFrame:
-        """Results that are there."""
+    def finished(self) -> pd.DataFrame:
+        """Results whose runs are finished."""
         return self.results[self.results.status.isna()]
 
     @property
     def simulated(self) -> bool:
         """Whether all recordings are simulated."""
-        kinds = [table.simulated for table in (self.made, self.sensors, self.leaks) if len(table)]
+        kinds = [
+            table.simulated for table in (self.finished, self.sensors, self.leaks) if len(table)
+        ]
         return bool(kinds) and all(bool(kind.all()) for kind in kinds)
 
     @property
     def source_name(self) -> str:
-        """The source, and whether it is simulated or measured where its name does not say so."""
+        """The source, with *simulated* or *measured* if its name does not say so."""
         kind = "simulated" if self.simulated else "measured"
         return self.source if kind in self.source else f"{self.source} ({kind})"
 
     def of(self, study: str, **columns: Any) -> pd.DataFrame:
-        """Rows of a study that have these values."""
+        """Rows of a study with the given values of columns."""
         rows = self.results[self.results.study == study]
         for name, value in columns.items():
             rows = rows[rows[name] == value]
         return rows
 
     def sensor_name(self, sensor: str) -> str:
-        """As the paper writes it, if it does."""
+        """Name of a sensor as the paper writes it, if it does."""
         names = {sheet.sensor: sheet.name for sheet in self.published.specifications}
         return names.get(sensor, sensor)
 
     def paper_recording_s(self, sensor: str) -> float:
-        """How long the paper's recordings of a sensor are."""
+        """Length of the paper's recordings of a sensor, seconds."""
         lengths = {sheet.sensor: sheet.recording_s for sheet in self.published.specifications}
         return lengths[sensor]
 
@@ -127,11 +110,11 @@ class Material:
         """Amplitudes of a warm-up that would make a published gain the ceiling in first windows.
 
         Args:
-            claim: The published result; T is the paper's, N and the spread are those of the
+            claim: The published result, with T from the paper, N and the turn-on spread from the
                 recordings.
 
         Returns:
-            One for each of :data:`TIME_CONSTANTS_S`; none where the sensor is not described.
+            An amplitude for each of :data:`TIME_CONSTANTS_S`; empty without recordings.
         """
         rows = self.sensors[self.sensors.sensor == claim.sensor]
         if rows.empty:
@@ -145,9 +128,9 @@ class Material:
         return [] if np.isnan(needed).any() else needed.tolist()
 
     def warm_up_allowed_mdps(self, sensor: str) -> list[float]:
-        """The largest amplitude that the recordings of a sensor allow, for each of ``WARM_UPS_S``.
+        """The largest warm-up that recordings of a sensor allow, for each of ``WARM_UPS_S``.
 
-        On the worst axis, from 95 % intervals; none where they do not tell.
+        The bounds are those of the worst axis, from 95 % intervals; empty if they are unknown.
         """
         row = self.sensors[self.sensors.sensor == sensor].iloc[-1]
         bounds = row.reindex([f"warm_up_bound_dps_{time_s:g}" for time_s in WARM_UPS_S]) / MDPS
@@ -156,23 +139,23 @@ class Material:
     @property
     def claims(self) -> list[PublishedResult]:
         """Published results of the sensors of this source."""
-        known = {*self.results.sensor, *self.sensors.sensor}
-        return [row for row in self.published.results if row.sensor in known]
+        sensors = {*self.results.sensor, *self.sensors.sensor}
+        return [row for row in self.published.results if row.sensor in sensors]
 
     def result(
         self, claim: PublishedResult, estimator: str, study: str | None = None
     ) -> pd.Series | None:
-        """Our result for a published one; None where there is none.
+        """Our result for a published one; None if there is none.
 
-        Where the study has no row with as many real gyroscopes, such as on the public file of a
-        single IMU, it is the one that comes closest from below.
+        Where the study has fewer real gyroscopes, such as on the public file of a single IMU, the
+        result with the most of them is taken.
 
         Args:
             claim: The published result.
-            estimator: Whose.
-            study: Another study than the one that makes the paper's table.
+            estimator: Name of the estimator.
+            study: Study to take it from instead of the one that makes the paper's table.
         """
-        rows = self.of(study or _STUDIES_OF[claim.table], estimator=estimator)
+        rows = self.of(study or STUDIES_OF[claim.table], estimator=estimator)
         for key in ("sensor", "virtual_gyros", "window_s"):
             rows = rows[rows[key] == getattr(claim, key)]
         rows = rows[rows.real_gyros <= claim.real_gyros].sort_values("real_gyros")
@@ -180,19 +163,19 @@ class Material:
         return None if row is None or pd.notna(row.status) else row
 
     def status(self, claim: PublishedResult) -> str:
-        """Why there is no result for a published one."""
-        rows = self.of(_STUDIES_OF[claim.table], estimator=CNN)
+        """Why there is no result of ours for a published one."""
+        rows = self.of(STUDIES_OF[claim.table], estimator=CNN)
         match = np.all([rows[key] == getattr(claim, key) for key in _KEYS], axis=0)
         return str(rows.status[match].iloc[0]) if match.any() else "not part of this run"
 
 
 def label(estimator: str) -> str:
-    """What a reader calls an estimator."""
+    """Name of an estimator for readers."""
     return _LABELS.get(estimator, estimator.replace("_", " "))
 
 
 def ends(row: Mapping[str, Any] | pd.Series | None, name: str, windows: str) -> tuple[float, ...]:
-    """A score over some windows and the ends of its interval; NaN where there is none."""
+    """A score over first or all windows and the ends of its interval; NaN if missing."""
     key = column(name, windows)
     values = [None if row is None else row.get(key + end) for end in ("", "_lo", "_hi")]
     return tuple(np.nan if value is None else float(value) for value in values)
@@ -200,21 +183,26 @@ def ends(row: Mapping[str, Any] | pd.Series | None, name: str, windows: str) -> 
 
 def interval(row: Any, name: str, windows: str = ALL) -> str:
     """A score in percent with its 95 % interval."""
-    value, lo, hi = ends(row, name, windows)
+    return bracketed(ends(row, name, windows), percent)
+
+
+def bracketed(values: Iterable[float], text: Callable[[float], str]) -> str:
+    """A value with its interval in brackets, if it has one; a dash for NaN."""
+    value, lo, hi = values
     if np.isnan(value):
         return "–"
-    return percent(value) + ("" if np.isnan(lo) else f" [{percent(lo)}, {percent(hi)}]")
+    return text(value) + ("" if np.isnan(lo) else f" [{text(lo)}, {text(hi)}]")
 
 
 def percent(value: float) -> str:
-    """A saving is unbounded off the ends of the running-mean curve."""
+    """A percentage; a saving is infinite beyond the ends of the running-mean curve."""
     if np.isinf(value):
         return "never reached" if value > 0 else "off the curve"
     return f"{round(value)}"
 
 
 def from_to(values: Sequence[float]) -> str:
-    """The smallest and the largest of some amounts, with two digits."""
+    """The range of some values, with two digits."""
     low, high = (f"{v:.0f}" if v >= 9.95 else f"{v:.1f}" for v in (min(values), max(values)))  # noqa: PLR2004
     return low if low == high else f"{low} to {high}"
 
@@ -227,7 +215,7 @@ def beyond_ceiling(row: Any, windows: str = ALL) -> bool:
 
 
 def remark(row: Any) -> str | None:
-    """What a reader must know beside an accuracy gain; None where there is nothing."""
+    """A remark on an accuracy gain, such as one beyond its ceiling; None if there is none."""
     notes = []
     for windows in (ALL, FIRST):
         gain, _, _ = ends(row, "accuracy_gain_pct", windows)
@@ -241,13 +229,13 @@ def remark(row: Any) -> str | None:
 
 
 def gyroscopes(row: Any) -> str:
-    """The training set in words."""
+    """The number of gyroscopes in a training set, in words."""
     virtual = f" + {row.virtual_gyros:.0f} virtual" if row.virtual_gyros else ""
     return f"{row.real_gyros:.0f} real{virtual}"
 
 
 def split(row: Any) -> str:
-    """How recordings were split, in words."""
+    """The split of the recordings, in words."""
     if pd.isna(row.get("folds")):
         return "–"
     if row.get("protocol") == LEAVE_ONE_DEVICE_OUT:
@@ -256,5 +244,5 @@ def split(row: Any) -> str:
 
 
 def window_words(windows: str) -> str:
-    """What a figure calls some windows."""
+    """Name of first or all windows in figures."""
     return {ALL: "all windows (main result)", FIRST: "first window (the paper's way)"}[windows]

@@ -1,6 +1,6 @@
-"""The figures of results: one function each, with its caption beside it."""
+"""The figures of results: a function for each, with its caption."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -37,113 +37,110 @@ from gyro_pipeline.pipelines.reporting.tables import WAYS, in_full, published_cl
 from gyro_pipeline.studies import CNN, CONSTANT, MEAN
 
 _TICKS_S = (1, 2, 5, 10, 20, 30, 60, 100)
-_SHIFT = 0.11  # points of one window stand side by side: so much apart, relative to the time
-_LEAST_SPAN = 2.5  # of an axis of errors, largest over smallest
-_COMMON_SPREAD_MDPS = 10  # turn-on spread that is common for consumer parts
+_SHIFT = 0.11  # relative distance between the points of a window, which stand side by side
+_MIN_SPAN = 2.5  # ratio of the ends of an axis of errors
+_COMMON_SPREAD_MDPS = 10  # typical turn-on spread of consumer parts
 _SPREADS_MDPS = np.geomspace(0.03, 30, 200)
 _SAVINGS_PCT = (-25.0, 100.0)  # savings outside are drawn at the edge, as arrows
+_ERROR = "RMSE against the recording's mean [mdps]"
+_SECTIONS = {"sparkfun": "IV-E", "dot": "IV-F"}  # of the paper, on virtual gyroscopes
 _GAINS_PCT = (-30.0, 102.0)
 _ON_CURVE = (
     "Left: all windows, the main result. Right: the first window of each recording, the paper's "
     "way. The line is the running mean against its length. Filled markers are the networks with "
     "95 % intervals, hollow ones the error that a published gain would mean on these data, bars "
-    "the ceiling: what is expected of the best estimator under the noise model. Lower is better."
+    "the ceiling: the expected error of the best estimator under the noise model. Lower is better."
 )
 
 
 def forest(material: Material) -> Exhibit | None:
-    """The paper's results beside ours: accuracy gains with intervals, a row for each."""
+    """Published accuracy gains beside ours with intervals, a row for each."""
     claims = material.claims
     if not any(material.result(claim, CNN) is not None for claim in claims):
         return None
-    with LOOK():
-        figure = Figure(figsize=(10.5, 1.9 + 0.42 * len(claims)), layout="constrained")
-        axes = figure.subplots(1, 2, sharey=True)
-        for ax, windows in zip(axes, (ALL, FIRST), strict=True):
-            for place, claim in enumerate(claims):
-                _draw_claim(ax, material, claim, place, windows)
-            ax.axvline(0, color="black", lw=1)
-            ax.set(title=window_words(windows), xlim=_GAINS_PCT, xlabel="accuracy gain A [%]")
-            ax.grid(False, axis="y")
-        names = [f"{material.sensor_name(one.sensor)}, {gyroscopes(one)}" for one in claims]
-        axes[0].set_yticks(range(len(claims)), names)
-        axes[0].set_ylim(len(claims) - 0.5, -0.5)
-        share_legend(figure, axes, columns=6)
-        figure.suptitle(f"Published and ours, windows of 10 s; {material.source_name}")
+    names = [f"{material.sensor_name(claim.sensor)}, {gyroscopes(claim)}" for claim in claims]
+
+    def draw(ax: Axes, windows: str) -> None:
+        for row, claim in enumerate(claims):
+            _draw_claim(ax, material, claim, row, windows)
+        ax.axvline(0, color="black", lw=1)
+        ax.set(xlim=_GAINS_PCT, xlabel="accuracy gain A [%]")
+        ax.grid(False, axis="y")
+        ax.set_yticks(range(len(claims)), names)
+        ax.set_ylim(len(claims) - 0.5, -0.5)
+
+    title = f"Published and ours, windows of 10 s; {material.source_name}"
+    figure = _two_panels(draw, title, (10.5, 1.9 + 0.42 * len(claims)), columns=6)
     caption = (
-        "A row for each published result. A, the accuracy gain, is how much smaller the error is "
+        "A row for each published result. A, the accuracy gain, says how much smaller the error is "
         "than that of the mean of the same window: 0 is the running mean, 100 no error. Bars are "
-        "95 % intervals over recordings. The ceiling is what is expected of the best under white "
-        "noise without drift or, where that was drawn or fitted, under the noise and warm-up of "
-        "the recordings. The oracle, which knows what was drawn, is judged on the same windows as "
+        "95 % intervals over recordings. The ceiling is expected of the best estimator under white "
+        "noise without drift or, if drawn or fitted, under the noise and warm-up of the "
+        "recordings. The oracle, which knows the drawn values, is judged on the same windows as "
         "the others."
     )
     return Exhibit("forest", "The paper's ten rows and ours", caption, figure)
 
 
+def _two_panels(
+    draw: Callable[[Axes, str], None], title: str, size: tuple[float, float], columns: int
+) -> Figure:
+    """A figure with a panel for all windows and one for first windows."""
+    with LOOK():
+        figure = Figure(figsize=size, layout="constrained")
+        axes = figure.subplots(1, 2, sharey=True)
+        for ax, windows in zip(axes, (ALL, FIRST), strict=True):
+            draw(ax, windows)
+            ax.set_title(window_words(windows))
+        share_legend(figure, axes, columns)
+        figure.suptitle(title)
+    return figure
+
+
 def _draw_claim(
-    ax: Axes, material: Material, claim: PublishedResult, place: int, windows: str
+    ax: Axes, material: Material, claim: PublishedResult, row: int, windows: str
 ) -> None:
     gain = "accuracy_gain_pct"
-    rows = [
+    styles = [
         (CNN, COLOURS[0], "o", -0.3),
         (CONSTANT, COLOURS[1], "s", -0.1),
         (DEFAULT, COLOURS[2], "^", 0.1),
     ]
-    for name, colour, marker, shift in rows:
+    for name, colour, marker, shift in styles:
         value, lo, hi = ends(material.result(claim, name), gain, windows)
         if np.isnan(value):
             continue
         shown, outside = np.clip(value, _GAINS_PCT[0] + 2, None), value < _GAINS_PCT[0]
         ax.errorbar(
-            [shown], [place + shift],
+            [shown], [row + shift],
             xerr=None if outside else reach([value], [lo], [hi]),
             fmt="<" if outside else marker, color=colour, ms=4.5, capsize=2, lw=1.2,
             label=label(name),
         )  # fmt: skip
     if material.result(claim, CNN) is None:
-        ax.text(2, place, material.status(claim), color="grey", va="center", fontsize=8)
+        ax.text(2, row, material.status(claim), color="grey", va="center", fontsize=8)
     limit, lo, hi = ends(material.result(claim, CNN), f"ceiling_{gain}", windows)
     if not np.isnan(limit):
         span = (lo, hi) if not np.isnan(lo) else (limit - 0.4, limit + 0.4)
-        ax.fill_betweenx([place - 0.42, place + 0.42], *span, color=CEILING, alpha=0.35, lw=0)
-        ax.plot([limit] * 2, [place - 0.42, place + 0.42], color=CEILING, lw=1.8, label="ceiling")
+        ax.fill_betweenx([row - 0.42, row + 0.42], *span, color=CEILING, alpha=0.35, lw=0)
+        ax.plot([limit] * 2, [row - 0.42, row + 0.42], color=CEILING, lw=1.8, label="ceiling")
     realised, _, _ = ends(material.result(claim, CNN), f"oracle_{gain}", windows)
     if not np.isnan(realised):
-        ax.plot(realised, place + 0.3, "x", color=CEILING, ms=6, mew=1.6, label="oracle")
-    ax.plot(claim.accuracy_gain_pct, place, "D", mfc="none", mec="black", ms=7, label="published")
+        ax.plot(realised, row + 0.3, "x", color=CEILING, ms=6, mew=1.6, label="oracle")
+    ax.plot(claim.accuracy_gain_pct, row, "D", mfc="none", mec="black", ms=7, label="published")
 
 
 # the paper's figures
 
 
-def sparkfun_3_real(material: Material) -> Exhibit | None:
-    """SparkFun, 3 real and virtual gyroscopes (paper, section IV-E, first figure)."""
-    return _augmentation(material, "sparkfun", 3, "IV-E")
-
-
-def sparkfun_12_real(material: Material) -> Exhibit | None:
-    """SparkFun, 12 real and virtual gyroscopes (paper, section IV-E, second figure)."""
-    return _augmentation(material, "sparkfun", 12, "IV-E")
-
-
-def dot_3_real(material: Material) -> Exhibit | None:
-    """Movella DOT, 3 real and virtual gyroscopes (paper, section IV-F, first figure)."""
-    return _augmentation(material, "dot", 3, "IV-F")
-
-
-def dot_12_real(material: Material) -> Exhibit | None:
-    """Movella DOT, 12 real and virtual gyroscopes (paper, section IV-F, second figure)."""
-    return _augmentation(material, "dot", 12, "IV-F")
-
-
-def _augmentation(material: Material, sensor: str, real: int, section: str) -> Exhibit | None:
+def augmentation(material: Material, sensor: str, real: int) -> Exhibit | None:
+    """Real and virtual gyroscopes of SparkFun or DOT (paper, sections IV-E and IV-F, figures)."""
     rows = material.of("augmentation", sensor=sensor)
     rows = rows[(rows.real_gyros == real) | (rows.estimator == MEAN)]
     claims = material.published.of_networks(sensor, real_gyros=real)
     title = f"{material.sensor_name(sensor)}: {real} real gyroscopes and virtual ones"
-    name = f"augmentation_{sensor}_{real}_real"
-    return _on_curve(material, rows, claims, "virtual_gyros", (name, title, section))
+    words = (f"augmentation_{sensor}_{real}_real", title, _SECTIONS[sensor])
+    return _on_curve(material, rows, claims, "virtual_gyros", words)
 
 
 def input_channels(material: Material) -> Exhibit | None:
@@ -169,14 +166,14 @@ def _on_curve(
     by: str,
     words: tuple[str, str, str],
 ) -> Exhibit | None:
-    """Running-mean RMSE against its length, with the networks' points at theirs.
+    """RMSE of the running mean against its length, and of the networks at theirs.
 
     Args:
-        material: For the curve.
-        rows: Results of one sensor; those that are not there have no point.
-        claims: The paper's results for the same networks.
-        by: What the networks differ in, ``real_gyros`` or ``virtual_gyros``.
-        words: Name, title and the paper's section.
+        material: Has the curve.
+        rows: Results of one sensor; unfinished ones have no point.
+        claims: Published results for the same networks.
+        by: The count in which the networks differ, ``real_gyros`` or ``virtual_gyros``.
+        words: Name, title and section of the paper.
     """
     rows = rows[rows.status.isna()]
     if rows[rows.estimator == CNN].empty:
@@ -185,18 +182,15 @@ def _on_curve(
     first = rows.iloc[0]
     curves = material.curves
     curves = curves[(curves.study == first.study) & (curves.sensor == first.sensor)]
-    with LOOK():
-        figure = Figure(figsize=(9.5, 4.8), layout="constrained")
-        axes = figure.subplots(1, 2, sharey=True)
-        for ax, windows in zip(axes, (ALL, FIRST), strict=True):
-            _draw_panel(ax, rows, curves[curves.windows == windows], windows, claims, by)
-        axes[0].set_ylabel("RMSE against the recording's mean [mdps]")
-        share_legend(figure, axes, columns=3)
-        figure.suptitle(f"{title}; {material.source_name}")
+
+    def draw(ax: Axes, windows: str) -> None:
+        _draw_curve(ax, rows, curves[curves.windows == windows], windows, claims, by)
+
+    figure = _two_panels(draw, f"{title}; {material.source_name}", (9.5, 4.8), columns=3)
     return Exhibit(name, title, f"{_ON_CURVE} Paper, section {section}.", figure)
 
 
-def _draw_panel(  # noqa: PLR0917 - what a panel shows
+def _draw_curve(  # noqa: PLR0917 - contents of a panel
     ax: Axes,
     results: pd.DataFrame,
     curve: pd.DataFrame,
@@ -228,10 +222,10 @@ def _draw_panel(  # noqa: PLR0917 - what a panel shows
                 MARKERS[i], color=COLOURS[i], ms=9, mfc="none", label=f"published, {size} {kind}",
             )  # fmt: skip
     _time_axis(ax, float(curve.time_s.max()))
-    ax.set(yscale="log", title=window_words(windows))
+    ax.set(yscale="log", ylabel=_ERROR if windows == ALL else None)
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter("{x:g}")
-    # The curve against the recording's own mean ends at 0, which has no logarithm.
+    # The error of the mean of the whole recording is 0, which has no logarithm.
     ax.set_ylim(0.08, 1.5 * (curve.rmse_dps / MDPS)[curve.time_s >= _TICKS_S[0]].max())
 
 
@@ -249,20 +243,17 @@ def _time_axis(ax: Axes, recording_s: float) -> None:
 def gyroscopes_10s(material: Material) -> Exhibit | None:
     """RMSE at 10 s against the number of gyroscopes (paper, section IV-D, second figure)."""
     claims = material.published.of_networks("sparkfun", virtual_gyros=0)
-    rows = material.made[material.made.study == "real2real"]
+    rows = material.finished[material.finished.study == "real2real"]
     rows = rows[(rows.sensor == "sparkfun") & (rows.estimator == CNN)]
     rows = rows[rows.window_s == claims[0].window_s] if claims else rows[:0]
     if rows.empty:
         return None
-    with LOOK():
-        figure = Figure(figsize=(9.5, 4.2), layout="constrained")
-        axes = figure.subplots(1, 2, sharey=True)
-        for ax, windows in zip(axes, (ALL, FIRST), strict=True):
-            _draw_bars(ax, rows.sort_values("real_gyros"), claims, windows)
-        axes[0].set_ylabel("RMSE against the recording's mean [mdps]")
-        share_legend(figure, axes, columns=4)
-        title = "Method 2: error at 10 s against the number of gyroscopes"
-        figure.suptitle(f"{title}; {material.source_name}")
+
+    def draw(ax: Axes, windows: str) -> None:
+        _draw_bars(ax, rows.sort_values("real_gyros"), claims, windows)
+
+    title = "Method 2: error at 10 s against the number of gyroscopes"
+    figure = _two_panels(draw, f"{title}; {material.source_name}", (9.5, 4.2), columns=4)
     caption = "Left: all windows, the main result. Right: the paper's way. Lower is better."
     caption += " Paper, section IV-D."
     return Exhibit("real2real_gyroscopes_10s", title, caption, figure)
@@ -271,20 +262,20 @@ def gyroscopes_10s(material: Material) -> Exhibit | None:
 def _draw_bars(
     ax: Axes, networks: pd.DataFrame, claims: Sequence[PublishedResult], windows: str
 ) -> None:
-    places, base = np.arange(len(networks)), column("test_rmse_dps", windows)
+    x, base = np.arange(len(networks)), column("test_rmse_dps", windows)
     rmse, lo, hi = (networks[f"{base}{end}"] / MDPS for end in ("", "_lo", "_hi"))
     bars: dict[str, Any] = {"yerr": reach(rmse, lo, hi), "color": COLOURS[0], "capsize": 3}
-    ax.bar(places, rmse, 0.6, label="network, 95 % interval", **bars)
+    ax.bar(x, rmse, 0.6, label="network, 95 % interval", **bars)
     mean = float(networks[column("mean_rmse_dps", windows)].iloc[0]) / MDPS
     ax.axhline(mean, color="black", lw=1.5, label="model-based: running mean")
     limit = float(networks[column("ceiling_rmse_dps", windows)].iloc[0]) / MDPS
     ax.axhline(limit, color=CEILING, ls="--", lw=1.5, label="ceiling")
     gains = {claim.real_gyros: claim.accuracy_gain_pct for claim in claims}
-    known = [i for i, gyros in enumerate(networks.real_gyros) if gyros in gains]
-    stated = [mean * (1 - gains[networks.real_gyros.iloc[i]] / 100) for i in known]
-    ax.plot(known, stated, "D", color=COLOURS[1], ms=9, mfc="none", mew=1.8, label="published")
-    ax.set_xticks(places, networks.real_gyros.astype(str).tolist())
-    ax.set(xlabel="gyroscopes in the training set", title=window_words(windows))
+    published = [i for i, gyros in enumerate(networks.real_gyros) if gyros in gains]
+    errors = [mean * (1 - gains[networks.real_gyros.iloc[i]] / 100) for i in published]
+    ax.plot(published, errors, "D", color=COLOURS[1], ms=9, mfc="none", mew=1.8, label="published")
+    ax.set_xticks(x, networks.real_gyros.astype(str).tolist())
+    ax.set(xlabel="gyroscopes in the training set", ylabel=_ERROR if windows == ALL else None)
     ax.set_axisbelow(True)
     ax.grid(False, axis="x")
 
@@ -293,12 +284,14 @@ def _draw_bars(
 
 
 def saving_against_turn_on_spread(material: Material) -> Exhibit | None:
-    """What can be saved at 10 s against the turn-on spread, and what the networks save.
+    """The possible time saving at 10 s against the turn-on spread, and that of the networks.
 
-    A sensor's curve is the ceiling with its N and T and one spread on all axes. A network stands
-    at the spread that gives its own ceiling: the sensor's, where its axes have one.
+    The curve of a sensor is the ceiling with its N and T and the same spread on all axes. A network
+    stands at the spread that gives its ceiling: that of the sensor, if its axes share one.
     """
-    rows = material.made[(material.made.study == "real2real") & (material.made.estimator == CNN)]
+    rows = material.finished[
+        (material.finished.study == "real2real") & (material.finished.estimator == CNN)
+    ]
     claims = material.published.of_table("generalization")
     rows = rows[rows.window_s.isin([claim.window_s for claim in claims])]
     claims = [claim for claim in claims if (rows.sensor == claim.sensor).any()]
@@ -317,9 +310,9 @@ def saving_against_turn_on_spread(material: Material) -> Exhibit | None:
         share_legend(figure, axes.ravel(), columns=3)
         figure.suptitle(f"What 10 s can save; {material.source_name}")
     caption = (
-        "The turn-on spread τ is what the bias changes from one power-on to the next; it decides "
+        "The turn-on spread τ is the change of the bias from one power-on to the next; it decides "
         "how much can be gained. The line is the ceiling of a sensor with that spread under white "
-        "noise without drift, markers are what the networks save, with 95 % intervals."
+        "noise without drift, markers are the savings of the networks with 95 % intervals."
     )
     name = "real2real_saving_against_turn_on_spread"
     return Exhibit(name, "What can be saved, against the turn-on spread", caption, figure)
@@ -335,7 +328,7 @@ def equal_spread(row: pd.Series, bound: str = "") -> float:
         bound: ``_lo`` or ``_hi`` for an end of the ceiling gain's interval; tau falls with it.
 
     Returns:
-        deg/s; 0 where the ceiling is that of a known bias.
+        The spread, deg/s; 0 where the ceiling is that of a known bias.
     """
     rho = 1 - row[f"ceiling_accuracy_gain_pct{bound}"] / 100
     r = row.window_s / row.recording_s
@@ -356,14 +349,14 @@ def _best_saving_pct(row: pd.Series, spreads_dps: NDArray[np.float64]) -> NDArra
     return 100 * best_saving(rho, row.window_s / row.recording_s)
 
 
-def _draw_savings(ax: Axes, own: pd.DataFrame, claim: PublishedResult) -> None:
-    curve = _best_saving_pct(own.iloc[0], _SPREADS_MDPS * MDPS)
+def _draw_savings(ax: Axes, rows: pd.DataFrame, claim: PublishedResult) -> None:
+    curve = _best_saving_pct(rows.iloc[0], _SPREADS_MDPS * MDPS)
     ax.plot(_SPREADS_MDPS, curve, color=CEILING, lw=1.5, label="ceiling")
     ax.axhline(claim.time_saving_pct, color="black", ls=":", label="the paper's saving")
     common = f"common for consumer parts: {_COMMON_SPREAD_MDPS} mdps"
     ax.axvline(_COMMON_SPREAD_MDPS, color="grey", ls="--", lw=1, label=common)
-    for i, (_, row) in enumerate(own.iterrows()):
-        shift = 1 + 0.14 * (i - (len(own) - 1) / 2)
+    for i, (_, row) in enumerate(rows.iterrows()):
+        shift = 1 + 0.14 * (i - (len(rows) - 1) / 2)
         _draw_saving(ax, row, shift, COLOURS[i], MARKERS[i])
     ax.set(xscale="log", xlim=(_SPREADS_MDPS[0], _SPREADS_MDPS[-1]), ylim=_SAVINGS_PCT)
     ax.set_title(f"{claim.sensor}; the paper's with {claim.real_gyros} gyroscopes")
@@ -389,7 +382,9 @@ def _draw_saving(ax: Axes, row: pd.Series, shift: float, colour: str, marker: st
 
 def estimators(material: Material, study: str, sensor: str) -> Exhibit | None:
     """RMSE of all estimators of a study against the window length, with the ceiling."""
-    rows = material.made[(material.made.study == study) & (material.made.sensor == sensor)]
+    rows = material.finished[
+        (material.finished.study == study) & (material.finished.sensor == sensor)
+    ]
     if rows.empty:
         return None
     with LOOK():
@@ -400,10 +395,10 @@ def estimators(material: Material, study: str, sensor: str) -> Exhibit | None:
         title = f"{material.sensor_name(sensor)}, {study.replace('_', ' ')}: error against window"
         figure.suptitle(f"{title}, all windows; {material.source_name}")
     caption = (
-        "Left: error over all windows. Right: the same relative to the running mean. Relatives "
-        "share a colour, filled markers are the recommended estimators. The dashed line is the "
-        "ceiling, on measured data an estimate. Lower is better. Estimators in black need no "
-        f"training recordings; each of the others {ORIENTATION_NOTE}."
+        "Left: error over all windows. Right: the same relative to the running mean. Related "
+        "estimators share a colour, filled markers are the recommended estimators. The dashed line "
+        "is the ceiling, on measured data an estimate. Lower is better. Estimators in black need "
+        f"no training recordings; every other one {ORIENTATION_NOTE}."
     )
     return Exhibit(f"{study}_{sensor}", title, caption, figure)
 
@@ -411,12 +406,12 @@ def estimators(material: Material, study: str, sensor: str) -> Exhibit | None:
 def _draw_estimators(left: Axes, right: Axes, rows: pd.DataFrame) -> None:
     means = rows[rows.estimator == MEAN].set_index("window_s").sort_index()
     names = [in_full(row, rows) for _, row in rows.iterrows()]
-    named = dict(zip(names, rows.estimator, strict=True))
-    for place, (name, estimator) in enumerate(named.items()):
-        own = rows[[one == name for one in names]].drop_duplicates("window_s")
-        rmse = own.set_index("window_s").test_rmse_dps_all.sort_index()
-        look = estimator_look(estimator, bool(own.recommended.any()))
-        shift = 1 + 0.015 * (place - len(named) / 2)
+    estimators_by_name = dict(zip(names, rows.estimator, strict=True))
+    for number, (name, estimator) in enumerate(estimators_by_name.items()):
+        results = rows[[other == name for other in names]].drop_duplicates("window_s")
+        rmse = results.set_index("window_s").test_rmse_dps_all.sort_index()
+        look = estimator_look(estimator, bool(results.recommended.any()))
+        shift = 1 + 0.015 * (number - len(estimators_by_name) / 2)
         ratio = rmse / means.test_rmse_dps_all.reindex(rmse.index)
         for ax, values in ((left, rmse / MDPS), (right, ratio)):
             ax.plot(values.index * shift, values, label=name, **look)
@@ -427,7 +422,7 @@ def _draw_estimators(left: Axes, right: Axes, rows: pd.DataFrame) -> None:
         ax.set(xscale="log", yscale="log", xlabel="window length [s], points side by side")
         ax.set_xticks(means.index.tolist(), minor=False)
         low, high = ax.get_ylim()
-        widen = max(np.sqrt(_LEAST_SPAN * low / high), 1)  # what differs by little must look so
+        widen = max(np.sqrt(_MIN_SPAN * low / high), 1)  # small differences must look small
         ax.set_ylim(low / widen, high * widen)
         ax.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
         plain_ticks(ax)
@@ -450,8 +445,8 @@ def leakage_against_stride(material: Material) -> Exhibit | None:
             _draw_leaks(ax, material, material.leaks[material.leaks.sensor == sensor])
         share_legend(figure, axes, columns=3)
     caption = (
-        "Windows that start a whole number of the network's hops apart share most of what it sees. "
-        "Split at random, they are near-duplicates that can be learned by heart."
+        "Windows whose starts differ by a whole number of hops of the network look almost the same "
+        "to it. Split at random, they are near-duplicates that can be learned by heart."
     )
     title = "Trained with leaks on purpose: accuracy gain against the window stride"
     return Exhibit("leakage_accuracy_against_stride", title, caption, figure)
@@ -489,5 +484,5 @@ def _draw_leaks(ax: Axes, material: Material, results: pd.DataFrame) -> None:
 def _stride_label(stride_s: float, hops: float) -> str:
     if np.isnan(hops):
         return f"{stride_s:g}"
-    whole = abs(hops - round(hops)) < 0.01  # noqa: PLR2004 - so near to a whole number, it is one
+    whole = abs(hops - round(hops)) < 0.01  # noqa: PLR2004 - a rounding error
     return f"{stride_s:g}\n{'= ' if whole else ''}{hops:.3g} hop{'s' if hops > 1.01 else ''}"  # noqa: PLR2004

@@ -1,4 +1,4 @@
-"""What follows from the results: sentences computed from them, whatever they are."""
+"""The findings: sentences that are computed from the results, whatever they are."""
 
 from collections.abc import Sequence
 
@@ -20,26 +20,26 @@ _ORACLE, _ORACLE_GAIN = (
 _CEILING_GAIN = column("ceiling_accuracy_gain_pct", ALL)
 
 _SIGNIFICANT = 0.001
-"""Of the oracle check after Holm's correction; tests/test_ceiling.py holds the same."""
+"""Significance level of the oracle check after Holm's correction, as in tests/test_ceiling.py."""
 
 
 def distinct(material: Material) -> pd.DataFrame:
-    """Results that are there, where studies share a training once."""
-    return material.made.drop_duplicates(["estimator", "window_s", "sensor", "fingerprints"])
+    """Finished results, each once where studies share a training."""
+    return material.finished.drop_duplicates(["estimator", "window_s", "sensor", "fingerprints"])
 
 
 def answer(material: Material) -> list[str]:
-    """The answer in three sentences; fewer where there is less to say."""
+    """The answer in at most three sentences."""
     rows = distinct(material)
-    told = [_networks(rows) or _estimators(rows), _published(material), _explanations(material)]
-    return [sentence for sentence in told if sentence]
+    sentences = _networks(rows) or _estimators(rows), _published(material), _explanations(material)
+    return [sentence for sentence in sentences if sentence]
 
 
 def findings(material: Material) -> list[str]:
-    """What else follows, a sentence each."""
+    """Further findings, a sentence for each."""
     rows = distinct(material)
     networks = rows[rows.estimator == CNN]
-    told = [
+    sentences = [
         *(_ranked(float(str(window)), group) for window, group in networks.groupby("window_s")),
         _matched(material),
         _more_data(networks, "virtual_gyros", "virtual gyroscopes to the same real ones"),
@@ -48,32 +48,33 @@ def findings(material: Material) -> list[str]:
         _prior_conflicts(rows),
         _oracle_check(rows),
     ]
-    return [sentence for sentence in told if sentence]
+    return [sentence for sentence in sentences if sentence]
 
 
 def _networks(rows: pd.DataFrame) -> str:
-    """What the network gains at the shortest window, and what a constant and a filter do."""
+    """Accuracy gains of the network, a constant and the best linear predictor, shortest window."""
     networks = rows[rows.estimator == CNN]
     if networks.empty:
         return ""
     window_s = networks.window_s.min()
-    here = rows[rows.window_s == window_s]
+    shortest = rows[rows.window_s == window_s]
     parts = [
-        f"Over all windows of {window_s:g} s the paper's network is {_gain(here, CNN)} % more "
+        f"Over all windows of {window_s:g} s the paper's network is {_gain(shortest, CNN)} % more "
         "accurate than the mean of the window"
     ]
-    if (here.estimator == CONSTANT).any():
+    if (shortest.estimator == CONSTANT).any():
         parts.append(
             "a constant, the device's known mean returned without a look at the window, "
-            f"{_gain(here, CONSTANT)} %"
+            f"{_gain(shortest, CONSTANT)} %"
         )
-    if (here.estimator == DEFAULT).any():
-        parts.append(f"the {label(DEFAULT)} predictor {_gain(here, DEFAULT)} %")
-    limit = f"{_range(here[_CEILING_GAIN].dropna())} %"
-    if _ORACLE_GAIN in here and here[_ORACLE_GAIN].notna().any():
+    if (shortest.estimator == DEFAULT).any():
+        parts.append(f"the {label(DEFAULT)} predictor {_gain(shortest, DEFAULT)} %")
+    limit = f"{_range(shortest[_CEILING_GAIN].dropna())} %"
+    if _ORACLE_GAIN in shortest and shortest[_ORACLE_GAIN].notna().any():
+        oracle = _range(shortest[_ORACLE_GAIN].dropna())
         parts.append(
-            f"and the oracle, which knows what was drawn, {_range(here[_ORACLE_GAIN].dropna())} %, "
-            f"where {limit} is expected of the best (the ceiling)"
+            f"and the oracle, which knows the drawn values, {oracle} %, where {limit} is expected "
+            "of the best estimator (the ceiling)"
         )
     else:
         parts.append(f"and the ceiling is {limit}")
@@ -85,19 +86,19 @@ def _gain(rows: pd.DataFrame, estimator: str) -> str:
 
 
 def _estimators(rows: pd.DataFrame) -> str:
-    """Of a study without networks: what its recommended estimators reach."""
-    good = rows[rows.recommended.fillna(False).astype(bool)]
-    good = good if len(good) else rows[rows.estimator != MEAN]
-    if good.empty or _GAIN not in good:
+    """The best recommended estimator of a study without networks."""
+    recommended = rows[rows.recommended.fillna(False).astype(bool)]
+    recommended = recommended if len(recommended) else rows[rows.estimator != MEAN]
+    if recommended.empty or _GAIN not in recommended:
         return ""
-    window_s = good.window_s.min()
-    best = good[good.window_s == window_s].sort_values(_RMSE).iloc[0]
+    window_s = recommended.window_s.min()
+    best = recommended[recommended.window_s == window_s].sort_values(_RMSE).iloc[0]
     ratio = 1 - best[[_GAIN, f"{_GAIN}_hi", f"{_GAIN}_lo"]].astype(float) / 100
     return (
         f"Over all windows of {window_s:g} s on {best.sensor} the error of {label(best.estimator)} "
         f"is {ratio.iloc[0]:.2f} times that of the mean [{ratio.iloc[1]:.2f}, "
-        f"{ratio.iloc[2]:.2f}], the smallest of {good.estimator.nunique()} recommended estimators; "
-        f"the ceiling is {1 - best[_CEILING_GAIN] / 100:.2f}."
+        f"{ratio.iloc[2]:.2f}], the smallest of {recommended.estimator.nunique()} recommended "
+        f"estimators; the ceiling is {1 - best[_CEILING_GAIN] / 100:.2f}."
     )
 
 
@@ -113,7 +114,7 @@ def _published(material: Material) -> str:
 
 
 def _explanations(material: Material) -> str:
-    """What would put the published gains within reach, the innocent explanation first."""
+    """Explanations of published gains beyond the ceiling, the harmless one first."""
     beyond = [claim for claim in material.claims if material.beyond_white_noise(claim)]
     if not beyond:
         return ""
@@ -124,14 +125,14 @@ def _explanations(material: Material) -> str:
     sizes = "; ".join(f"{name} {from_to(a)}" for name, a in needed.items() if a)
     amount = f" ({sizes} mdps at power-on, for time constants of 5 to 60 s)" if sizes else ""
     return (
-        f"Three things would put them within reach: a warm-up{amount}, which a constant could take "
-        "off as well; another truth than the mean of the recording; or a leak between training and "
-        f"test. {_what_decides(material, list(needed))}"
+        f"Three things would put them within reach: a warm-up{amount}, which a constant could also "
+        "correct; another truth than the mean of the recording; or a leak between training and "
+        f"test. {_test_of_warm_up(material, list(needed))}"
     )
 
 
-def _what_decides(material: Material, names: Sequence[str]) -> str:
-    """What tells a warm-up from the others: on measured data, the largest that there can be."""
+def _test_of_warm_up(material: Material, names: Sequence[str]) -> str:
+    """How to recognise a warm-up; on measured data, the largest warm-up that they allow."""
     allowed = {
         material.sensor_name(sensor): material.warm_up_allowed_mdps(sensor)
         for sensor in material.sensors.sensor
@@ -149,9 +150,9 @@ def _ranked(window_s: float, networks: pd.DataFrame) -> str:
     better, worse = (networks[f"{_GAIN}_lo"] > 0).sum(), (networks[f"{_GAIN}_hi"] < 0).sum()
     realised = _ORACLE in networks and networks[_ORACLE].notna().all()
     best = networks[_ORACLE if realised else _CEILING]
-    told = (
+    sentences = (
         f"At {window_s:g} s, {better} of {len(networks)} networks are better than the running mean "
-        f"with their whole interval and {worse} are worse with it; A is {_range(networks[_GAIN])} "
+        f"with their whole interval and {worse} are worse; A is {_range(networks[_GAIN])} "
         f"%. Their RMSE is {_range(networks[_RMSE] / best, '.2f')} times "
         f"{'that of the oracle on the same windows' if realised else 'the expected ceiling'}."
     )
@@ -159,15 +160,15 @@ def _ranked(window_s: float, networks: pd.DataFrame) -> str:
     if key in networks and networks[key].notna().any():
         paired = networks[networks[key].notna()]
         better, worse = (paired[f"{key}_hi"] < 0).sum(), (paired[f"{key}_lo"] > 0).sum()
-        told += (
+        sentences += (
             f" In pairs on the same windows, {better} of {len(paired)} are better than the "
             f"constant with their whole interval and {worse} worse."
         )
-    return told
+    return sentences
 
 
 def _matched(material: Material) -> str:
-    """How many published gains are within the intervals of ours."""
+    """The number of published gains within the intervals of our results."""
     rows = [(claim, material.result(claim, CNN)) for claim in material.claims]
     both = [(claim, row) for claim, row in rows if row is not None]
     if not both:
@@ -179,8 +180,8 @@ def _matched(material: Material) -> str:
     )
 
 
-def _more_data(networks: pd.DataFrame, count: str, what: str) -> str:
-    """How A changes with one count while the rest of the training set stays, in pairs."""
+def _more_data(networks: pd.DataFrame, count: str, addition: str) -> str:
+    """The change of A with a count while the rest of the training set stays, in pairs."""
     key = f"added_{count}_pct"
     pairs = networks[networks[key].notna()] if key in networks else networks[:0]
     if pairs.empty:
@@ -188,7 +189,7 @@ def _more_data(networks: pd.DataFrame, count: str, what: str) -> str:
     better, worse = (pairs[f"{key}_lo"] > 0).sum(), (pairs[f"{key}_hi"] < 0).sum()
     half = (pairs[f"{key}_hi"] - pairs[f"{key}_lo"]).median() / 2
     return (
-        f"Adding {what} changes A by {_range(pairs[key], '+.0f')} points, in {len(pairs)} "
+        f"Adding {addition} changes A by {_range(pairs[key], '+.0f')} points, in {len(pairs)} "
         "comparisons paired over the same windows, all seeds together: the 95 % interval is "
         f"±{half:.1f} points (median), above 0 in {better} and below 0 in {worse}; about one in 20 "
         "excludes 0 by chance."
@@ -214,13 +215,13 @@ def _below_ceiling(rows: pd.DataFrame) -> str:
 
 
 def _prior_conflicts(rows: pd.DataFrame) -> str:
-    """What contradicts the prior, and what the mean would have given."""
+    """Results whose recordings contradict the prior, with the error of the mean."""
     conflicts = rows[rows.prior_conflict.notna()]
-    told = [
+    sentences = [
         f"{label(row.estimator)} on {row.sensor} at {row.window_s:g} s: {row.prior_conflict}"
         for _, row in conflicts.iterrows()
     ]
-    return f"The prior does not hold. {'. '.join(told)}." if told else ""
+    return f"The prior does not hold. {'. '.join(sentences)}." if sentences else ""
 
 
 def _oracle_check(rows: pd.DataFrame) -> str:
@@ -232,10 +233,10 @@ def _oracle_check(rows: pd.DataFrame) -> str:
     beaten = int((corrected < _SIGNIFICANT).sum())
     verdict = "No estimator beats" if not beaten else f"DEFECT OF THE EVALUATION: {beaten} beat"
     return (
-        f"{verdict} the oracle, which knows what was drawn, on the same windows significantly: the "
-        f"smallest p value of {len(checked)} is {corrected.min():.2g} after Holm's correction. "
-        "(With 48 comparisons and 20 recordings, a leak that halves the errors is seen in 94 % of "
-        "cases if all recordings leak, in 0 % if half of them do.)"
+        f"{verdict} the oracle, which knows the drawn values, on the same windows significantly: "
+        f"the smallest p value of {len(checked)} is {corrected.min():.2g} after Holm's correction. "
+        "(With 48 comparisons and 20 recordings, a leak that halves the errors is detected in 94 % "
+        "of cases if all recordings leak, in 0 % if half of them do.)"
     )
 
 

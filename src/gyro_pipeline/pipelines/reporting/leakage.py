@@ -8,7 +8,7 @@ import pandas as pd
 
 from gyro_pipeline.conventions import ALL, BEST, BEST_EPOCH_ON_TEST, LAST, PAPER
 from gyro_pipeline.parameters import Sensor, Study, Training
-from gyro_pipeline.pipelines.reporting.results import errors_of, scores_of
+from gyro_pipeline.pipelines.reporting.results import errors_of, scores_of, with_ends
 from gyro_pipeline.pipelines.reporting.tables import WAYS
 from gyro_pipeline.scoring.scores import (
     curve_errors,
@@ -28,67 +28,64 @@ _CEILINGS = ("ceiling_time_saving_pct", "ceiling_accuracy_gain_pct")
 
 
 def pool_leakage(
-    study: Study,
-    training: Training,
-    sensors: dict[str, Any],
-    **stored: Any,
+    study: Study, training: Training, sensors: dict[str, Any], **stored: Any
 ) -> dict[str, pd.DataFrame]:
     """Pool the leak study's runs into one row per sensor, stride and way of training.
 
     Args:
-        study: Its network's hop.
-        training: What the study does not change.
-        sensors: Their rates, by which the hop is a time, where they are known.
+        study: The study, which may set the hop of the network.
+        training: Settings that the study does not change.
+        sensors: Configured sensors; a known rate makes the hop a time.
         **stored: For each sensor its plan, ``<sensor>_plan``, and its runs, ``<sensor>_runs``.
 
     Returns:
-        ``results``: what names a row; its counts; its figures of merit over all test windows of all
-        folds and seeds, with intervals over recordings; A of the constant; by how much the
-        network's mean square exceeds the constant's, with the upper end of its 99 % interval; the
-        p value against the oracle, corrected over all rows, on simulated white noise; the ceiling;
-        the stride in hops of the network; and run ids.
+        ``results``: sensor, stride and way of training; counts; scores over all test windows of all
+        folds and seeds, with intervals over recordings; A of the constant; the mean square of the
+        network less that of the constant, with the upper end of its 99 % interval; the p value
+        against the oracle on simulated white noise, corrected over all rows; the ceiling; the
+        stride in hops of the network; and run ids.
     """
     rows = []
     for sensor in [name.removesuffix("_plan") for name in stored if name.endswith("_plan")]:
         runs = {run.fingerprint: run for run in reversed(stored[f"{sensor}_runs"])}
-        made = [(spec, runs[key]) for key, spec in possible_runs(stored[f"{sensor}_plan"]).items()]
+        planned_runs = [
+            (spec, runs[key]) for key, spec in possible_runs(stored[f"{sensor}_plan"]).items()
+        ]
         rate_hz = Sensor(**sensors[sensor]).rate_hz
         hop_s = np.nan if rate_hz is None else study.training_of(training).hop / rate_hz
-        for stride_s in dict.fromkeys(spec.window_stride_s for spec, _ in made):
-            of_stride = [(spec, run) for spec, run in made if spec.window_stride_s == stride_s]
-            of_ways = _rows_of_stride(of_stride)
-            rows += [row | {"hops": stride_s / hop_s} for row in of_ways]
+        for stride_s in dict.fromkeys(spec.window_stride_s for spec, _ in planned_runs):
+            of_stride = [(s, run) for s, run in planned_runs if s.window_stride_s == stride_s]
+            rows += [row | {"hops": stride_s / hop_s} for row in _rows_of_stride(of_stride)]
     results = pd.DataFrame(rows)
     checked = results.beats_oracle_p.notna()
     results.loc[checked, "beats_oracle_p"] = holm(results.beats_oracle_p[checked].tolist())
     return {"results": results}
 
 
-def _rows_of_stride(
-    made: Sequence[tuple[RunSpec, StoredRun]],
-) -> list[dict[str, Any]]:
-    """A row for each way of training: all its seeds pooled."""
-    by_name = {spec.estimator: run for spec, run in made}
+def _rows_of_stride(stored: Sequence[tuple[RunSpec, StoredRun]]) -> list[dict[str, Any]]:
+    """A row for each way of training, with its seeds pooled."""
+    by_name = {spec.estimator: run for spec, run in stored}
     rows = []
-    for way in WAYS:
-        own = [(spec, run) for spec, run in made if (spec.protocol, spec.estimator) == way]
-        if not own:
+    for protocol, estimator in WAYS:
+        matches = [
+            (spec, run)
+            for spec, run in stored
+            if (spec.protocol, spec.estimator) == (protocol, estimator)
+        ]
+        if not matches:
             continue
+        spec, runs = matches[0][0], [run for _, run in matches]
         names = ("sensor", "source", "window_s", "window_stride_s", "estimator")
-        row = {name: getattr(own[0][0], name) for name in names} | {"leak": own[0][0].protocol}
-        weights = BEST if own[0][0].protocol == BEST_EPOCH_ON_TEST else LAST
-        runs = [run for _, run in own]
+        row = {name: getattr(spec, name) for name in names} | {"leak": protocol}
+        weights = BEST if protocol == BEST_EPOCH_ON_TEST else LAST
         rows.append(row | _pooled(runs, weights, by_name[MEAN], by_name[CONSTANT]))
     return rows
 
 
 def _pooled(
-    runs: Sequence[StoredRun],
-    weights_of: str,
-    mean: StoredRun,
-    constant: StoredRun,
+    runs: Sequence[StoredRun], weights_of: str, mean: StoredRun, constant: StoredRun
 ) -> dict[str, Any]:
-    """All seeds of one way of training at one stride."""
+    """Scores of a way of training at a stride, with its seeds pooled."""
     errors, first = _ordered(runs, weights_of), runs[0]
     recordings = errors.recording.nunique()
     weights = leave_one_out(recordings)
@@ -103,7 +100,7 @@ def _pooled(
     curve = curve_errors(mean.load(CURVE), PAPER, ALL).of(weights)
     window_s = float(first.params["window_s"])
     for name, estimate in score(ours, of_mean, curve, window_s, weights).items():
-        row |= {name: estimate.value, f"{name}_lo": estimate.lo, f"{name}_hi": estimate.hi}
+        row |= with_ends(name, estimate)
     plain = weights[:1]
     ratio = np.sqrt(of_constant.mean(plain) / of_mean.mean(plain))[0]
     row["constant_accuracy_gain_pct"] = 100 * (1 - ratio)
@@ -118,7 +115,7 @@ def _pooled(
 
 
 def _ordered(runs: Sequence[StoredRun], weights: str = LAST) -> pd.DataFrame:
-    """Errors against the mean of the recording, each run's in an order that all have."""
+    """Errors against the mean of the recording, in the same order for every run."""
     tables = [errors_of([run], weights).query("truth == @PAPER") for run in runs]
     return pd.concat([table.sort_values(["recording", "start", "axis"]) for table in tables])
 

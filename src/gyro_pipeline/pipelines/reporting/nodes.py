@@ -1,9 +1,10 @@
-"""The report of a source: its tables, its figures, and the page that shows them, as Markdown.
+"""The report of a source: its tables, its figures, and the page with them, as Markdown.
 
-Modules that draw are imported where they are used, since every run imports this one.
+Modules that draw are imported where they are used, since every run imports this module.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import product
 from typing import Any
 
 import pandas as pd
@@ -21,12 +22,12 @@ from gyro_pipeline.studies import CNN, CONSTANT, LEAKAGE, MEAN
 
 Tables = Mapping[str, Callable[[], pd.DataFrame]]
 _OF_THE_PAPER = ("augmentation", "real2real", "input_channels", tables.FIRST_WINDOWS)
-"""Studies that stand beside the paper's; others have a figure and a table per sensor."""
+"""Studies that repeat the paper's; any other one has a figure and a table for each sensor."""
 
 _BASE = ("base", "local")
 _COLUMNS = [*ROW, "study", "status", "run_ids", "fingerprints", "env", "simulated"]
 _COLUMNS += ["recommended", "beats_oracle_p", *WARNINGS]
-"""Of results, also where none was made."""
+"""Columns of results, which are also there if no result is."""
 
 
 def write_report(
@@ -37,29 +38,31 @@ def write_report(
     studies: dict[str, Any],
     sensors: dict[str, Any],
     earlier: Tables,
-    **made: Tables,
+    **fresh: Tables,
 ) -> tuple[dict[str, pd.DataFrame], dict[str, Any], str]:
     """Make the tables, the figures and the page of a source.
 
     Args:
         source: Where the logs come from.
-        only: What the run was narrowed to.
-        published: What the paper states.
+        only: Filters of the run.
+        published: Results and specifications that the paper states.
         ground_truth: The tolerance that figures show.
-        studies: As configured, to say what was not run.
-        sensors: Likewise.
-        earlier: Pooled results and descriptions of this source that are stored, by
+        studies: Configured studies, to list those that were not run.
+        sensors: Configured sensors.
+        earlier: Stored results and descriptions of this source, by
             ``<study or sensor>/<table>``.
-        **made: Those of this run, by study or sensor.
+        **fresh: Results and descriptions of this run, by study or sensor.
 
     Returns:
         Tables by name, figures by name, and the page as Markdown.
     """
-    fresh = {f"{name}/{table}": load for name, own in made.items() for table, load in own.items()}
-    material = _material(source, published, dict(earlier) | fresh)
+    stored = dict(earlier)
+    for name, loaders in fresh.items():
+        stored |= {f"{name}/{table}": load for table, load in loaders.items()}
+    material = _material(source, published, stored)
     exhibits = {
         **_figures(material, ground_truth),
-        "start_up": _made([tables.start_up(material)]),
+        "start_up": _existing([tables.start_up(material)]),
         "tables": _tables(material),
         "files": _files(material),
     }
@@ -72,8 +75,8 @@ def write_report(
         premise=PREMISE,
         answer=answer(material),
         findings=findings(material),
-        explained=_explained(material.made.estimator),
-        facts=_facts(material, only, set(made)),
+        explained=_explained(material.finished.estimator),
+        facts=_facts(material, only, set(fresh)),
         missing=_missing(material, only, studies, sensors),
         runs=_runs(material),
     )
@@ -109,13 +112,10 @@ def _material(source: str, published: Published, stored: Tables) -> Material:
 
 
 def _tables(material: Material) -> list[Exhibit]:
-    compared = [tables.ratios(material, study, sensor) for study, sensor in _compared(material)]
-    return _made([
-        tables.three_gyroscopes(material),
-        tables.multiple_gyroscopes(material),
-        tables.generalization(material),
+    return _existing([
+        *(tables.paper_results(material, table) for table in tables.PAPER_TABLES),
         tables.trained_on_first_windows(material),
-        *compared,
+        *(tables.ratios(material, study, sensor) for study, sensor in _comparisons(material)),
         tables.sensor_specifications(material),
         tables.recording_quality(material),
         tables.dataset_hours(material),
@@ -124,22 +124,16 @@ def _tables(material: Material) -> list[Exhibit]:
 
 
 def _figures(material: Material, ground_truth: GroundTruth) -> dict[str, list[Exhibit]]:
-    """Those that the page begins with, and all others."""
+    """The figures by their part of the page."""
     from gyro_pipeline.pipelines.reporting import figures, signals  # noqa: PLC0415
 
-    compared = [
-        figures.estimators(material, study, sensor) for study, sensor in _compared(material)
-    ]
     others = [
-        *compared,
+        *(figures.estimators(material, study, sensor) for study, sensor in _comparisons(material)),
         figures.saving_against_turn_on_spread(material),
         figures.input_channels(material),
         figures.training_data(material),
         figures.gyroscopes_10s(material),
-        figures.sparkfun_3_real(material),
-        figures.sparkfun_12_real(material),
-        figures.dot_3_real(material),
-        figures.dot_12_real(material),
+        *(figures.augmentation(material, *row) for row in product(("sparkfun", "dot"), (3, 12))),
         signals.allan_deviation(material),
         signals.running_average(material, ground_truth),
         signals.calibrated_signal(material),
@@ -147,39 +141,42 @@ def _figures(material: Material, ground_truth: GroundTruth) -> dict[str, list[Ex
         figures.leakage_against_stride(material),
     ]
     return {
-        "drift": _made([signals.drift(material)]),
-        "forest": _made([figures.forest(material)]),
-        "figures": _made(others),
+        "drift": _existing([signals.drift(material)]),
+        "forest": _existing([figures.forest(material)]),
+        "figures": _existing(others),
     }
 
 
 def _files(material: Material) -> list[Exhibit]:
     """Tables that are too long for the page."""
     studies = material.results.study.unique().tolist()
-    made = [tables.results_table(material, study) for study in studies]
-    others = dict.fromkeys(study for study, _ in _compared(material))
-    return _made(made + [tables.comparison(material, study) for study in others])
+    compared = dict.fromkeys(study for study, _ in _comparisons(material))
+    return _existing([
+        *(tables.results_table(material, study) for study in studies),
+        *(tables.comparison(material, study) for study in compared),
+    ])  # fmt: skip
 
 
-def _made(exhibits: Iterable[Exhibit | None]) -> list[Exhibit]:
+def _existing(exhibits: Iterable[Exhibit | None]) -> list[Exhibit]:
     return [exhibit for exhibit in exhibits if exhibit is not None]
 
 
-def _compared(material: Material) -> list[tuple[str, str]]:
-    """Studies that compare estimators, and their sensors."""
+def _comparisons(material: Material) -> list[tuple[str, str]]:
+    """Each study that compares estimators, with each of its sensors."""
     rows = material.results[~material.results.study.isin(_OF_THE_PAPER)]
     return list(dict.fromkeys(zip(rows.study, rows.sensor, strict=True)))
 
 
 def _explained(estimators: Iterable[str]) -> list[tuple[str, str]]:
-    """A sentence on each estimator that is shown, those of the first figure first."""
+    """Name and description of each estimator in the report, those of the first figure first."""
     first = [MEAN, CNN, CONSTANT, DEFAULT]
     shown = {*estimators} - {CNN_BEST}
     names = [name for name in (*first, *ESTIMATORS, *sorted(shown)) if name in shown]
-    return [(label(name), _sentence(name)) for name in dict.fromkeys(names)]
+    return [(label(name), _description(name)) for name in dict.fromkeys(names)]
 
 
-def _sentence(name: str) -> str:
+def _description(name: str) -> str:
+    """The first sentence of the docstring of an estimator, and its fixed options."""
     first = " ".join((estimator_class(name).__doc__ or "No description.").split("\n\n")[0].split())
     _, options = ESTIMATORS.get(name, (name, {}))
     words = [
@@ -191,8 +188,8 @@ def _sentence(name: str) -> str:
 
 
 def _facts(material: Material, only: Only, fresh: set[str]) -> list[tuple[str, str]]:
-    """What was run, in plain words."""
-    rows = material.made
+    """How the numbers were made: data, networks, windows, code and environment."""
+    rows = material.finished
     facts = {"Data": _data(material)}
     if len(material.sensors):
         facts["Recordings"] = "; ".join(
@@ -203,20 +200,22 @@ def _facts(material: Material, only: Only, fresh: set[str]) -> list[tuple[str, s
         )
     if len(rows):
         networks = rows[rows.estimator == CNN].drop_duplicates("fingerprints")
-        epochs = ", ".join(f"{one:.0f}" for one in sorted(networks.epochs.dropna().unique()))
+        epochs = ", ".join(f"{count:.0f}" for count in sorted(networks.epochs.dropna().unique()))
         if len(networks):
             facts["Networks"] = f"{len(networks)}, of {epochs} epochs (the paper: 1200)"
             facts["Seeds"] = f"{networks.seeds.max():.0f}"
-        facts["Windows"] = ", ".join(f"{one:g}" for one in sorted(rows.window_s.unique())) + " s"
+        facts["Windows"] = (
+            ", ".join(f"{time_s:g}" for time_s in sorted(rows.window_s.unique())) + " s"
+        )
         facts["Trained"] = f"{rows.started.min()} to {rows.started.max()} UTC"
         facts["Code"] = "; ".join(sorted(rows.code.unique()))
         facts["Environment"] = ", ".join(sorted(rows.env.unique()))
     narrowed = ", ".join(f"{k}={v}" for k, v in only.model_dump(exclude_none=True).items())
     if narrowed:
         facts["Narrowed to"] = narrowed
-    old = [study for study in material.results.study.unique() if study not in fresh]
-    if old:
-        facts["From earlier runs"] = ", ".join(old)
+    earlier = [study for study in material.results.study.unique() if study not in fresh]
+    if earlier:
+        facts["From earlier runs"] = ", ".join(earlier)
     return [*facts.items()]
 
 
@@ -232,26 +231,26 @@ def _data(material: Material) -> str:
 def _missing(
     material: Material, only: Only, studies: Mapping[str, Any], sensors: Iterable[str]
 ) -> pd.DataFrame:
-    """The fewest commands that make what is not there, and what each makes."""
-    envs = {env for env in material.made.env.dropna() if env not in _BASE}
+    """The fewest commands that make the missing results, and the results of each."""
+    envs = {env for env in material.finished.env.dropna() if env not in _BASE}
     env = f" --env={envs.pop()}" if len(envs) == 1 else ""
     makes: dict[str, list[str]] = {}
-    for name, given in studies.items():
-        study = Study.model_validate(given)
-        asked = [sensor for sensor in study.sensors_among(sensors) if only.sensor in (None, sensor)]
+    for name, settings in studies.items():
+        study = Study.model_validate(settings)
+        studied = [s for s in study.sensors_among(sensors) if only.sensor in (None, s)]
         rows = material.of(name)
-        lacking, there = int((rows.status == NOT_RUN).sum()), len(rows) > 0
-        if not asked or (there and not lacking) or not (there or study.default):
+        lacking, begun = int((rows.status == NOT_RUN).sum()), len(rows) > 0
+        if not studied or (begun and not lacking) or not (begun or study.default):
             continue
         command = f"kedro run{'' if study.default else f' --pipeline={name}'}{env}"
-        words = f"{lacking} of {len(rows)} results of {name}" if there else f"the study {name}"
-        makes.setdefault(command, []).append(words)
-    rows_of = [{"Command": command, "Makes": ", ".join(words)} for command, words in makes.items()]
-    return pd.DataFrame(rows_of, columns=["Command", "Makes"])
+        results = f"{lacking} of {len(rows)} results of {name}" if begun else f"the study {name}"
+        makes.setdefault(command, []).append(results)
+    table = [{"Command": command, "Makes": ", ".join(names)} for command, names in makes.items()]
+    return pd.DataFrame(table, columns=["Command", "Makes"])
 
 
 def _runs(material: Material) -> list[dict[str, Any]]:
-    """Where the runs of each study are."""
+    """The number of results and runs of each study, and its experiment in MLflow."""
     return [
         {
             "study": study,
@@ -259,7 +258,7 @@ def _runs(material: Material) -> list[dict[str, Any]]:
             "runs": rows.run_ids.str.split().explode().nunique(),
             "experiment": str(rows.experiment_id.iloc[0]),
         }
-        for study, rows in material.made.groupby("study", sort=False)
+        for study, rows in material.finished.groupby("study", sort=False)
     ]
 
 

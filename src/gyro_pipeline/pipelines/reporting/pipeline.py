@@ -21,13 +21,13 @@ def create_pipeline(
 
     Args:
         studies: The sensors of each study.
-        sensors: Those whose recordings the report describes.
-        virtual: Those of them that have virtual gyroscopes.
+        sensors: Sensors whose recordings the report describes.
+        virtual: Sensors with virtual gyroscopes.
     """
     nodes = [_pooled(study, studied) for study, studied in studies.items() if studied]
     nodes += [_described(sensor, sensor in virtual) for sensor in sensors]
-    given = "source only published ground_truth studies sensors".split()
-    inputs = {name: f"params:{name}" for name in given} | {"earlier": "reporting.earlier"}
+    settings = "source only published ground_truth studies sensors".split()
+    inputs = {name: f"params:{name}" for name in settings} | {"earlier": "reporting.earlier"}
     inputs |= {output.split(".")[0]: output for node in nodes for output in node.outputs}
     report = _node(write_report, inputs, REPORT, "_".join(studies))
     return Pipeline([*nodes, report])
@@ -36,12 +36,12 @@ def create_pipeline(
 def _pooled(study: str, sensors: Sequence[str]) -> Node:
     inputs = {f"{sensor}_plan": f"{study}.{sensor}.training.plan" for sensor in sensors}
     inputs |= {f"{sensor}_runs": f"{study}.{sensor}.evaluation.runs" for sensor in sensors}
-    given = {"study": f"params:studies.{study}"}
-    if study == LEAKAGE:
-        given |= {name: f"params:{name}" for name in ("training", "sensors")}
-        return _node(pool_leakage, inputs | given, f"{study}.reporting.pooled", study)
-    given |= {name: f"params:{name}" for name in ("source", "windows_s", "seeds", "only")}
-    return _node(pool_results, inputs | given, f"{study}.reporting.pooled", study)
+    pool: Any = pool_leakage if study == LEAKAGE else pool_results
+    settings = "training sensors" if study == LEAKAGE else "source windows_s seeds only"
+    inputs |= {name: f"params:{name}" for name in settings.split()} | {
+        "study": f"params:studies.{study}"
+    }
+    return _node(pool, inputs, f"{study}.reporting.pooled", study)
 
 
 def _described(sensor: str, virtual: bool) -> Node:

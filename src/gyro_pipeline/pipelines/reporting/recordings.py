@@ -1,4 +1,4 @@
-"""What the recordings of a sensor show: its noise, drift and hours, as tables to draw from."""
+"""The description of a sensor by its recordings: noise, drift and hours, as tables."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -20,19 +20,19 @@ from gyro_pipeline.physics.warm_up import LAST, fit_common_warm_up, settling
 from gyro_pipeline.recordings import iterate_recordings, tested_imu
 
 SIGMAS_MDPS = (1.0, 0.5)
-"""The accuracy of the bias for which the times of a start-up are given."""
+"""Standard deviations of the bias for which the time of a start-up is computed."""
 
 FIGURES = ["white_dps_rts", "instability_dps", "random_walk_dps_per_rts"]
 GYROSCOPES = (1, 4, 10)
-"""How many gyroscopes the paper averages in its figure of convergence."""
+"""Numbers of gyroscopes that the paper averages in its figure of convergence."""
 
-_DRIFT_POINTS = 24  # of a recording; noise would hide the drift if there were many more
+_DRIFT_POINTS = 24  # per recording; with many more, noise would hide the drift
 WARM_UPS_S = (5.0, 20.0, 60.0)
 """Time constants of the warm-ups that are fitted to recordings."""
 
 _WORST_FIRST = (REJECTED, REPAIRED, KEPT)
-_SHOWN = 20  # recordings of a sensor that have a row of their own in the table of quality
-_POINTS = 1300  # more of a running mean would not be seen
+_MAX_ROWS = 20  # recordings of a sensor with a row in the quality table
+_POINTS = 1300  # of a running mean; more would not be visible
 
 
 def describe(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
@@ -48,12 +48,12 @@ def describe(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
 
     Args:
         recordings: Angular rates, deg/s.
-        bias: Their ground truth.
+        bias: Ground truth of the recordings.
         noise: N, B and K of every gyroscope.
-        allan: Their Allan variances.
-        quality: What quality control found.
+        allan: Allan variances of the recordings.
+        quality: Results of quality control.
         ground_truth: The tolerance of the settling time.
-        virtual: Virtual recordings, where there are some.
+        virtual: Virtual recordings, if there are any.
 
     Returns:
         ``description``, one row; ``quality``, the table of the report; and ``signals``, the lines
@@ -78,18 +78,17 @@ def describe(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
 def drift(recordings: xr.Dataset) -> tuple[pd.DataFrame, dict[str, float]]:
     """Mean rate against time after power-on, over all recordings and IMUs, and its warm-up.
 
-    Each recording is centred by the mean of its last quarter, so that only what changes within a
-    recording is left: a warm-up that all power-ons share stands out, noise averages out.
+    Each recording is centred by the mean of its last quarter, so that only changes within a
+    recording are left: a warm-up that all power-ons share stands out, noise averages out.
 
     Args:
-        recordings: Angular rates, deg/s; a recording shorter than nine in ten others is left out.
+        recordings: Angular rates, deg/s; the shortest tenth of the recordings is left out.
 
     Returns:
-        Lines: for each axis its middles of blocks ``x``, seconds, the mean ``y``, deg/s, and its
-        95 % interval over recordings, ``lo`` and ``hi``, NaN for a single recording; and for each
-        axis the warm-up fitted with the time constant that stands out most. Then, as
-        ``warm_up_bound_dps_<time constant>``, the largest amplitude of any axis that the 95 %
-        interval allows.
+        Lines for each axis: times ``x``, seconds, the mean ``y``, deg/s, with its 95 % interval
+        over recordings, ``lo`` and ``hi``, NaN for a single recording; and the warm-up fitted with
+        the most significant time constant. Then, as ``warm_up_bound_dps_<time constant>``, the
+        largest amplitude of any axis that the 95 % interval allows.
     """
     lengths = recordings["samples"].to_numpy()
     length = int(np.quantile(lengths[lengths > 0], 0.1, method="lower"))
@@ -102,52 +101,55 @@ def drift(recordings: xr.Dataset) -> tuple[pd.DataFrame, dict[str, float]]:
     ])  # fmt: skip
     blocks_hz = means.shape[-1] * rate_hz / length
     coarse = block_means(means, block_edges(means.shape[-1], means.shape[-1] // _DRIFT_POINTS))
-    seen = settling(coarse, coarse.shape[-1] * rate_hz / length)
+    drifts = settling(coarse, coarse.shape[-1] * rate_hz / length)
     fits = {time_s: fit_common_warm_up(means, blocks_hz, time_s) for time_s in WARM_UPS_S}
     bounds = {f"warm_up_bound_dps_{t:g}": float(fit.bound.max()) for t, fit in fits.items()}
     time_s = max(fits, key=lambda t: np.nansum((fits[t].amplitude / fits[t].half) ** 2))
-    decay = np.exp(-seen.time_s / time_s)
-    decay -= decay[seen.time_s >= seen.time_s[-1] * (1 - LAST)].mean()
+    decay = np.exp(-drifts.time_s / time_s)
+    decay -= decay[drifts.time_s >= drifts.time_s[-1] * (1 - LAST)].mean()
     lines = []
     for i, axis in enumerate(AXES):
-        ends = {"lo": seen.rate[i] - seen.half[i], "hi": seen.rate[i] + seen.half[i]}
-        lines.append({"line": axis, "x": seen.time_s, "y": seen.rate[i], **ends})
+        rate, half = drifts.rate[i], drifts.half[i]
+        ends = {"lo": rate - half, "hi": rate + half}
+        lines.append({"line": axis, "x": drifts.time_s, "y": rate, **ends})
         fitted = fits[time_s].amplitude[i] * decay
-        lines.append({"line": f"{axis}, warm-up of {time_s:g} s", "x": seen.time_s, "y": fitted})
+        lines.append({"line": f"{axis}, warm-up of {time_s:g} s", "x": drifts.time_s, "y": fitted})
     return pd.concat(map(pd.DataFrame, lines), ignore_index=True), bounds
 
 
 def start_up(recordings: xr.Dataset, bias: pd.DataFrame, noise: pd.DataFrame) -> dict[str, float]:
     """Seconds at rest after which the bias of the tested IMU is known, pooled over its axes.
 
-    The mean of t seconds errs by N^2/t + (0.664 B)^2 + K^2 t/3. Who knows earlier calibrations
-    combines it with their mean, about which the bias scatters by the turn-on spread; the ceiling
-    is that of one who knows their mean exactly. White noise, no warm-up, exchangeable power-ons.
+    The mean of t seconds has the variance N^2/t + (0.664 B)^2 + K^2 t/3. It is combined with the
+    mean of earlier calibrations, about which the bias scatters by the turn-on spread; for the
+    ceiling this mean is known exactly. There is no warm-up, and power-ons are exchangeable.
 
     Args:
-        recordings: For the split and, if simulated, the drawn spread.
-        bias: Their ground truth.
+        recordings: Recordings with their split and, if simulated, the drawn spread.
+        bias: Ground truth of the recordings.
         noise: N, B and K.
 
     Returns:
-        ``spread_dps`` and ``white_dps_rts`` of each axis, and ``<method>_s_at_<sigma>``, of the
-        methods mean, history and ceiling; 0 where history alone suffices, inf where a recording's
-        length does not, NaN where the noise is not known.
+        ``spread_dps`` and ``white_dps_rts`` of each axis, and ``<method>_s_at_<sigma>`` of the
+        methods mean, history and ceiling: 0 if the history alone suffices, infinite if it takes
+        longer than a recording, NaN if the noise is unknown.
     """
     imu, rate_hz = tested_imu(recordings), recordings.attrs["rate_hz"]
     white, flicker, walk = (
         noise[noise.imu == imu].set_index("axis").loc[list(AXES), FIGURES].T.to_numpy()
     )
-    own = bias[bias.imu == imu]
+    training = bias[bias.imu == imu]
     if "split" in recordings.coords:
         held_out = recordings.recording[recordings.split == TEST].to_numpy()
-        own = own[~own.recording.isin(held_out)]
-    means = own.pivot(index="recording", columns="axis", values="bias_dps")[list(AXES)].to_numpy()
+        training = training[~training.recording.isin(held_out)]
+    means = training.pivot(index="recording", columns="axis", values="bias_dps")[
+        list(AXES)
+    ].to_numpy()
     recording_s = float(recordings["samples"].max()) / rate_hz
     averaging, count = white**2 / recording_s, len(means)
     try:
         spread = turn_on_spread(means, averaging)
-    except InputError:  # of a single recording
+    except InputError:  # a single recording
         spread = np.full(len(AXES), np.nan)
     if "true_turn_on_spread" in recordings:
         spread = recordings.true_turn_on_spread.to_numpy()
@@ -173,13 +175,13 @@ def start_up(recordings: xr.Dataset, bias: pd.DataFrame, noise: pd.DataFrame) ->
 
 
 def recording_quality(table: pd.DataFrame) -> pd.DataFrame:
-    """How many recordings were kept, repaired and rejected, and those that something was found in.
+    """Count the recordings that were kept, repaired and rejected, and list those with findings.
 
     Args:
-        table: Of the raw-logs stage, a row per IMU and recording.
+        table: The quality table of the raw-logs stage, a row per IMU and recording.
 
     Returns:
-        A row for the sensor, and below it the recordings that are not simply kept, the worst first.
+        A row for the sensor, and below it the recordings with findings, the worst first.
     """
     counts, used = Counter(table.outcome), (table.stop - table.start).dropna()
     noted = table[(table.outcome != KEPT) | table.findings.notna()]
@@ -197,20 +199,20 @@ def recording_quality(table: pd.DataFrame) -> pd.DataFrame:
             "Findings": f"in {len(noted)} recordings" if len(noted) else "none",
         }
     ]
-    rows += [_of_recording(row) for _, row in noted.head(_SHOWN).iterrows()]
-    if len(noted) > _SHOWN:
-        rest = f"in {len(noted) - _SHOWN} further recordings"
+    rows += [_quality_row(row) for _, row in noted.head(_MAX_ROWS).iterrows()]
+    if len(noted) > _MAX_ROWS:
+        rest = f"in {len(noted) - _MAX_ROWS} further recordings"
         rows.append({"Sensor": rows[0]["Sensor"], "Findings": rest})
     return pd.DataFrame(rows)
 
 
 def _range(rows: pd.Series) -> str:
-    """How many rows the shortest and the longest recording have."""
+    """The number of rows in the shortest and in the longest recording."""
     lowest, highest = f"{rows.min():.0f}", f"{rows.max():.0f}"
     return f"{lowest} of each" if lowest == highest else f"{lowest} to {highest}"
 
 
-def _of_recording(row: pd.Series) -> dict[str, Any]:
+def _quality_row(row: pd.Series) -> dict[str, Any]:
     used = "none" if pd.isna(row.stop) else f"{row.start:.0f} to {row.stop - 1:.0f}"
     return {
         "Sensor": row.sensor,
@@ -234,21 +236,21 @@ def _noise(noise: pd.DataFrame) -> dict[str, float]:
 
 
 def _counts(recordings: xr.Dataset, virtual: xr.Dataset | None) -> dict[str, float]:
-    """Recordings of gyroscopes, and samples in them, that train, test, or do either.
+    """Numbers of recordings and of their samples that train, test, or do either.
 
-    Training recordings (validation included) count for every gyroscope, test recordings for the
-    three of the tested IMU; in a k-fold all of them do both.
+    Training recordings, including those for validation, count for every gyroscope, test recordings
+    for the three of the tested IMU; in a k-fold all recordings do both.
     """
     samples = recordings["samples"].load().transpose("imu", "recording")
-    there = samples > 0
-    tested = there & (there.imu == tested_imu(recordings))
-    train, test = there, tested
+    exists = samples > 0
+    tested = exists & (exists.imu == tested_imu(recordings))
+    train, test = exists, tested
     if "split" in recordings.coords:
-        train, test = there & (recordings.split != TEST), tested & (recordings.split == TEST)
+        train, test = exists & (recordings.split != TEST), tested & (recordings.split == TEST)
     gyroscopes = len(AXES) * int(train.any("recording").sum())
     row: dict[str, float] = {
         "gyroscopes": gyroscopes,
-        "median_samples": float(samples.where(there).median()),
+        "median_samples": float(samples.where(exists).median()),
     }
     for name, part in (("train", train), ("test", test), ("all", train | test)):
         row[f"{name}_recordings"] = len(AXES) * int(part.sum())
@@ -264,7 +266,7 @@ def _counts(recordings: xr.Dataset, virtual: xr.Dataset | None) -> dict[str, flo
 
 
 def _allan_lines(allan: xr.Dataset, noise: pd.DataFrame) -> Iterator[pd.DataFrame]:
-    """The Allan deviation of each gyroscope, and the fit of N, B and K over all of them."""
+    """Lines with the Allan deviation of each gyroscope, and with the fit of N, B and K over all."""
     times_s = allan.time_s.to_numpy()
     counts = allan.differences.fillna(0)
     variance = allan.allan_variance.weighted(counts).mean("recording")
@@ -298,10 +300,10 @@ def _signals(
     centred = samples - samples.mean(axis=1, keepdims=True)
     for count in (count for count in GYROSCOPES if count <= len(means)):
         settled_s = float(settling_time_s(centred[:count].mean(axis=0), rate_hz, tolerance_dps))
-        together = means[:count].mean(axis=0)
-        yield _line(f"convergence {count}", f"settled at {settled_s:.1f} s", times_s, together)
-    for alone in means[: max(GYROSCOPES)]:
-        yield _line("convergence", "each alone", times_s, alone)
+        average = means[:count].mean(axis=0)
+        yield _line(f"convergence {count}", f"settled at {settled_s:.1f} s", times_s, average)
+    for single in means[: max(GYROSCOPES)]:
+        yield _line("convergence", "each alone", times_s, single)
 
 
 def _line(figure: str, line: str, x: NDArray[np.float64], y: NDArray[np.float64]) -> pd.DataFrame:
@@ -313,7 +315,7 @@ def _line(figure: str, line: str, x: NDArray[np.float64], y: NDArray[np.float64]
 def _running_mean(
     samples: NDArray[np.float64], rate_hz: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Times in s, shape (points,), and the mean of all samples until then, (..., points)."""
+    """Times, (points,), seconds, and the mean of all samples up to each, (..., points)."""
     step = max(1, samples.shape[-1] // _POINTS)
     counts = np.arange(step, samples.shape[-1] + 1, step)
     return counts / rate_hz, np.cumsum(samples, axis=-1)[..., counts - 1] / counts

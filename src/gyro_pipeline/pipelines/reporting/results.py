@@ -1,4 +1,4 @@
-"""From tracked runs to one row per result: seeds pooled, with intervals."""
+"""Results from tracked runs: a row for each, with seeds pooled and intervals."""
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
@@ -36,13 +36,13 @@ from gyro_pipeline.tracking import CURVE, ERRORS, SCORES, StoredRun
 logger = logging.getLogger(__name__)
 
 ROW = ["sensor", "source", "estimator", "method", "real_gyros", "virtual_gyros", "window_s"]
-"""What names a result."""
+"""Columns that identify a result."""
 
 NOT_RUN = "not run"
-"""The status of a result that no finished run has; one that is there has none."""
+"""Status of a result without a finished run; a finished result has no status."""
 
 CNN_BEST = "cnn_best"
-"""The paper's network at its best validation epoch, where that was stored."""
+"""The paper's network at its best validation epoch, if that was stored."""
 
 CEILINGS = ["ceiling_rmse_dps", "ceiling_time_saving_pct", "ceiling_accuracy_gain_pct"]
 CEILINGS += [f"ceiling_{name}_accuracy_gain_pct" for name in ("joint", "history")]
@@ -51,50 +51,50 @@ REALISED = [
     for name in ("oracle", "constant")
     for score in ("rmse_dps", "accuracy_gain_pct")
 ]
-"""What the oracle, where it is known, and the constant reach on the same windows."""
+"""Scores of the constant and, on simulated data, of the oracle on the same windows."""
 
 OTHERS = ["coverage_1sigma_pct", "coverage_2sigma_pct", "beats_oracle_p"]
 OTHERS += [f"prior_p_{axis}" for axis in AXES]
 OTHERS += [f"turn_on_correlation_{axes}" for axes in ("xy", "xz", "yz")]
 WARNINGS = ["below_ceiling", "prior_conflict"]
-"""Tags of a run, in words."""
+"""Tags of a run with a warning in words."""
 
 REFERENCES = (MEAN, DEFAULT, CONSTANT)
-"""What every estimator is compared with, in pairs over recordings."""
+"""Estimators that every other one is compared with, in pairs over recordings."""
 
 ADDED = ("virtual_gyros", "real_gyros")
-"""Counts of gyroscopes in training whose effect on A is compared in pairs."""
+"""Counts of training gyroscopes whose effect on A is compared in pairs."""
 
 _CURVES = ["study", "sensor", "windows", "time_s", "rmse_dps"]
 _ENDS = {"": "value", "_lo": "lo", "_hi": "hi"}
 
 
 def column(name: str, windows: str = FIRST) -> str:
-    """Name of a column of results; that of first windows is the plain name of the score."""
+    """Name of a column of results: the plain name of the score for first windows."""
     return f"{name}_{ALL}" if windows == ALL else name
 
 
+def with_ends(name: str, estimate: Estimate) -> dict[str, float | None]:
+    """Columns with an estimate, under its name, and with the ends of its interval."""
+    return {name + end: getattr(estimate, key) for end, key in _ENDS.items()}
+
+
 def pool_results(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
-    study: Study,
-    source: str,
-    windows_s: list[float],
-    seeds: list[int],
-    only: Only,
-    **stored: Any,
+    study: Study, source: str, windows_s: list[float], seeds: list[int], only: Only, **stored: Any
 ) -> dict[str, pd.DataFrame]:
-    """Pool the runs that a study's plans ask for into one row per result.
+    """Pool the planned runs of a study into one row per result.
 
     Args:
-        study: Its grid.
+        study: The study with its grid.
         source: Where the logs come from.
         windows_s: Calibration times, seconds.
-        seeds: All of them make up a row.
-        only: What the grid is narrowed to.
+        seeds: Seeds that are pooled in a row.
+        only: Filters of the grid.
         **stored: For each sensor its plan, ``<sensor>_plan``, and its runs, ``<sensor>_runs``.
 
     Returns:
-        ``results``, a row per estimator, sensor, window and training set, with ``status``: none,
-        or why there is no result; and ``curves`` of the running mean, with columns ``study,
+        ``results``, a row per estimator, sensor, window and training set, whose ``status`` says
+        why there is no result; and ``curves`` of the running mean, with columns ``study,
         sensor, windows, time_s, rmse_dps``.
     """
     sensors = [name.removesuffix("_plan") for name in stored if name.endswith("_plan")]
@@ -109,23 +109,22 @@ def pool_results(  # noqa: PLR0913, PLR0917 - a node's arguments are its dataset
             cell = Cell([spec for spec in specs if spec.window_s == window_s], finder)
             results += cell.results()
         curves += [] if cell.mean is None else [pooled_curve(cell.mean)]
-    more = len({run.fingerprint for run in runs} - finder.planned)
-    if more:
+    unused = len({run.fingerprint for run in runs} - finder.planned)
+    if unused:
         logger.info(
             "%s: %d finished runs with other settings or data are in the store and not used",
-            *(study.experiment, more),
+            *(study.experiment, unused),
         )
-    made = curves[1:] or curves
-    return {"results": pd.DataFrame(results), "curves": pd.concat(made)}
+    return {"results": pd.DataFrame(results), "curves": pd.concat(curves[1:] or curves)}
 
 
 class Finder:
-    """Finds the finished runs of rows by the fingerprints that the plans give them.
+    """Finds the finished runs of rows by the fingerprints in the plans.
 
     Args:
-        plan: Of all sensors.
-        runs: Finished ones, newest first.
-        unseen_devices: Whether the tested devices are unseen ones.
+        plan: The plans of all sensors.
+        runs: Finished runs, newest first.
+        unseen_devices: Whether the tested devices are unseen.
     """
 
     def __init__(self, plan: pd.DataFrame, runs: Sequence[StoredRun], unseen_devices: bool) -> None:
@@ -139,29 +138,24 @@ class Finder:
 
     @property
     def planned(self) -> set[str]:
-        """Fingerprints of the runs that the plans ask for."""
+        """Fingerprints of the planned runs."""
         return set(self._keys.values())
 
     def __call__(self, row: Iterable[RunSpec]) -> tuple[list[StoredRun], str]:
         """The runs of all seeds of a row, or none and the reason."""
         specs = dict.fromkeys(run_spec(spec, self._unseen_devices) for spec in row)
         reasons = [self._left_out[spec] for spec in specs if self._left_out.get(spec)]
-        found = [self._runs.get(self._keys.get(spec, "")) for spec in specs]
-        runs = [run for run in found if run is not None]
+        keys = [self._keys.get(spec, "") for spec in specs]
+        runs = [self._runs[key] for key in keys if key in self._runs]
         return (runs, "") if len(runs) == len(specs) else ([], reasons[0] if reasons else NOT_RUN)
 
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """The results of one sensor and window, which all stand beside one running mean.
+    """The results of a sensor and window length, which share a running mean."""
 
-    Attributes:
-        specs: Its rows, a spec for every seed.
-        find: Gives the runs of a row.
-    """
-
-    specs: Sequence[RunSpec]
-    find: Finder
+    specs: Sequence[RunSpec]  # rows of the study, a spec for every seed
+    find: Finder  # finds the runs of a row
 
     @cached_property
     def _rows(self) -> list[tuple[list[RunSpec], list[StoredRun], str]]:
@@ -171,7 +165,7 @@ class Cell:
 
     @cached_property
     def mean(self) -> StoredRun | None:
-        """The run of the running mean; None where there is none."""
+        """The run of the running mean; None if it is missing."""
         means = [runs[0] for specs, runs, _ in self._rows if runs and specs[0].estimator == MEAN]
         return means[0] if means else None
 
@@ -186,25 +180,25 @@ class Cell:
 
     @cached_property
     def _weights(self) -> np.ndarray:
-        """Of recordings, or devices, with each left out in turn."""
+        """Weights of recordings, or devices, with each left out in turn."""
         return leave_one_out(clusters(self._references[MEAN]).nunique())
 
     @cached_property
     def _squares(self) -> dict[str, SquaredErrors]:
-        """Squared errors of the running mean for all and for first windows."""
+        """Squared errors of the running mean, for all and for first windows."""
         errors = self._references[MEAN]
         return {windows: squared_errors(errors, PAPER, windows) for windows in (ALL, FIRST)}
 
     @cached_property
     def _curves(self) -> dict[str, WeightedCurve]:
-        """Its RMSE against its length, likewise."""
+        """RMSE of the running mean against its length, for all and for first windows."""
         assert self.mean is not None
         table = self.mean.load(CURVE)
         curves = {windows: curve_errors(table, PAPER, windows) for windows in (ALL, FIRST)}
         return {windows: curve.of(self._weights) for windows, curve in curves.items()}
 
     def results(self) -> list[dict[str, Any]]:
-        """One for each row; without the running mean there is none to compare with."""
+        """A result for each row; all need the running mean, which they are compared with."""
         results = []
         for specs, runs, problem in self._rows:
             name = {key: getattr(specs[0], key) for key in ("study", "protocol", *ROW)}
@@ -244,10 +238,10 @@ class Cell:
         }
 
     def _figures(self, runs: Sequence[StoredRun], window_s: float) -> dict[str, Any]:
-        """Figures of merit of all seeds pooled, with intervals over recordings.
+        """Scores of all seeds pooled, with intervals over recordings.
 
-        Squared errors are averaged over seeds; ``_seed_sd`` is the standard deviation over the
-        seeds' own figures, and None for one seed.
+        Squared errors are averaged over seeds; ``_seed_sd`` is the standard deviation of the scores
+        of single seeds, None for one seed.
         """
         errors = [errors_of([run]) for run in runs]
         tested = self._references[MEAN].reindex(columns=["imu", "recording"], fill_value=0)
@@ -257,68 +251,68 @@ class Cell:
             single = [self._scores(table, windows, window_s) for table in errors[1:] and errors]
             for base, estimate in pooled.items():
                 name = column(base, windows)
-                row |= {name + end: getattr(estimate, key) for end, key in _ENDS.items()}
+                row |= with_ends(name, estimate)
                 values = [scores[base].value for scores in single]
                 spread = np.std(values, ddof=1) if values and np.isfinite(values).all() else None
                 row[f"{name}_seed_sd"] = spread
         return row | self._differences(runs)
 
     def _scores(self, errors: pd.DataFrame, windows: str, window_s: float) -> dict[str, Estimate]:
-        own, reference = squared_errors(errors, PAPER, windows), self._squares[windows]
-        scores = score(own, reference, self._curves[windows], window_s, self._weights)
+        squares, of_mean = squared_errors(errors, PAPER, windows), self._squares[windows]
+        scores = score(squares, of_mean, self._curves[windows], window_s, self._weights)
         return scores | {
             f"accuracy_gain_pct_{axis}": self._gain(errors, windows, axis) for axis in AXES
         }
 
     def _gain(self, errors: pd.DataFrame, windows: str, axis: str) -> Estimate:
-        """A of one axis."""
-        own, mean = (
+        """A on an axis."""
+        square, of_mean = (
             squared_errors(table[table.axis == axis], PAPER, windows).mean(self._weights)
             for table in (errors, self._references[MEAN])
         )
-        return gain_pct(with_interval(np.sqrt(own / mean), positive=True))
+        return gain_pct(with_interval(np.sqrt(square / of_mean), positive=True))
 
     def _added(self, spec: RunSpec, runs: Sequence[StoredRun]) -> dict[str, Any]:
-        """By how much A exceeds that with the fewest gyroscopes, all else equal.
+        """A less the A with the fewest gyroscopes, all else equal: ``added_<count>_pct``.
 
-        Paired over recordings, all seeds together: ``added_<count>_pct``, over all windows.
+        Differences are over all windows, paired over recordings, with all seeds together.
         """
         row: dict[str, Any] = {}
         for count in ADDED if spec.estimator == CNN else ():
-            none: dict[str, Any] = {count: 0}
-            alike = [
-                (getattr(specs[0], count), of_fewer)
-                for specs, of_fewer, _ in self._rows
-                if of_fewer and replace(specs[0], **none) == replace(spec, **none)
+            without: dict[str, Any] = {count: 0}
+            similar = [
+                (getattr(specs[0], count), others)
+                for specs, others, _ in self._rows
+                if others and replace(specs[0], **without) == replace(spec, **without)
             ]
-            fewest, of_fewest = min(alike, key=lambda pair: pair[0])
+            fewest, base_runs = min(similar, key=lambda pair: pair[0])
             if getattr(spec, count) > fewest:
-                own, base = (squared_errors(errors_of(r), PAPER, ALL) for r in (runs, of_fewest))
-                change = gain_difference(own, base, self._squares[ALL], self._weights)
-                row |= {f"added_{count}_pct{end}": getattr(change, k) for end, k in _ENDS.items()}
+                more, base = (squared_errors(errors_of(r), PAPER, ALL) for r in (runs, base_runs))
+                change = gain_difference(more, base, self._squares[ALL], self._weights)
+                row |= with_ends(f"added_{count}_pct", change)
         return row
 
     def _differences(self, runs: Sequence[StoredRun]) -> dict[str, Any]:
-        """Errors less those of the references on all the same windows, paired over recordings.
+        """Errors less those of the references on the same windows, paired over recordings.
 
-        ``less_<name>_dps`` is a difference of RMSEs against the mean of the recording;
-        ``less_<name>_dps2_<truth>`` one of mean squares against the other truths, whose own noise
-        may leave none to take the root of.
+        ``less_<name>_dps`` is a difference of RMSEs against the mean of the recording, and
+        ``less_<name>_dps2_<truth>`` a difference of mean squares against another truth: less the
+        noise of that truth, a mean square may be negative.
         """
         table = errors_of(runs)
         row: dict[str, Any] = {}
         for truth in table.truth.unique():
-            own = squared_errors(table, truth, ALL)
+            squares = squared_errors(table, truth, ALL)
             for name, errors in self._references.items():
                 compare = rmse_difference if truth == PAPER else paired_difference
-                less = compare(own, squared_errors(errors, truth, ALL), self._weights)
+                difference = compare(squares, squared_errors(errors, truth, ALL), self._weights)
                 key = f"less_{name}_dps" + ("" if truth == PAPER else f"2_{truth}")
-                row |= {key + end: getattr(less, part) for end, part in _ENDS.items()}
+                row |= with_ends(key, difference)
         return row
 
 
 def _provenance(runs: Sequence[StoredRun]) -> dict[str, Any]:
-    """Where, when and with which code runs were made; a commit says little if files had changed."""
+    """Where, when and with which code runs were made, and whether files were uncommitted."""
     tags, newest = runs[0].tags, max(run.started_ms for run in runs)
     commit = tags.get("mlflow.source.git.commit", "")[:12] or "unknown"
     changed = " with uncommitted changes" if tags.get("git_dirty") == "True" else ""
@@ -336,7 +330,7 @@ def scores_of(run: StoredRun) -> Mapping[tuple[str, str, str], float]:
     """Scores of a run at the last epoch against the paper's truth.
 
     Returns:
-        By score, windows, and ``value``, ``lo`` or ``hi``; those that are there.
+        Existing values by score, windows, and ``value``, ``lo`` or ``hi``.
     """
     table = run.load(SCORES)
     table = table[(table.truth == PAPER) & (table.weights == LAST)]
@@ -349,7 +343,7 @@ def scores_of(run: StoredRun) -> Mapping[tuple[str, str, str], float]:
 
 
 def mean_row(mean: StoredRun) -> dict[str, Any]:
-    """Errors and ceilings of a window from the run of its running mean."""
+    """Errors and ceilings of a window length, from the run of its running mean."""
     row: dict[str, Any] = {"recording_s": float(mean.load(CURVE).time_s.max())}
     scores = scores_of(mean)
     for windows in (ALL, FIRST):
@@ -360,14 +354,14 @@ def mean_row(mean: StoredRun) -> dict[str, Any]:
 
 
 def best_epoch(run: StoredRun) -> StoredRun:
-    """The run as if its weights at the best validation epoch had been its last ones."""
+    """The run with the errors at its best validation epoch in place of those at its last."""
     errors = run.load(ERRORS)
     errors = errors[errors.weights == BEST].assign(weights=LAST)
     return replace(run, load={ERRORS: errors}.__getitem__)
 
 
 def errors_of(runs: Iterable[StoredRun], weights: str = LAST) -> pd.DataFrame:
-    """Errors of some runs, one after the other."""
+    """Errors of runs, one after the other, with the weights of the last or best epoch."""
     table = pd.concat([run.load(ERRORS) for run in runs])
     return table[table.weights == weights]
 
@@ -376,7 +370,7 @@ def pooled_curve(mean: StoredRun) -> pd.DataFrame:
     """RMSE of the running mean against its length, for first and for all windows.
 
     Args:
-        mean: Its run.
+        mean: The run of the running mean.
 
     Returns:
         Columns ``study, sensor, windows, time_s, rmse_dps``.
@@ -386,5 +380,5 @@ def pooled_curve(mean: StoredRun) -> pd.DataFrame:
         curve = curve_errors(table, PAPER, windows)
         rmse = curve.of(np.ones((1, len(curve.squares.sums)))).rmse[0]
         parts.append(pd.DataFrame({"windows": windows, "time_s": curve.times_s, "rmse_dps": rmse}))
-    whose = {name: mean.params[name] for name in ("study", "sensor")}
-    return pd.concat(parts).assign(**whose)[_CURVES]
+    keys = {name: mean.params[name] for name in ("study", "sensor")}
+    return pd.concat(parts).assign(**keys)[_CURVES]

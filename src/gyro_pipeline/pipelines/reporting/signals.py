@@ -1,4 +1,4 @@
-"""The figures of recordings: one function each, drawn from what ``describe`` made of them."""
+"""The figures of recordings: a function for each, drawn from the tables of ``describe``."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ from gyro_pipeline.pipelines.reporting.style import (
     share_legend,
 )
 
-_FROM_S = 1.0  # a running mean of less is mostly off the figure
+_FROM_S = 1.0  # a shorter running mean is mostly off the figure
 _HOUR_S = 3600
 _TOLERANCE = "The band is the tolerance around the mean of the recording, which counts as truth."
 
@@ -33,15 +33,14 @@ def drift(material: Material) -> Exhibit | None:
     figure, panels = _panels(material, sharey=False)
     with LOOK():
         for ax, sensor in panels:
-            own = lines[lines.sensor == sensor]
+            rows = lines[lines.sensor == sensor]
             for axis, colour in zip(AXES, COLOURS, strict=False):
-                line = own[own.line == axis]
+                line = rows[rows.line == axis]
                 ax.plot(line.x, line.y / MDPS, color=colour, lw=1.4, label=f"axis {axis}")
-                ax.fill_between(
-                    line.x, line.lo / MDPS, line.hi / MDPS, color=colour, alpha=0.18, lw=0
-                )
+                band = line.lo / MDPS, line.hi / MDPS
+                ax.fill_between(line.x, *band, color=colour, alpha=0.18, lw=0)
             for axis, colour in zip(AXES, COLOURS, strict=False):
-                fit = own[own.line.str.startswith(f"{axis},")]
+                fit = rows[rows.line.str.startswith(f"{axis},")]
                 ax.plot(fit.x, fit.y / MDPS, color=colour, ls="--", lw=1, label="fitted warm-up")
             ax.axhline(0, color="black", lw=0.8)
             ax.set(title=material.sensor_name(sensor), xlabel="time after power-on [s]")
@@ -50,16 +49,16 @@ def drift(material: Material) -> Exhibit | None:
         figure.suptitle(f"Mean rate against time after power-on; {material.source_name}")
     caption = (
         "The mean over all recordings, each centred by its last quarter, with its 95 % interval. A "
-        "line at 0 is a bias that does not move; one that starts off it is a warm-up, which an "
-        "estimator that knows the device, a constant included, can take off. White noise without "
-        "drift, the premise of the ceiling, means a line at 0. Dashed is the warm-up fitted to all "
+        "line at 0 is a bias that does not move; a line that starts off 0 is a warm-up, which any "
+        "estimator that knows the device, even a constant, can correct. White noise without drift, "
+        "the premise of the ceiling, means a line at 0. Dashed is the warm-up fitted to all "
         f"recordings. The 95 % intervals allow an amplitude of at most {_bounds(material)}."
     )
     return Exhibit("drift", "Does the rate drift after power-on?", caption, figure)
 
 
 def _bounds(material: Material) -> str:
-    """The largest amplitude of a warm-up that recordings allow, by sensor and time constant."""
+    """The largest warm-up amplitude that recordings allow, by sensor and time constant."""
     allowed = {sensor: material.warm_up_allowed_mdps(sensor) for sensor in material.sensors.sensor}
     times_s = "/".join(f"{time_s:g}" for time_s in WARM_UPS_S)
     sizes = ", ".join(
@@ -79,7 +78,8 @@ def allan_deviation(material: Material) -> Exhibit | None:
     figure, panels = _panels(material, sharey=True)
     with LOOK():
         for ax, sensor in panels:
-            _draw_allan(ax, lines[lines.sensor == sensor], _described(material, sensor))
+            row = material.sensors[material.sensors.sensor == sensor].iloc[0]
+            _draw_allan(ax, lines[lines.sensor == sensor], row)
             sheet = sheets.get(sensor)
             if sheet is not None and sheet.noise_density_mdps_rthz is not None:
                 times_s = np.sort(lines[lines.sensor == sensor].x.unique())
@@ -90,7 +90,7 @@ def allan_deviation(material: Material) -> Exhibit | None:
         share_legend(figure, [ax for ax, _ in panels], columns=3)
         figure.suptitle(f"Overlapping Allan deviation; {material.source_name}")
     caption = (
-        "How much averages of a length differ. White noise falls as 1/√t; flicker noise (B) and "
+        "The scatter of averages against their length. White noise falls as 1/√t; flicker (B) and "
         "random walk (K) bend the curve upwards. The dashed line is the fit over all gyroscopes."
     )
     return Exhibit("allan_deviation", "Allan deviation of every gyroscope", caption, figure)
@@ -114,7 +114,7 @@ def _draw_allan(ax: Axes, lines: Any, row: pd.Series) -> None:
 
 def running_average(material: Material, ground_truth: GroundTruth) -> Exhibit | None:
     """Running average of one gyroscope until it has converged (paper, section II)."""
-    lines = _first(material)
+    lines = _shown_lines(material)
     if lines is None:
         return None
     mean, settled = (lines[lines.figure == name] for name in ("running average", "bias"))
@@ -126,19 +126,19 @@ def running_average(material: Material, ground_truth: GroundTruth) -> Exhibit | 
         ax.plot(mean.x, mean.y / MDPS, color=COLOURS[0], label="running average")
         ax.axhline(bias, color="black", lw=1, label="ground truth: mean of the recording")
         _band(ax, bias, tolerance, f"± {tolerance:g} mdps")
-        words = f"stays within from {settled_s:.1f} s on"
-        ax.axvline(settled_s, color=CEILING, ls="--", label=words)
-        _limit(ax, (mean.y[mean.x >= _FROM_S] / MDPS - bias).to_numpy(), tolerance, bias)
+        label = f"stays within from {settled_s:.1f} s on"
+        ax.axvline(settled_s, color=CEILING, ls="--", label=label)
+        _set_limits(ax, (mean.y[mean.x >= _FROM_S] / MDPS - bias).to_numpy(), tolerance, bias)
         ax.set(xlim=(0, mean.x.max()), xlabel="time [s]", ylabel="angular rate [mdps]")
         share_legend(figure, [ax], columns=2)
-        figure.suptitle(f"Running average of one gyroscope: {_whose(material, mean)}")
+        figure.suptitle(f"Running average of one gyroscope: {_gyroscope(material, mean)}")
     caption = f"{_TOLERANCE} Paper, section II."
     return Exhibit("running_average", "Running average of one gyroscope", caption, figure)
 
 
 def calibrated_signal(material: Material) -> Exhibit | None:
     """Raw and calibrated signal of the same gyroscope (paper, section II, second figure)."""
-    lines = _first(material)
+    lines = _shown_lines(material)
     if lines is None:
         return None
     raw, bias = lines[lines.figure == "signal"], float(lines[lines.figure == "bias"].y.iloc[0])
@@ -146,11 +146,9 @@ def calibrated_signal(material: Material) -> Exhibit | None:
         figure = Figure(figsize=(8.5, 4.2), layout="constrained")
         ax = figure.subplots()
         # as pixels also in the SVG, which would hold every sample otherwise
-        for name, y, colour in (
-            ("raw", raw.y, COLOURS[0]),
-            ("calibrated", raw.y - bias, COLOURS[2]),
-        ):
-            ax.plot(raw.x, y, color=colour, lw=0.4, rasterized=True, label=name)
+        style: dict[str, Any] = {"lw": 0.4, "rasterized": True}
+        ax.plot(raw.x, raw.y, color=COLOURS[0], label="raw", **style)
+        ax.plot(raw.x, raw.y - bias, color=COLOURS[2], label="calibrated", **style)
         ax.axhline(bias, color=COLOURS[1], lw=2, label="bias")
         ax.axhline(0, color="black", lw=1)
         ax.set(xlim=(0, raw.x.max()), xlabel="time [s]", ylabel="angular rate [deg/s]")
@@ -158,7 +156,7 @@ def calibrated_signal(material: Material) -> Exhibit | None:
         for line in figure.legends[0].get_lines():
             line.set_linewidth(2)
         mean = lines[lines.figure == "running average"]
-        figure.suptitle(f"Raw and calibrated signal: {_whose(material, mean)}")
+        figure.suptitle(f"Raw and calibrated signal: {_gyroscope(material, mean)}")
     caption = "Calibrated is the raw signal less the bias. Paper, section II."
     title = "Raw and calibrated signal of the same gyroscope"
     return Exhibit("calibrated_signal", title, caption, figure)
@@ -166,7 +164,7 @@ def calibrated_signal(material: Material) -> Exhibit | None:
 
 def mg_convergence(material: Material, ground_truth: GroundTruth) -> Exhibit | None:
     """Running average over several gyroscopes (paper, section III-A, figure of MG convergence)."""
-    lines = _first(material)
+    lines = _shown_lines(material)
     if lines is None:
         return None
     tolerance = ground_truth.tolerance_mdps
@@ -185,29 +183,25 @@ def mg_convergence(material: Material, ground_truth: GroundTruth) -> Exhibit | N
             plural = "s" if count > 1 else ""
             ax.set(title=f"{count} gyroscope{plural}, {line.line.iloc[0]}", xlabel="time [s]")
             ax.set_xlim(0, line.x.max())
-        _limit(axes[0], alone[:, together[0].x >= 2 * _FROM_S], tolerance)
+        _set_limits(axes[0], alone[:, together[0].x >= 2 * _FROM_S], tolerance)
         axes[0].set_ylabel("running average less ground truth [mdps]")
         share_legend(figure, axes, columns=3)
         sensor = material.sensor_name(lines.sensor.iloc[0])
         figure.suptitle(f"Running average of several gyroscopes: {sensor}; {material.source_name}")
     caption = (
-        "Each gyroscope is centred by its own bias before they are averaged: biases of several "
-        f"deg/s would hide all else. {_TOLERANCE} Paper, section III-A."
+        "Each gyroscope is centred by its bias before averaging: biases of several deg/s would "
+        f"hide everything else. {_TOLERANCE} Paper, section III-A."
     )
     return Exhibit("mg_convergence", "Running average of several gyroscopes", caption, figure)
 
 
-def _first(material: Material) -> pd.DataFrame | None:
-    """The lines of the sensor that is shown: SparkFun, or the first one that there is."""
+def _shown_lines(material: Material) -> pd.DataFrame | None:
+    """The lines of SparkFun or, without it, of the first sensor; None without signals."""
     if material.signals.empty:
         return None
     sensors = material.signals.sensor.unique().tolist()
     shown = "sparkfun" if "sparkfun" in sensors else sensors[0]
     return material.signals[material.signals.sensor == shown]
-
-
-def _described(material: Material, sensor: str) -> pd.Series:
-    return material.sensors[material.sensors.sensor == sensor].iloc[0]
 
 
 def _panels(material: Material, sharey: bool) -> tuple[Figure, list[tuple[Axes, str]]]:
@@ -222,7 +216,8 @@ def _panels(material: Material, sharey: bool) -> tuple[Figure, list[tuple[Axes, 
     return figure, list(zip(axes, sensors, strict=False))
 
 
-def _whose(material: Material, line: pd.DataFrame) -> str:
+def _gyroscope(material: Material, line: pd.DataFrame) -> str:
+    """The sensor, gyroscope and recording of a line, for titles."""
     sensor = material.sensor_name(line.sensor.iloc[0])
     return f"{sensor} {line.line.iloc[0]}; {material.source_name}"
 
@@ -232,7 +227,7 @@ def _band(ax: Axes, middle: float, tolerance: float, words: str) -> None:
     ax.axhspan(*ends, color=COLOURS[2], alpha=0.2, lw=0, label=words)
 
 
-def _limit(ax: Axes, shown: np.ndarray, tolerance: float, middle: float = 0.0) -> None:
-    """Leave out what the running mean does at the very first, when it scatters most."""
-    half = max(3 * tolerance, 1.1 * float(np.abs(shown).max()))
+def _set_limits(ax: Axes, values: np.ndarray, tolerance: float, middle: float = 0.0) -> None:
+    """Fit the y axis to values, from which the scatter of the first moments is left out."""
+    half = max(3 * tolerance, 1.1 * float(np.abs(values).max()))
     ax.set_ylim(middle - half, middle + half)

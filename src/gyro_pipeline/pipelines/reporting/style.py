@@ -1,4 +1,4 @@
-"""How figures look."""
+"""The style of figures."""
 
 from collections.abc import Iterable
 from functools import partial
@@ -17,7 +17,7 @@ CEILING = "#D55E00"
 MARKERS = ("o", "s", "^", "D", "v", "P")
 
 LOOK = partial(mpl.rc_context, {"font.size": 9, "axes.grid": True, "grid.alpha": 0.3})
-"""Context in which a figure is drawn."""
+"""Context in which figures are drawn."""
 
 _FAMILIES = {
     "black": ("mean", "median", "trimmed_mean"),
@@ -36,38 +36,38 @@ _FAMILIES = {
 
 
 def estimator_look(name: str, recommended: bool) -> dict[str, Any]:
-    """How an estimator's line is drawn: relatives in one colour, recommended ones filled."""
+    """Style of the line of an estimator: a colour per family, filled markers if recommended."""
     families = [(c, names.index(name)) for c, names in _FAMILIES.items() if name in names]
-    colour, place = families[0] if families else ("grey", 0)
+    colour, member = families[0] if families else ("grey", 0)
     return {
         "color": colour,
-        "marker": MARKERS[place],
+        "marker": MARKERS[member],
         "ms": 5,
         "mfc": colour if recommended else "white",
-        "lw": 1.2 if place == 0 else 0.7,
-        "ls": "-" if place == 0 else ":",
+        "lw": 1.2 if member == 0 else 0.7,
+        "ls": "-" if member == 0 else ":",
     }
 
 
 def share_legend(figure: Figure, axes: Iterable[Axes], columns: int) -> None:
-    """One legend below all panels; what several panels show is named once."""
-    named: dict[str, Artist] = {}
+    """Add a legend below all panels, with each label once."""
+    handles: dict[str, Artist] = {}
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
-            named.setdefault(str(label), handle)
-    place: Any = {"loc": "outside lower center", "ncols": columns, "frameon": False}
-    figure.legend(list(named.values()), list(named), **place)
+            handles.setdefault(str(label), handle)
+    layout: Any = {"loc": "outside lower center", "ncols": columns, "frameon": False}
+    figure.legend(list(handles.values()), list(handles), **layout)
 
 
 def reach(values: ArrayLike, lo: ArrayLike, hi: ArrayLike) -> NDArray[np.float64]:
-    """Lengths of error bars, shape (2, n); none where there is no interval."""
-    given = np.asarray(values, np.float64)
-    lengths = [given - np.asarray(lo, np.float64), np.asarray(hi, np.float64) - given]
+    """Lengths of error bars, shape (2, n); 0 where there is no interval."""
+    centres = np.asarray(values, np.float64)
+    lengths = [centres - np.asarray(lo, np.float64), np.asarray(hi, np.float64) - centres]
     return np.maximum(np.nan_to_num(lengths), 0.0)
 
 
 def plain_ticks(ax: Axes) -> None:
-    """Numbers of logarithmic axes as people write them."""
+    """Write the numbers of logarithmic axes without exponents."""
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_formatter("{x:g}")
     ax.minorticks_off()

@@ -1,4 +1,4 @@
-"""The tables of the report: one function each, with its caption beside it."""
+"""The tables of the report: a function for each, with its caption."""
 
 import logging
 from typing import Any
@@ -10,8 +10,10 @@ from gyro_pipeline.conventions import ALL, AXES, DISJOINT, FIRST, MDPS, PAPER, T
 from gyro_pipeline.estimators import DEFAULT, ESTIMATORS, ORIENTATION_NOTE
 from gyro_pipeline.parameters import PublishedHours, PublishedResult
 from gyro_pipeline.pipelines.reporting.exhibits import (
+    STUDIES_OF,
     Exhibit,
     Material,
+    bracketed,
     ends,
     from_to,
     gyroscopes,
@@ -37,52 +39,45 @@ logger = logging.getLogger(__name__)
 FIRST_WINDOWS = "first_windows"
 """The study whose networks are trained on first windows."""
 
+PAPER_TABLES = {
+    "three_gyroscopes": "Three real gyroscopes",
+    "multiple_gyroscopes": "Twelve real gyroscopes",
+    "generalization": "The four sensors",
+}
+"""Titles of the result tables of the paper."""
+
 _HOUR_S = 3600
 _AT_DATASHEET = "At the datasheet's rate h"
 _SUMMARY = (
-    "Windows of 10 s; S and A in percent, with 95 % intervals over recordings, over all windows. "
+    "Windows of 10 s; S and A in percent, over all windows, with 95 % intervals over recordings. "
     "The paper's way is over the first window of each recording, and scatters more. Ceilings are "
-    "those of white noise without drift or, where that was fitted, of the noise of the recordings, "
-    "and expected: whoever is above with an interval that holds it is so by chance. The oracle, "
-    "which knows what was drawn, is judged on the very windows. "
+    "those of white noise without drift or, if fitted, of the noise of the recordings. They are "
+    "expected values: an A above the ceiling whose interval contains it is there by chance. The "
+    "oracle, which knows the drawn values, is judged on the same windows as the network. "
     "The warm-up needed is the amplitude that would make the published A the ceiling of first "
-    "windows, for time constants of 5 to 60 s and recordings as long as the paper's. S of the "
-    "ceiling, A of each axis, seeds and runs are in the CSV files. Paper, section IV-G."
+    "windows, for time constants of 5 to 60 s and recordings as long as those of the paper. S of "
+    "the ceiling, A of each axis, seeds and runs are in the CSV files. Paper, section IV-G."
 )
 
 
 # results beside the paper's
 
 
-def three_gyroscopes(material: Material) -> Exhibit | None:
-    """The paper's summary with three real gyroscopes."""
-    return _result_table(material, "augmentation_three_gyroscopes", "Three real gyroscopes")
-
-
-def multiple_gyroscopes(material: Material) -> Exhibit | None:
-    """The paper's summary with twelve real gyroscopes."""
-    return _result_table(material, "augmentation_multiple_gyroscopes", "Twelve real gyroscopes")
-
-
-def generalization(material: Material) -> Exhibit | None:
-    """The paper's summary of the four sensors."""
-    return _result_table(material, "real2real_generalization", "The four sensors")
-
-
-def _result_table(material: Material, name: str, title: str) -> Exhibit | None:
-    study, _, table = name.partition("_")
+def paper_results(material: Material, table: str) -> Exhibit | None:
+    """A result table of the paper, one of ``PAPER_TABLES``, with our results beside it."""
+    study = STUDIES_OF[table]
     if material.of(study).empty:
         return None
     rows = [_result_row(material, claim) for claim in material.published.of_table(table)]
-    made = pd.DataFrame(rows)
+    results = pd.DataFrame(rows)
     shown = ["Sensor", "Gyroscopes", "Published S/A %", "S %", "A %", "Constant A %", _BEST_A]
     shown += ["Ceiling A %", *[_ORACLE_A] * material.simulated, "Paper's way A %", _WARM_UP]
-    shown += ["Note"] if made["Note"].notna().any() else []
-    return Exhibit(name, title, _SUMMARY, made, shown)
+    shown += ["Note"] if results["Note"].notna().any() else []
+    return Exhibit(f"{study}_{table}", PAPER_TABLES[table], _SUMMARY, results, shown)
 
 
 def trained_on_first_windows(material: Material) -> Exhibit | None:
-    """Networks trained on all and on first windows, beside a constant: where a bias warms up."""
+    """Networks trained on all and on first windows, beside a constant, for a bias that warms up."""
     if material.of(FIRST_WINDOWS).empty:
         return None
     rows = []
@@ -94,10 +89,10 @@ def trained_on_first_windows(material: Material) -> Exhibit | None:
     if not rows:
         return None
     caption = (
-        "The paper's network, trained on all windows and on first windows, over the first window "
-        "of each recording, the paper's way, and over all windows; A in percent, with 95 % "
-        "intervals. What a bias that settles after power-on gives to the network in first windows, "
-        "it gives to a constant as well. The ceiling is that of the noise and warm-up drawn."
+        "The paper's network, trained on all windows and on first windows; judged over the first "
+        "window of each recording, the paper's way, and over all windows; A in percent, with 95 % "
+        "intervals. If a bias settles after power-on, a constant gains as much in first windows as "
+        "the network does. The ceiling is that of the drawn noise and warm-up."
     )
     title = "Trained on all and on first windows, beside a constant"
     return Exhibit("first_windows", title, caption, pd.DataFrame(rows))
@@ -130,7 +125,7 @@ def _result_row(material: Material, claim: PublishedResult) -> dict[str, Any]:
     row = material.result(claim, CNN)
     others = {name: material.result(claim, name) for name in (RESIDUAL_NETWORK, CONSTANT, DEFAULT)}
     residual = others[RESIDUAL_NETWORK]
-    known: Any = {} if row is None else row
+    ours: Any = {} if row is None else row
     runs = [other.run_ids for other in (row, residual) if other is not None]
     fewer = row is not None and bool(row.real_gyros < claim.real_gyros)
     other = f" ({gyroscopes(claim)})" * fewer
@@ -138,7 +133,7 @@ def _result_row(material: Material, claim: PublishedResult) -> dict[str, Any]:
         "Approach": claim.approach,
         "Sensor": claim.sensor,
         "Source": material.source_name,
-        "Split": split(known),
+        "Split": split(ours),
         "Gyroscopes": gyroscopes(claim if row is None else row),
         "Published S/A %": f"{claim.time_saving_pct:.0f}/{claim.accuracy_gain_pct:.0f}" + other,
         "S %": interval(row, "time_saving_pct"),
@@ -154,10 +149,10 @@ def _result_row(material: Material, claim: PublishedResult) -> dict[str, Any]:
         _ORACLE_A: interval(row, "oracle_accuracy_gain_pct"),
         "Paper's way ceiling A %": interval(row, "ceiling_accuracy_gain_pct", FIRST),
         _WARM_UP: _warm_up(material, claim),
-        "Seeds": known.get("seeds"),
-        "Spread of S over seeds": _spread(known, "time_saving_pct"),
-        "Spread of A over seeds": _spread(known, "accuracy_gain_pct"),
-        "Recordings": known.get("recordings"),
+        "Seeds": ours.get("seeds"),
+        "Spread of S over seeds": _spread(ours, "time_saving_pct"),
+        "Spread of A over seeds": _spread(ours, "accuracy_gain_pct"),
+        "Recordings": ours.get("recordings"),
         "Section": claim.section,
         "Runs": " ".join(_short(ids) for ids in runs) or None,
         "Note": material.status(claim) if row is None else remark(row),
@@ -177,7 +172,7 @@ def _spread(row: Any, base: str) -> str:
 
 
 def _short(run_ids: str) -> str:
-    """The first digits of each run id are enough to find it."""
+    """Run ids, cut to the first digits that are enough to find a run."""
     return " ".join(run_id[:8] for run_id in run_ids.split())
 
 
@@ -185,10 +180,11 @@ def _short(run_ids: str) -> str:
 
 
 def results_table(material: Material, study: str) -> Exhibit:
-    """All results of a study, in mdps and percent; also printed."""
+    """All results of a study in mdps and percent, which are also logged."""
     rows = material.of(study)
-    twins = rows.duplicated(["sensor", "estimator", "window_s", "run_ids"]) & rows.run_ids.notna()
-    rows = rows[~twins]  # rows whose estimator uses the same part of the training set
+    # the same runs, where an estimator uses the same part of several training sets
+    copies = rows.duplicated(["sensor", "estimator", "window_s", "run_ids"]) & rows.run_ids.notna()
+    rows = rows[~copies]
     columns = ["sensor", "estimator", "method", "real_gyros", "virtual_gyros", "window_s"]
     table = rows[columns].assign(source=material.source_name)
     for windows in (ALL, FIRST):
@@ -216,24 +212,27 @@ def _scaled(rows: pd.DataFrame, name: str, digits: int, unit: float = 1.0) -> pd
 
 
 def comparison(material: Material, study: str) -> Exhibit | None:
-    """Estimators side by side, over all windows against the mean of the recording.
+    """Compare the estimators of a study over all windows against the mean of the recording.
 
-    Differences are of RMSEs on the same windows, with 95 % intervals over recordings; negative ones
-    are in favour of the row's estimator. Against the samples outside the window, truth (b), and the
-    drawn bias, truth (c), they are of mean squares.
+    The table has differences of RMSEs on the same windows, with 95 % intervals over recordings; a
+    negative one favours the estimator of the row. Against the samples outside the window, truth
+    (b), and the drawn bias, truth (c), they are differences of mean squares.
     """
-    made = material.made[material.made.study == study].copy()
-    if made.empty:
+    results = material.finished[material.finished.study == study].copy()
+    if results.empty:
         return None
-    made["rank"] = made.estimator.map({name: i for i, name in enumerate(ESTIMATORS)})
-    made = made.sort_values(["sensor", "window_s", "rank"])
-    groups = made.groupby(["sensor", "window_s"], sort=False)
-    rows = [_compared(material, row, group) for _, group in groups for _, row in group.iterrows()]
+    results["rank"] = results.estimator.map({name: i for i, name in enumerate(ESTIMATORS)})
+    groups = results.sort_values(["sensor", "window_s", "rank"]).groupby(
+        ["sensor", "window_s"], sort=False
+    )
+    rows = [
+        _comparison_row(material, row, group) for _, group in groups for _, row in group.iterrows()
+    ]
     table = pd.DataFrame(rows).round({"Within ±1σ %": 1, "Within ±2σ %": 1})
     return Exhibit(f"{study}_comparison", f"{study}: estimators compared", "", table, ())
 
 
-def _compared(material: Material, row: pd.Series, group: pd.DataFrame) -> dict[str, Any]:
+def _comparison_row(material: Material, row: pd.Series, group: pd.DataFrame) -> dict[str, Any]:
     mean = group[group.estimator == MEAN].test_rmse_dps_all.iloc[0]
     return {
         "Sensor": row.sensor,
@@ -268,15 +267,17 @@ def _difference(row: pd.Series, name: str, truth: str = PAPER) -> str:
     if truth != PAPER:
         key, unit = f"less_{name}_dps2_{truth}", MDPS**2
     values = [row.get(key + end) for end in ("", "_lo", "_hi")]
-    value, lo, hi = (np.nan if one is None else one / unit for one in values)
-    if np.isnan(value) or name == row.estimator:
+    if name == row.estimator:
         return "–"
-    return f"{value:+.3f}" + ("" if np.isnan(lo) else f" [{lo:+.3f}, {hi:+.3f}]")
+    scaled = (np.nan if value is None else value / unit for value in values)
+    return bracketed(scaled, "{:+.3f}".format)
 
 
 def ratios(material: Material, study: str, sensor: str) -> Exhibit | None:
     """Errors of a sensor's estimators relative to the running mean, by window length."""
-    rows = material.made[(material.made.study == study) & (material.made.sensor == sensor)]
+    rows = material.finished[
+        (material.finished.study == study) & (material.finished.sensor == sensor)
+    ]
     if rows.empty:
         return None
     table: dict[str, dict[str, str]] = {}
@@ -290,39 +291,37 @@ def ratios(material: Material, study: str, sensor: str) -> Exhibit | None:
         if pd.notna(mean.get("oracle_accuracy_gain_pct_all")):
             shown[_ORACLE] = _ratio(mean, "oracle_accuracy_gain_pct_all")
         table[f"{float(str(window_s)):g} s"] = shown
-    made = pd.DataFrame(table)
-    last = [name for name in ("ceiling", _ORACLE) if name in made.index]
-    made = made.reindex([*made.index.drop(last), *last]).fillna("–")
-    made = made.rename_axis("Estimator").reset_index()
-    shown_columns = [*made.columns]
-    made.insert(1, "Source", material.source_name)
-    made = made.assign(Split=split(rows.iloc[0]))
-    unseen = " Each device in turn is one that no estimator has seen; intervals are over devices."
+    errors = pd.DataFrame(table)
+    last = [name for name in ("ceiling", _ORACLE) if name in errors.index]
+    errors = errors.reindex([*errors.index.drop(last), *last]).fillna("–")
+    errors = errors.rename_axis("Estimator").reset_index()
+    columns = [*errors.columns]
+    errors.insert(1, "Source", material.source_name)
+    errors = errors.assign(Split=split(rows.iloc[0]))
+    unseen = " No estimator has seen the device that it is tested on; intervals are over devices."
     caption = (
         "RMSE over all windows against the mean of the recording, relative to that of the running "
         "mean over the same window, with 95 % intervals. A gain is one whose interval lies below "
-        "1. The ceiling is that of white noise without drift or, where that was fitted, of the "
-        f"noise of the recordings. `tables/{study}_comparison.csv` has differences, coverage and "
-        f"the other truths. Each but mean, median and trimmed mean {ORIENTATION_NOTE}."
+        "1. The ceiling is that of white noise without drift or, if fitted, of the noise of the "
+        f"recordings. `tables/{study}_comparison.csv` has differences, coverage and the other "
+        f"truths. Every estimator except mean, median and trimmed mean {ORIENTATION_NOTE}."
     ) + unseen * ("device" in split(rows.iloc[0]))
     title = f"{material.sensor_name(sensor)}, {study.replace('_', ' ')}: error relative to the mean"
-    return Exhibit(f"{study}_{sensor}", title, caption, made, shown_columns)
+    return Exhibit(f"{study}_{sensor}", title, caption, errors, columns)
 
 
 def in_full(row: pd.Series, rows: pd.DataFrame) -> str:
-    """An estimator's name, its training set where it has several, and whether it is recommended."""
-    own = rows[(rows.estimator == row.estimator) & (rows.window_s == row.window_s)]
-    trained = f", {gyroscopes(row)}" if own.run_ids.nunique() > 1 else ""
+    """Name of an estimator, with its training set if it has several, and if it is recommended."""
+    alike = rows[(rows.estimator == row.estimator) & (rows.window_s == row.window_s)]
+    trained = f", {gyroscopes(row)}" if alike.run_ids.nunique() > 1 else ""
     return label(row.estimator) + trained + (" (recommended)" if row.recommended else "")
 
 
 def _ratio(row: pd.Series, gain: str) -> str:
-    """One less an accuracy gain, whose interval turns round; 1 is the running mean."""
+    """The error relative to the running mean, 1 - A, with its interval."""
     gains = [row.get(f"{gain}{end}") for end in ("", "_lo", "_hi")]
     value, hi, lo = (1 - np.array(gains, np.float64) / 100).tolist()
-    if np.isnan(value):
-        return "–"
-    return f"{value:.3f}" if np.isnan(lo) else f"{value:.3f} [{lo:.3f}, {hi:.3f}]"
+    return bracketed((value, lo, hi), "{:.3f}".format)
 
 
 # sensors
@@ -350,10 +349,10 @@ def start_up(material: Material) -> Exhibit | None:
     caption = (
         "Seconds at rest after a power-on until the standard deviation of the bias, pooled over "
         "the axes of IMU 1, is 1 or 0.5 mdps. *Mean*: the average of the samples alone. *With "
-        "history*: combined with the device's earlier calibrations, as many as the last column "
-        "says. *Ceiling*: as if their mean were known exactly. 0 s: the earlier calibrations alone "
-        "suffice. From N, B and K of the recordings; no warm-up, the same orientation, and "
-        "power-ons that do not follow one another."
+        "history*: combined with the earlier calibrations of the device, whose number is in the "
+        "last column. *Ceiling*: as if the mean of all calibrations were known exactly. 0 s: the "
+        "earlier calibrations alone suffice. Computed from N, B and K of the recordings, for a "
+        "device without warm-up, in the same orientation, with independent power-ons."
     )
     return Exhibit("start_up", "Seconds of rest that a start-up takes", caption, pd.DataFrame(rows))
 
@@ -371,7 +370,7 @@ def _plain(value: float) -> str:
 
 
 def sensor_specifications(material: Material) -> Exhibit | None:
-    """The datasheets beside what the recordings show (section IV-A, table of specifications)."""
+    """Datasheet values beside measured ones (section IV-A, table of specifications)."""
     if material.sensors.empty:
         return None
     described = {row.sensor: row for _, row in material.sensors.iterrows()}
@@ -403,8 +402,8 @@ def sensor_specifications(material: Material) -> Exhibit | None:
             }
         )
     caption = (
-        "Datasheet values beside those found in the recordings: the root mean square over "
-        "gyroscopes, with the smallest and the largest. N is the white noise: the mean of t "
+        "Datasheet values beside those measured in the recordings: the root mean square over "
+        "gyroscopes, with the smallest and the largest value. N is the white noise: the mean of t "
         "seconds scatters by N/√t. B is the bias instability. Paper, section IV-A."
     )
     table = pd.DataFrame(rows)
@@ -423,7 +422,7 @@ def _rms(row: pd.Series | None, name: str, factor: float) -> str:
 
 
 def dataset_hours(material: Material) -> Exhibit | None:
-    """Hours of all datasets, from counts (section IV-A, table of hours)."""
+    """Hours of all datasets, from counts of samples (section IV-A, table of hours)."""
     described = {row.sensor: row for _, row in material.sensors.iterrows()}
     if not {row.sensor for row in material.published.hours} & set(described):
         return None
@@ -494,13 +493,13 @@ def _from_to(low: float, high: float) -> str:
 
 
 def recording_quality(material: Material) -> Exhibit | None:
-    """How the raw logs were found."""
+    """Results of the quality control of the raw logs."""
     if material.quality.empty:
         return None
     caption = (
-        "Quality control of the raw logs, and the recordings in which it found something. The "
-        "longest stretch without a gap is kept of a recording, and brief damage in it is masked. "
-        "Rows count from 0."
+        "Quality control of the raw logs, and the recordings with findings. Of each recording, the "
+        "longest stretch without a gap is kept, and brief damage in it is masked. Rows count from "
+        "0."
     )
     title = "Recordings: kept, repaired, rejected"
     return Exhibit("recording_quality", title, caption, material.quality)
@@ -516,14 +515,14 @@ WAYS = {
     ("test_in_training", "cnn"): "Test windows in training",
     ("best_epoch_on_test", "cnn"): "Honest split, epoch chosen on test",
 }
-"""What tables and figures call each way of training (protocol, estimator), in their order."""
+"""Names of the ways of training (protocol, estimator), in the order of tables and figures."""
 
 _ONE_SIDED = 0.001
-"""A p value against the oracle below this, corrected for the number of checks, is a leak."""
+"""A smaller p value against the oracle, corrected for the number of checks, is a leak."""
 
 
 def leakage_results(material: Material) -> Exhibit | None:
-    """S and A of each way of training of the leak study, side by side for each stride."""
+    """S and A of each way of training in the leak study, a row for each stride."""
     if material.leaks.empty:
         return None
     groups = material.leaks.groupby(["sensor", "window_stride_s"], sort=False)
@@ -531,10 +530,10 @@ def leakage_results(material: Material) -> Exhibit | None:
     table = pd.DataFrame(rows)
     logger.info("leak study, S/A %%\n%s", table.to_string(index=False, na_rep="–"))
     caption = (
-        "None of these is a result: test information was let into the training, each time in one "
-        "way, beside the honest split of the same windows. It shows that leakage suffices to pass "
-        "the ceiling, not that anybody did it. S and A are over the windows that each way calls "
-        "its test, in percent, with 95 % intervals of A over recordings."
+        "None of these is a result: test information was let into the training, each time in a "
+        "different way, beside the honest split of the same windows. This shows that a leak "
+        "suffices to pass the ceiling, not that anybody had one. S and A are over the test windows "
+        "of each way of training, in percent, with 95 % intervals of A over recordings."
     )
     shown = ["Sensor", "Window stride s", *(f"{name} S/A %" for name in WAYS.values())]
     shown += ["Constant A %", "Ceiling S/A %", "Published S/A %"]
@@ -546,8 +545,8 @@ def _leak_row(material: Material, ways: pd.DataFrame) -> dict[str, Any]:
     first = ways.iloc[0]
     claim = published_claim(material, first)
     shuffled = ways[ways.index.get_level_values("estimator") == "cnn_shuffled"]
-    caught = ways.beats_oracle_p.dropna()
-    beating = [WAYS[way] for way in caught.index[caught < _ONE_SIDED]]
+    p_values = ways.beats_oracle_p.dropna()
+    leaking = [WAYS[way] for way in p_values.index[p_values < _ONE_SIDED]]
     return {
         "Sensor": first.sensor,
         "Source": material.source_name,
@@ -555,26 +554,28 @@ def _leak_row(material: Material, ways: pd.DataFrame) -> dict[str, Any]:
         "Windows": first.windows,
         "Recordings": first.recordings,
         **{
-            f"{name} S/A %": _pair(ways.loc[[way]].iloc[0], "") if way in ways.index else None
+            f"{name} S/A %": _saving_and_gain(ways.loc[[way]].iloc[0], "")
+            if way in ways.index
+            else None
             for way, name in WAYS.items()
         },
         "Constant A %": percent(first.constant_accuracy_gain_pct),
-        "Ceiling S/A %": _pair(first, "ceiling_"),
+        "Ceiling S/A %": _saving_and_gain(first, "ceiling_"),
         "Published S/A %": claim and f"{claim.time_saving_pct:.0f}/{claim.accuracy_gain_pct:.0f}",
         "Shuffled beats the constant": "yes"
         if (shuffled.over_constant_dps2_hi < 0).any()
         else "no",
-        "Beats the oracle": "; ".join(beating) or ("none" if len(caught) else "not known"),
+        "Beats the oracle": "; ".join(leaking) or ("none" if len(p_values) else "not known"),
     }
 
 
-def _pair(row: pd.Series, kind: str) -> str:
-    """S/A, with the interval of A where there is one."""
+def _saving_and_gain(row: pd.Series, kind: str) -> str:
+    """S/A, with the interval of A if there is one."""
     gain = f"{kind}accuracy_gain_pct"
     return f"{percent(row[f'{kind}time_saving_pct'])}/{interval(row, gain, FIRST)}"
 
 
 def published_claim(material: Material, row: pd.Series) -> PublishedResult | None:
-    """The paper's result on real gyroscopes of a sensor."""
+    """The published result for real gyroscopes of a sensor alone."""
     claims = material.published.of_networks(row.sensor, virtual_gyros=0)
     return next((claim for claim in claims if claim.window_s == row.window_s), None)

@@ -1,4 +1,4 @@
-"""One tracked run per estimator, training set, window and seed."""
+"""Trainings: a tracked run per estimator, training set, window and seed."""
 
 from gyro_pipeline.pipelines.training.pipeline import create_pipeline
 

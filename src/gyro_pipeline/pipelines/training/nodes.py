@@ -1,4 +1,4 @@
-"""Nodes of the training stage: the runs that a study needs, and the fits that they lack."""
+"""Nodes of the training stage: plan the runs of a study, and fit the missing ones."""
 
 import logging
 import time
@@ -49,53 +49,47 @@ logger = logging.getLogger(__name__)
 
 @dataclass
 class TrainingSets:
-    """Training sets of the runs of one study and sensor, each made once.
+    """Training sets of the runs of a study and sensor, each made once."""
 
-    Attributes:
-        windows: The windows table.
-        recordings: Real recordings.
-        virtual: Virtual recordings, where the study uses some.
-    """
-
-    windows: pd.DataFrame
-    recordings: xr.Dataset
-    virtual: xr.Dataset | None
-    _made: dict[Any, dict[str, TrainingSet]] = field(default_factory=dict)
+    windows: pd.DataFrame  # the windows table
+    recordings: xr.Dataset  # real recordings
+    virtual: xr.Dataset | None  # virtual recordings, if the study uses some
+    _cache: dict[Any, dict[str, TrainingSet]] = field(default_factory=dict)
 
     def of(self, spec: RunSpec) -> dict[str, TrainingSet]:
-        """What each fold of a run trains on, by the fold's name.
+        """The training set of each fold of a run, by the name of the fold.
 
         Raises:
-            InputError: The recordings cannot give what the run asks for.
+            InputError: There are fewer IMUs than the run needs.
         """
         key = spec.protocol, spec.window_s, spec.window_stride_s
         counts = spec.method, spec.real_imus, spec.virtual_imus
-        if (key, counts) not in self._made:
+        if (key, counts) not in self._cache:
             rows = self.table_of(spec)
             tested = rows.imu[rows.role == TEST].unique()
-            only = int(tested[0]) if len(tested) == 1 else UNSEEN
-            self._made[key, counts] = {
-                str(fold): self._training_set(spec, own, only)
-                for fold, own in rows.groupby("fold", observed=True, sort=False)
+            device = int(tested[0]) if len(tested) == 1 else UNSEEN
+            self._cache[key, counts] = {
+                str(fold): self._training_set(spec, in_fold, device)
+                for fold, in_fold in rows.groupby("fold", observed=True, sort=False)
             }
-        return self._made[key, counts]
+        return self._cache[key, counts]
 
     @cached_property
-    def _seen(self) -> xr.Dataset:
-        """Real recordings without what was drawn."""
+    def _without_truths(self) -> xr.Dataset:
+        """Real recordings without the drawn values of simulated data."""
         return self.recordings[["angular_rate", "samples", "recording_mean"]]
 
     def table_of(self, spec: RunSpec) -> pd.DataFrame:
-        """Rows of the windows table that are of the run's protocol, window and stride."""
+        """Rows of the windows table with the protocol, window and stride of a run."""
         w = self.windows
         chosen = w.protocol == spec.protocol
         chosen &= (w.window_s == spec.window_s) & (w.window_stride_s == spec.window_stride_s)
         return w[chosen]
 
-    def _training_set(self, spec: RunSpec, rows: pd.DataFrame, tested: int) -> TrainingSet:
-        """What a fold trains on; the tested IMU first, where it trains, then others in order."""
+    def _training_set(self, spec: RunSpec, rows: pd.DataFrame, device: int) -> TrainingSet:
+        """The training set of a fold, with the tested IMU first, if it trains, then others."""
         tests = rows.imu[rows.role == TEST].unique()
-        device = int(tests[0]) if len(tests) else tested
+        device = int(tests[0]) if len(tests) else device
         learned = rows[rows.role != TEST]
         real = sorted(
             learned.imu[learned.origin == ORIGIN_REAL].unique().tolist(),
@@ -103,20 +97,20 @@ class TrainingSets:
         )
         if spec.real_imus > len(real):
             raise InputError(
-                f"{spec.sensor}: {spec.real_gyros} gyroscopes asked by {spec.study}, the "
+                f"{spec.sensor}: {spec.study} needs {spec.real_gyros} gyroscopes, the "
                 f"{spec.source} recordings hold {len(AXES) * len(real)} that train; narrow with "
                 "--params=only.real_gyros=..."
             )
-        # where every device is an unseen one in its turn, all of them train the model
-        more = device == UNSEEN and len(tests) == 0
+        # the model of a study on unseen devices is trained on all of them
+        additional = device == UNSEEN and len(tests) == 0
         imus = {
-            ORIGIN_REAL: real[: spec.real_imus + more],
+            ORIGIN_REAL: real[: spec.real_imus + additional],
             ORIGIN_VIRTUAL: range(1, 1 + spec.virtual_imus),
         }
-        used = [(learned.origin == origin) & learned.imu.isin(of) for origin, of in imus.items()]
+        used = [(learned.origin == origin) & learned.imu.isin(i) for origin, i in imus.items()]
         attributes, samples = self.recordings.attrs, self.recordings.sizes["sample"]
         return TrainingSet(
-            self._seen,
+            self._without_truths,
             self.virtual if spec.virtual_imus else None,
             learned[used[0] | used[1]],
             window_size(spec.window_s, attributes["rate_hz"], samples, spec.sensor),
@@ -138,21 +132,21 @@ def plan_runs(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     """List the runs that a study needs on a sensor, before anything is trained.
 
     Args:
-        study: Its grid.
+        study: The study with its grid.
         recordings: Real recordings.
         windows: The windows table.
         windows_s: Calibration times, seconds.
-        seeds: Of estimators that draw at random.
-        only: Narrows the grid.
-        training: Hyper-parameters; part of the fingerprints of estimators that have some.
-        virtual: Virtual recordings, where the study uses some.
+        seeds: Seeds of estimators that draw at random.
+        only: Filters of the grid.
+        training: Hyper-parameters, part of the fingerprints of seeded estimators.
+        virtual: Virtual recordings, if the study uses some.
 
     Returns:
         A row per run: the fields of :class:`~gyro_pipeline.studies.RunSpec`; the ``fingerprint``
-        of all that it depends on; and ``left_out``, why it cannot be made.
+        of everything that it depends on; and ``left_out``, why it cannot be made.
 
     Raises:
-        InputError: The recordings cannot give what the grid asks for.
+        InputError: There are fewer IMUs than the grid needs.
     """
     sensor, source = recordings.attrs["sensor"], recordings.attrs["source"]
     rows = study_rows(study, sensor, source, windows_s, seeds, only)
@@ -169,26 +163,26 @@ def plan_runs(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
 
 
 def _check_plan(specs: Mapping[str, RunSpec], sets: TrainingSets, settings: Training) -> None:
-    """Refuse data, windows or settings that are not those that the plan was made with.
+    """Refuse other data, windows or settings than those of the plan.
 
     Raises:
-        InputError: A run would carry the fingerprint of another one.
+        InputError: A run would get the fingerprint of another one.
     """
     for key, spec in specs.items():
         if fingerprint(_content(spec, sets, settings)) != key:
             raise InputError(
-                f"{_name(spec)}: its plan was made with other data or settings than are read now; "
-                f"type kedro run --pipeline={spec.study}, without options that leave out its plan"
+                f"{_name(spec)}: its plan was made with other data or settings than the current "
+                f"ones; type kedro run --pipeline={spec.study}, without options that skip its plan"
             )
 
 
 def _content(spec: RunSpec, sets: TrainingSets, settings: Training) -> list[Any]:
-    """All that a run depends on: code, settings, data and windows, but not its study."""
+    """Everything that a run depends on: code, settings, data and windows, but not its study."""
     estimator = estimator_class(spec.estimator)
     used = [sets.recordings, *([sets.virtual] if spec.virtual_imus and sets.virtual else [])]
-    # an estimator of one's own may use any of ours by its name
-    ours = ["gyro_pipeline.estimators"] if own_classes([spec.estimator]) else []
-    fitting = ["gyro_pipeline.estimators.fitting", estimator.__module__, *ours]
+    # a user's estimator may use any other one by its name
+    package = ["gyro_pipeline.estimators"] if own_classes([spec.estimator]) else []
+    fitting = ["gyro_pipeline.estimators.fitting", estimator.__module__, *package]
     return [
         code_hash(__name__, *fitting, entry(spec.estimator)),
         {name: value for name, value in vars(spec).items() if name not in ("study", "seed")},
@@ -213,10 +207,10 @@ def _tests(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _problem(spec: RunSpec, folds: Mapping[str, TrainingSet], settings: Training) -> str:
-    """Why an estimator cannot be fitted in some fold; empty where it can in all.
+    """The reason why an estimator cannot be fitted in a fold; empty if it can in all folds.
 
     Raises:
-        InputError: The settings do not suit the windows.
+        InputError: The settings do not fit the windows.
     """
     estimator = make_estimator(spec.estimator, settings, spec.seed)
     for fold, training in folds.items():
@@ -229,12 +223,12 @@ def _problem(spec: RunSpec, folds: Mapping[str, TrainingSet], settings: Training
 
 
 def _lacking(spec: RunSpec, sets: TrainingSets) -> str:
-    """Which recording cannot test, as an IMU lacks it that is seen beside the tested one."""
+    """The reason why a recording cannot test: an IMU side by side with the tested one lacks it."""
     if spec.method != 1:
         return ""
     tests = _tests(sets.table_of(spec)).recording.unique()
-    seen = sets.recordings["samples"].isel(imu=slice(spec.real_imus)).sel(recording=tests)
-    lacking = tests[(seen == 0).any("imu").to_numpy()]
+    samples = sets.recordings["samples"].isel(imu=slice(spec.real_imus)).sel(recording=tests)
+    lacking = tests[(samples == 0).any("imu").to_numpy()]
     if not len(lacking):
         return ""
     return f"recording {lacking[0]} tests: expected {spec.real_imus} IMUs side by side to have it"
@@ -252,52 +246,52 @@ def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     execution: Execution,
     virtual: xr.Dataset | None = None,
 ) -> Iterator[FittedRun]:
-    """Fit what the plan asks for and no study has fitted yet; each fit is saved when it ends.
+    """Fit the planned estimators that no study has fitted yet; each fit is saved when it ends.
 
     Args:
-        study: Whose runs.
-        plan: From :func:`plan_runs`.
+        study: The study.
+        plan: The plan from :func:`plan_runs`.
         tracked: All runs on these logs, of any study.
-        recordings: Real recordings; workers read only what they need of them.
+        recordings: Real recordings, which workers read only in part.
         windows: The windows table.
         training: Hyper-parameters.
-        splits: Recorded with each run.
-        virtual_gyros: Likewise.
+        splits: Settings that are stored with each run.
+        virtual_gyros: Settings that are stored with each run.
         execution: How estimators are fitted.
-        virtual: Virtual recordings, where the study uses some.
+        virtual: Virtual recordings, if the study uses some.
 
     Yields:
-        The fits of runs that then wait for their evaluation.
+        The fits of runs, which are evaluated later.
 
     Raises:
-        InputError: The plan is not of these recordings, windows and settings.
+        InputError: The plan was made with other recordings, windows or settings.
     """
     sets, settings = TrainingSets(windows, recordings, virtual), study.training_of(training)
     specs = possible_runs(plan)
     _check_plan(specs, sets, settings)
-    here = {run.fingerprint: run for run in reversed(tracked) if run.study == study.experiment}
-    elsewhere = {run.fingerprint: run for run in reversed(tracked) if run.trained}
+    in_study = {run.fingerprint: run for run in reversed(tracked) if run.study == study.experiment}
+    trained = {run.fingerprint: run for run in reversed(tracked) if run.trained}
     missing = {
-        key: [fold for fold in sets.of(spec) if key not in here or fold not in here[key].fits]
+        key: [f for f in sets.of(spec) if key not in in_study or f not in in_study[key].fits]
         for key, spec in specs.items()
-        if key not in here or not here[key].trained
+        if key not in in_study or not in_study[key].trained
     }
-    shared = [key for key in missing if key in elsewhere]
+    shared = [key for key in missing if key in trained]
     label = f"{study.experiment} {recordings.attrs['sensor']}"
     logger.info(
         "%s: %d runs planned, %d skipped (made before), %d shared with another study, %d to fit",
         *(label, len(specs), len(specs) - len(missing), len(shared), len(missing) - len(shared)),
     )
 
-    def fitted(key: str, fold: str, estimator: Any, began: float, ended: float) -> FittedRun:
+    def fitted_run(key: str, fold: str, estimator: Any, start: float, end: float) -> FittedRun:
         spec = specs[key]
         params = run_params(spec, study, training, splits, virtual_gyros)
-        return _fitted(spec, key, params, sets, fold, estimator, began, ended)
+        return _fitted_run(spec, key, params, sets, fold, estimator, start, end)
 
     for key in shared:
         for fold in missing[key]:
             now = time.time()
-            yield fitted(key, fold, _loaded(elsewhere[key], fold), now, now)
+            yield fitted_run(key, fold, _load_fit(trained[key], fold), now, now)
     jobs = [
         FitJob(key, _name(spec), fold, spec.estimator, settings, spec.seed, sets.of(spec)[fold])
         for key, spec in specs.items()
@@ -305,30 +299,29 @@ def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
         for fold in missing[key]
     ]
     for job, fit in run_fits(jobs, execution, label):
-        yield fitted(job.key, job.fold, fit.estimator, fit.started, fit.ended)
+        yield fitted_run(job.key, job.fold, fit.estimator, fit.started, fit.ended)
 
 
-def _loaded(run: StoredRun, fold: str) -> Estimator:
-    """A fit of another study's run; of a network with its losses, which are stored beside it."""
+def _load_fit(run: StoredRun, fold: str) -> Estimator:
+    """The fit of another study's run; a network gets its losses, which are stored separately."""
     estimator = run.load_fit(fold)
     if "train_loss" in run.metrics:
         estimator.history = run.load(HISTORY)
     return estimator
 
 
-def _fitted(  # noqa: PLR0917 - what a fit is stored with
+def _fitted_run(  # noqa: PLR0917 - contents of a stored fit
     spec: RunSpec,
     key: str,
     params: Mapping[str, Any],
     sets: TrainingSets,
     fold: str,
     estimator: Any,
-    began: float,
-    ended: float,
+    start: float,
+    end: float,
 ) -> FittedRun:
     folds, attributes = sets.of(spec), sets.recordings.attrs
     is_model = fold == ALL_RECORDINGS or ALL_RECORDINGS not in folds and fold == next(iter(folds))
-    training = folds[fold]
     tags = {"data_hash": attributes["data_hash"], "simulated": str(attributes["simulated"])}
     return FittedRun(
         run=RunIdentity(
@@ -342,10 +335,10 @@ def _fitted(  # noqa: PLR0917 - what a fit is stored with
         ),
         fold=fold,
         estimator=estimator,
-        started_ms=int(1000 * began),
-        ended_ms=int(1000 * ended),
+        started_ms=int(1000 * start),
+        ended_ms=int(1000 * end),
         is_model=is_model,
-        example=_example(spec, training, sets.recordings),
+        example=_example(spec, folds[fold], sets.recordings),
         dataset={
             "name": f"{spec.sensor} recordings",
             "digest": attributes["data_hash"],
@@ -355,17 +348,17 @@ def _fitted(  # noqa: PLR0917 - what a fit is stored with
 
 
 def _example(spec: RunSpec, training: TrainingSet, recordings: xr.Dataset) -> np.ndarray:
-    """A window as the estimator sees it, (1, gyroscopes, samples), deg/s."""
-    seen = recordings.isel(imu=slice(spec.real_imus if spec.method == 1 else 1))
-    there = (seen["samples"] > 0).all("imu").to_numpy()
-    number = int(there.argmax())  # the first that all of them have
-    window = seen.angular_rate.isel(recording=number, sample=slice(training.size))
-    first = window.transpose("imu", "axis", "sample")
-    return fill_masked(first.to_numpy().reshape(1, -1, training.size)).astype(np.float32)
+    """A window in the shape of the estimator's input, (1, gyroscopes, samples), deg/s."""
+    visible = recordings.isel(imu=slice(spec.real_imus if spec.method == 1 else 1))
+    common = (visible["samples"] > 0).all("imu").to_numpy()
+    first = int(common.argmax())  # the first recording that all IMUs have
+    window = visible.angular_rate.isel(recording=first, sample=slice(training.size))
+    samples = window.transpose("imu", "axis", "sample").to_numpy()
+    return fill_masked(samples.reshape(1, -1, training.size)).astype(np.float32)
 
 
 def _name(spec: RunSpec) -> str:
-    """Sensor, estimator, training set, window and seed, at a glance in a list of runs."""
+    """The name of a run: sensor, estimator, training set, window and seed."""
     stride = spec.window_stride_s
     parts = [
         spec.sensor,
@@ -379,23 +372,19 @@ def _name(spec: RunSpec) -> str:
 
 
 def _note(spec: RunSpec, folds: Mapping[str, TrainingSet]) -> str:
-    """What was trained on what, in two sentences."""
+    """A description of a run and its training set, in two sentences."""
     fold = ALL_RECORDINGS if ALL_RECORDINGS in folds else next(iter(folds))
-    windows, judged = folds[fold].windows, sum(name != ALL_RECORDINGS for name in folds)
-    shown = " and ".join(
+    windows, fits = folds[fold].windows, sum(name != ALL_RECORDINGS for name in folds)
+    amounts = " and ".join(
         f"{len(rows)} windows of {len(rows[['imu', 'recording']].drop_duplicates())} {origin!s} "
         "recordings"
         for origin, rows in windows.groupby("origin", observed=True)
     )
-    how = (
-        "fitted once more, to all recordings:"
-        if fold == ALL_RECORDINGS
-        else f"fitted to the {fold}:"
-    )
+    target = "all recordings, once more" if fold == ALL_RECORDINGS else f"the {fold}"
     return (
         f"The model `{spec.estimator}` estimates the bias of {spec.sensor} from {spec.window_s:g} "
-        f"s; it was {how} {shown or 'no windows'} ({spec.real_gyros} real and "
-        f"{spec.virtual_gyros} virtual gyroscopes, source {spec.source}). The figures are of "
-        f"the protocol {spec.protocol}, by {judged} fit{'s' * (judged > 1)}, of which none saw "
-        "what it was judged on unless the protocol is a leak."
+        f"s; it was fitted to {target}: {amounts or 'no windows'} ({spec.real_gyros} real and "
+        f"{spec.virtual_gyros} virtual gyroscopes, source {spec.source}). The metrics are those of "
+        f"the protocol {spec.protocol} with {fits} fit{'s' * (fits > 1)}, none of which saw its "
+        "test recordings unless the protocol is a leak."
     )

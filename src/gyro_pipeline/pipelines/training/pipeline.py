@@ -1,17 +1,19 @@
 """Wiring of the training stage."""
 
+from typing import Any
+
 from kedro.pipeline import Node, Pipeline
 
 from gyro_pipeline.pipelines.training.nodes import plan_runs, train
 
 
 def create_pipeline(study: str, sensor: str, virtual: bool) -> Pipeline:
-    """Trainings of one study on one sensor.
+    """The trainings of a study on a sensor.
 
     Args:
-        study: Its name.
-        sensor: Its name.
-        virtual: Whether virtual gyroscopes take part.
+        study: Name of the study.
+        sensor: Name of the sensor.
+        virtual: Whether the study uses virtual gyroscopes.
     """
     stage = f"{study}.{sensor}.training"
     data = {
@@ -25,23 +27,12 @@ def create_pipeline(study: str, sensor: str, virtual: bool) -> Pipeline:
     grid = {name: f"params:{name}" for name in ("windows_s", "seeds", "only")}
     settings = {name: f"params:{name}" for name in ("splits", "virtual_gyros", "execution")}
     runs = {"plan": f"{stage}.plan", "tracked": f"{sensor}.training.tracked"}
-    return Pipeline(
-        [
-            Node(
-                plan_runs,
-                data | grid,
-                f"{stage}.plan",
-                name=f"plan_{study}_{sensor}",
-                namespace="training",
-                tags=[study, sensor],
-            ),
-            Node(
-                train,
-                data | settings | runs,
-                f"{stage}.runs",
-                name=f"train_{study}_{sensor}",
-                namespace="training",
-                tags=[study, sensor],
-            ),
-        ]
-    )
+    nodes: list[tuple[str, Any, dict[str, str], str]] = [
+        ("plan", plan_runs, data | grid, f"{stage}.plan"),
+        ("train", train, data | settings | runs, f"{stage}.runs"),
+    ]
+    namespace, tags = "training", [study, sensor]
+    return Pipeline([
+        Node(make, inputs, output, name=f"{name}_{study}_{sensor}", namespace=namespace, tags=tags)
+        for name, make, inputs, output in nodes
+    ])  # fmt: skip

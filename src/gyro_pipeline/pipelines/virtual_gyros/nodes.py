@@ -16,21 +16,20 @@ from gyro_pipeline.recordings import common_length
 def synthesise(
     recordings: xr.Dataset, bias: pd.DataFrame, virtual_gyros: VirtualGyros
 ) -> xr.Dataset:
-    """Virtual gyroscopes like the real ones in training (paper, section IV-A).
+    """Simulate virtual gyroscopes like the real ones in training (paper, section IV-A).
 
-    Each has one bias, drawn uniformly between the smallest and the largest measured one, and
-    white noise of the real gyroscopes' sample sigma around it, in every recording.
+    Each has a bias, drawn uniformly between the smallest and the largest measured one, and in every
+    recording white noise with the sample sigma of the real gyroscopes.
 
     Args:
-        recordings: The real ones, for their rate, the length that studies cut them to, and the
-            ``split`` that says which of them train.
-        bias: Their ground truth; that of training recordings is used.
+        recordings: Real recordings, with their rate, common length and ``split``.
+        bias: Ground truth of the real recordings, of which training recordings are used.
         virtual_gyros: Counts, turn-on jitter and seed.
 
     Returns:
-        Recordings in the layout of the real ones, with ``recording_mean`` (imu, recording, axis);
-        the attribute ``train_recordings`` says how many of each train, ``drawn_from`` from which
-        real recordings they were drawn.
+        Recordings in the layout of the real ones, with ``recording_mean`` (imu, recording, axis).
+        The attribute ``train_recordings`` is the number of recordings of each IMU that train, and
+        ``drawn_from`` lists the real recordings that biases and noise were drawn from.
 
     Raises:
         InputError: If the split is a k-fold: each fold would need gyroscopes of its own.
@@ -46,13 +45,12 @@ def synthesise(
     sigma = np.sqrt(np.mean(training.sample_sigma_dps**2))
     generator = np.random.default_rng([virtual_gyros.seed, zlib.crc32(sensor.encode())])
     shape = (virtual_gyros.imus, virtual_gyros.recordings, len(AXES))
-    drawn = generator.uniform(
-        training.bias_dps.min(), training.bias_dps.max(), size=(shape[0], 1, shape[2])
-    )
+    limits = training.bias_dps.min(), training.bias_dps.max()
+    unit_bias = generator.uniform(*limits, size=(shape[0], 1, shape[2]))
     jitter = generator.standard_normal(shape) * virtual_gyros.turn_on_jitter_mdps * MDPS
     samples = generator.standard_normal((*shape, common_length(recordings)), dtype=np.float32)
     samples *= np.float32(sigma)
-    samples += (drawn + jitter)[..., None].astype(np.float32)
+    samples += (unit_bias + jitter)[..., None].astype(np.float32)
     labels = {"imu": np.arange(1, shape[0] + 1), "recording": np.arange(1, shape[1] + 1)}
     return xr.Dataset(
         {

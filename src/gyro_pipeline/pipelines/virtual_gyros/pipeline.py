@@ -6,20 +6,8 @@ from gyro_pipeline.pipelines.virtual_gyros.nodes import synthesise
 
 
 def create_pipeline(sensor: str) -> Pipeline:
-    """Virtual gyroscopes like those of one sensor."""
-    return Pipeline(
-        [
-            Node(
-                synthesise,
-                [
-                    f"{sensor}.raw_logs.recordings",
-                    f"{sensor}.ground_truth.bias",
-                    "params:virtual_gyros",
-                ],
-                f"{sensor}.virtual_gyros.recordings",
-                name=f"synthesise_{sensor}",
-                namespace="virtual_gyros",
-                tags=[sensor],
-            )
-        ]
-    )
+    """Virtual gyroscopes like those of a sensor."""
+    stage, name = "virtual_gyros", f"synthesise_{sensor}"
+    inputs = [f"{sensor}.raw_logs.recordings", f"{sensor}.ground_truth.bias", f"params:{stage}"]
+    output = f"{sensor}.{stage}.recordings"
+    return Pipeline([Node(synthesise, inputs, output, name=name, namespace=stage, tags=[sensor])])

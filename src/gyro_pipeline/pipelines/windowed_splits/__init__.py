@@ -1,4 +1,4 @@
-"""Which recordings train, validate and test."""
+"""Windowed splits: the windows that train, validate and test."""
 
 from gyro_pipeline.pipelines.windowed_splits.pipeline import create_pipeline
 

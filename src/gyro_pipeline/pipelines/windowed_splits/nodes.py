@@ -22,11 +22,7 @@ from gyro_pipeline.conventions import (
 from gyro_pipeline.parameters import Only, Splits, Study
 from gyro_pipeline.pipelines.windowed_splits.copies import SAMPLES as COMPARED
 from gyro_pipeline.pipelines.windowed_splits.copies import near_copies
-from gyro_pipeline.pipelines.windowed_splits.protocols import (
-    PROTOCOLS,
-    Candidates,
-    check_table,
-)
+from gyro_pipeline.pipelines.windowed_splits.protocols import PROTOCOLS, Candidates, check_table
 from gyro_pipeline.recordings import (
     bias_rows,
     common_length,
@@ -40,9 +36,9 @@ from gyro_pipeline.windows import describe_losses, usable_windows, window_size
 logger = logging.getLogger(__name__)
 
 APART = {BY_RECORDING: "recording", K_FOLD: "recording", LEAVE_ONE_DEVICE_OUT: "imu"}
-"""What has one role in a fold of each honest protocol; the leaks part nothing."""
+"""Column whose values have only one role in a fold of an honest protocol; leaks have none."""
 
-_PLACE = ["imu", "recording"]
+_KEYS = ["imu", "recording"]
 
 WINDOWS_TABLE = [
     "protocol",
@@ -51,57 +47,56 @@ WINDOWS_TABLE = [
     "fold",
     "role",
     "origin",
-    *_PLACE,
+    *_KEYS,
     "start",
 ]
 """Columns of a windows table."""
 
 _COMPACT = dict.fromkeys(["protocol", "fold", "role", "origin"], "category") | dict.fromkeys(
-    [*_PLACE, "start"], "int32"
+    [*_KEYS, "start"], "int32"
 )
 
 
 def cut_to_common_length(
     recordings: xr.Dataset, bias: pd.DataFrame, quality: pd.DataFrame
 ) -> tuple[xr.Dataset, pd.DataFrame, pd.DataFrame]:
-    """Cut recordings to one length, which studies need, and list what is in them.
+    """Cut recordings to one length, which studies need, and list masked samples and copies.
 
-    The length and who set it are logged.
+    The length, and the recording that sets it, are logged.
 
     Args:
-        recordings: Of a length each; what is cut off stays in their file.
-        bias: Their ground truth.
-        quality: The table of the raw-logs stage, for the name of the shortest one's file.
+        recordings: Recordings of different lengths.
+        bias: Ground truth of the recordings.
+        quality: The quality table, for the file names of the recordings.
 
     Returns:
-        Recordings of the length that keeps most samples, with their means: the truth of a study is
-        the mean of recordings of the study's length. Their ground truth, measured again where they
-        were cut. And a row for each: ``imu, recording``; ``masked``, the numbers of its masked
-        samples; and ``copies``, the rows of those before it that are its copies, with their
-        correlation.
+        Recordings of the length that keeps most samples, with their means, which are the truth of a
+        study. Their ground truth, measured again if they were cut. And a row for each recording:
+        ``imu, recording``; ``masked``, the numbers of its masked samples; and ``copies``, the rows
+        of its copies among the recordings before it, with their correlation.
     """
     length, lengths = common_length(recordings), recordings["samples"].to_numpy()
     lengths, rate_hz = lengths[lengths > 0], recordings.attrs["rate_hz"]
-    alike = cut_to_length(recordings, length)
+    equal = cut_to_length(recordings, length)
     if (lengths != length).any():
         _log_lengths(recordings.attrs["sensor"], quality, length, rate_hz)
-        bias = bias_rows(alike)
+        bias = bias_rows(equal)
     else:
         logger.info("%s: all recordings are %.1f s", recordings.attrs["sensor"], length / rate_hz)
-    means = bias.set_index([*_PLACE, "axis"]).bias_dps.to_xarray()
-    alike = alike.assign(recording_mean=means.reindex_like(alike[[*_PLACE, "axis"]]))
+    means = bias.set_index([*_KEYS, "axis"]).bias_dps.to_xarray()
+    equal = equal.assign(recording_mean=means.reindex_like(equal[[*_KEYS, "axis"]]))
     rows: list[tuple[Any, ...]] = []
     starts = []
-    for imu, number, rates in iterate_recordings(alike):
+    for imu, number, rates in iterate_recordings(equal):
         rows.append((imu, number, np.flatnonzero(np.isnan(rates).any(axis=0)), []))
         starts.append(rates[:, :COMPARED])
     for pair in near_copies(np.stack(starts)):
         rows[pair.second][-1].append((pair.first, pair.correlation))
-    return alike, bias, pd.DataFrame(rows, columns=[*_PLACE, "masked", "copies"])
+    return equal, bias, pd.DataFrame(rows, columns=[*_KEYS, "masked", "copies"])
 
 
 def _log_lengths(sensor: str, quality: pd.DataFrame, length: int, rate_hz: float) -> None:
-    """Say to which length recordings are cut, who set it, and which are too short."""
+    """Log the length to which recordings are cut, which one sets it, and which are too short."""
     used = quality.dropna(subset="stop")
     lengths = (used["stop"] - used["start"]).to_numpy(int)
     first = used.iloc[int(np.flatnonzero(lengths == length)[0])]
@@ -130,13 +125,13 @@ def split_windows(  # noqa: PLR0917 - a node's arguments are its datasets
     """Make the windows table of a study: which windows train, validate and test.
 
     Args:
-        study: Its protocol, windows and strides.
+        study: The study with its protocol, windows and strides.
         recordings: Real recordings, all of one length.
-        contents: What is in them, from :func:`cut_to_common_length`.
+        contents: Masked samples and copies, from :func:`cut_to_common_length`.
         splits: Counts, the seed, and which windows train.
-        windows_s: Window lengths, where the study has none of its own.
-        only: Narrows the study.
-        virtual: Virtual recordings, all of whose windows train, where the study uses some.
+        windows_s: Window lengths, if the study sets none.
+        only: Filters of the study.
+        virtual: Virtual recordings, all of whose windows train, if the study uses some.
 
     Returns:
         A row per window and fold; see :mod:`gyro_pipeline.conventions`.
@@ -155,20 +150,20 @@ def split_windows(  # noqa: PLR0917 - a node's arguments are its datasets
         size, stride = sizes_of(window_s, stride_s, recordings)
         table = _real_windows(study, protocol, size, stride, recordings, contents, splits)
         if virtual is not None:
-            drawn = _virtual_windows(virtual, size, splits)
-            table = pd.concat([table, drawn.merge(table[["fold"]].drop_duplicates(), how="cross")])
+            folds = table[["fold"]].drop_duplicates()
+            virtual_table = _virtual_windows(virtual, size, splits).merge(folds, how="cross")
+            table = pd.concat([table, virtual_table])
         if protocol in APART:
             check_table(table, APART[protocol], contents, drawn_from)
-        place = table.assign(protocol=protocol, window_s=window_s, window_stride_s=stride_s)
-        tables.append(place)
+        tables.append(table.assign(protocol=protocol, window_s=window_s, window_stride_s=stride_s))
     return pd.concat(tables, ignore_index=True)[WINDOWS_TABLE].astype(_COMPACT)
 
 
 def sizes_of(window_s: float, stride_s: float, recordings: xr.Dataset) -> tuple[int, int]:
-    """Samples of a window, and from the start of one to that of the next.
+    """Window length and stride in samples.
 
     Raises:
-        InputError: A window is longer than a recording, or a stride is no sample.
+        InputError: A window is longer than a recording, or the stride is less than a sample.
     """
     rate_hz, sensor = recordings.attrs["rate_hz"], recordings.attrs["sensor"]
     size = window_size(window_s, rate_hz, recordings.sizes["sample"], sensor)
@@ -181,7 +176,7 @@ def sizes_of(window_s: float, stride_s: float, recordings: xr.Dataset) -> tuple[
     return size, stride
 
 
-def _real_windows(  # noqa: PLR0917 - what a table depends on
+def _real_windows(  # noqa: PLR0917 - everything that a table depends on
     study: Study,
     protocol: str,
     size: int,
@@ -212,14 +207,14 @@ def _real_windows(  # noqa: PLR0917 - what a table depends on
     tested = table(windows)
     if not (tested.role == TEST).any():
         raise InputError(
-            f"{label}: no test recording has one that can be used; lower windows_s of the study, "
-            "or bring recordings that lost fewer samples"
+            f"{label}: no test recording has a usable window; lower windows_s of the study, or "
+            "bring recordings that lost fewer samples"
         )
     if splits.training_windows == "all":
         return tested
     if splits.training_windows == "first":
         trained = tested[tested.role != TEST]
-        first = trained.groupby(["fold", *_PLACE]).start.transform("min") == trained.start
+        first = trained.groupby(["fold", *_KEYS]).start.transform("min") == trained.start
         return pd.concat([trained[first], tested[tested.role == TEST]])
     training_stride = round(splits.training_windows * rate_hz)
     trained = table(usable_windows(contents, samples, size, max(training_stride, 1)))
@@ -229,10 +224,10 @@ def _real_windows(  # noqa: PLR0917 - what a table depends on
 def _first_recordings(
     contents: pd.DataFrame, samples: int, size: int, tested: int, study: Study
 ) -> pd.DataFrame:
-    """The first recordings of the tested IMU that have a window, as many as the study uses."""
-    own = contents[contents.imu == tested]
-    usable = usable_windows(own, samples, size, size).recording.unique()
-    return own[own.recording.isin(usable)].iloc[: study.recordings]
+    """The first recordings of the tested IMU with a window, in the number that the study uses."""
+    contents = contents[contents.imu == tested]
+    usable = usable_windows(contents, samples, size, size).recording.unique()
+    return contents[contents.recording.isin(usable)].iloc[: study.recordings]
 
 
 def _virtual_windows(virtual: xr.Dataset, size: int, splits: Splits) -> pd.DataFrame:
@@ -245,13 +240,13 @@ def _virtual_windows(virtual: xr.Dataset, size: int, splits: Splits) -> pd.DataF
     starts = range(0, samples - size + 1, stride)
     numbers = range(1, 1 + int(virtual.attrs["train_recordings"]))
     index = pd.MultiIndex.from_product(
-        [virtual.imu.to_numpy(), numbers, starts], names=[*_PLACE, "start"]
+        [virtual.imu.to_numpy(), numbers, starts], names=[*_KEYS, "start"]
     )
     return index.to_frame(index=False).assign(role=TRAIN, origin=ORIGIN_VIRTUAL)
 
 
 def _split(recordings: xr.Dataset) -> Mapping[int, str] | None:
-    """The role of each recording in a hold-out; None where few recordings make a k-fold."""
+    """The role of each recording in a hold-out; None for a k-fold."""
     if "split" not in recordings.coords:
         return None
     numbers = recordings.recording.to_numpy().tolist()

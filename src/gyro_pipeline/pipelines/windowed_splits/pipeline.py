@@ -6,44 +6,33 @@ from gyro_pipeline.pipelines.windowed_splits.nodes import cut_to_common_length, 
 
 
 def create_pipeline(study: str, sensor: str, virtual: bool) -> Pipeline:
-    """One sensor's recordings, all of one length, and the windows table of a study.
+    """The recordings of a sensor, cut to one length, and the windows table of a study.
 
     Args:
-        study: Its name.
-        sensor: Its name.
-        virtual: Whether virtual gyroscopes take part.
+        study: Name of the study.
+        sensor: Name of the sensor.
+        virtual: Whether the study uses virtual gyroscopes.
     """
-    stage = f"{sensor}.windowed_splits"
-    drawn = {"virtual": f"{sensor}.virtual_gyros.recordings"} if virtual else {}
-    return Pipeline(
-        [
-            Node(
-                cut_to_common_length,
-                [
-                    f"{sensor}.raw_logs.recordings",
-                    f"{sensor}.ground_truth.bias",
-                    f"{sensor}.raw_logs.quality",
-                ],
-                [f"{stage}.recordings", f"{stage}.bias", f"{stage}.contents"],
-                name=f"cut_to_common_length_{sensor}",
-                namespace="windowed_splits",
-                tags=[sensor],
-            ),
-            Node(
-                split_windows,
-                {
-                    "study": f"params:studies.{study}",
-                    "recordings": f"{stage}.recordings",
-                    "contents": f"{stage}.contents",
-                    "splits": "params:splits",
-                    "windows_s": "params:windows_s",
-                    "only": "params:only",
-                }
-                | drawn,
-                f"{study}.{sensor}.windowed_splits.windows",
-                name=f"split_windows_{study}_{sensor}",
-                namespace="windowed_splits",
-                tags=[study, sensor],
-            ),
-        ]
+    stage, logs = f"{sensor}.windowed_splits", f"{sensor}.raw_logs"
+    inputs = {name: f"params:{name}" for name in ("splits", "windows_s", "only")}
+    inputs |= {name: f"{stage}.{name}" for name in ("recordings", "contents")}
+    inputs["study"] = f"params:studies.{study}"
+    if virtual:
+        inputs["virtual"] = f"{sensor}.virtual_gyros.recordings"
+    cut = Node(
+        cut_to_common_length,
+        [f"{logs}.recordings", f"{sensor}.ground_truth.bias", f"{logs}.quality"],
+        [f"{stage}.recordings", f"{stage}.bias", f"{stage}.contents"],
+        name=f"cut_to_common_length_{sensor}",
+        namespace="windowed_splits",
+        tags=[sensor],
     )
+    split = Node(
+        split_windows,
+        inputs,
+        f"{study}.{stage}.windows",
+        name=f"split_windows_{study}_{sensor}",
+        namespace="windowed_splits",
+        tags=[study, sensor],
+    )
+    return Pipeline([cut, split])

@@ -1,7 +1,7 @@
-"""Protocols: short functions that say which windows train, validate and test in each fold.
+"""Protocols: functions that decide which windows train, validate and test in each fold.
 
-The honest ones never part what belongs together: a recording (of all IMUs, which were recorded
-together) or a device has one role in a fold. The leaks of the leak study break this on purpose.
+In an honest protocol a recording (of all IMUs, which were recorded together) or a device has only
+one role in a fold. The leaks of the leak study break this rule on purpose.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -37,21 +37,13 @@ Folds = Iterator[tuple[str, Texts]]
 
 @dataclass(frozen=True)
 class Candidates:
-    """Windows that a protocol deals with.
+    """The windows that a protocol assigns to roles."""
 
-    Attributes:
-        windows: A row per usable window of a real recording: ``imu, recording, start``.
-        split: Role of each recording in a hold-out; None where few recordings make a k-fold.
-        tested: The IMU whose recordings test.
-        numbers: Its recordings that can test, in order, whichever windows these are.
-        splits: Counts, and the seed of every deal.
-    """
-
-    windows: pd.DataFrame
-    split: Mapping[int, str] | None
-    tested: int
-    numbers: Sequence[int]
-    splits: Splits
+    windows: pd.DataFrame  # a row per usable window of a real recording: imu, recording, start
+    split: Mapping[int, str] | None  # role of each recording in a hold-out; None for a k-fold
+    tested: int  # the IMU whose recordings test
+    numbers: Sequence[int]  # recordings of this IMU that can test, in order
+    splits: Splits  # counts, and the seed of all random choices
 
     def roles(self, of_recordings: Mapping[int, str]) -> Texts:
         """Roles of windows by their recordings; only the tested IMU tests."""
@@ -60,7 +52,7 @@ class Candidates:
 
 
 def by_recording(candidates: Candidates) -> Folds:
-    """Hold the test recordings of the split out; without a split, every recording tests once.
+    """Hold out the test recordings of the split; without a split, every recording tests once.
 
     Recordings that the tested IMU lacks cannot test: in a k-fold they train in every fold.
     """
@@ -71,23 +63,23 @@ def by_recording(candidates: Candidates) -> Folds:
     if len(numbers) <= splits.leave_one_out_up_to:
         parts = [[number] for number in numbers]
     else:
-        dealt = deal(len(numbers), splits.folds, splits.split_seed)
-        parts = [sorted(numbers[place] for place in part) for part in dealt]
+        positions = deal(len(numbers), splits.folds, splits.split_seed)
+        parts = [sorted(numbers[position] for position in part) for part in positions]
     others = dict.fromkeys(candidates.windows.recording.unique().tolist(), TRAIN)
     for fold, test in enumerate([*parts, []]):
         rest = [number for number in numbers if number not in set(test)]
-        wanted = splits.fold_validation_recordings
-        validation = choose_validation(rest, wanted, splits.split_seed, fold + 1)
+        count = splits.fold_validation_recordings
+        validation = choose_validation(rest, count, splits.split_seed, fold + 1)
         roles = others | dict.fromkeys(validation, VALIDATION) | dict.fromkeys(test, TEST)
         yield f"fold {fold}" if test else ALL_RECORDINGS, candidates.roles(roles)
 
 
 def k_fold(candidates: Candidates) -> Folds:
-    """Deal recordings to folds; none validates."""
+    """Deal recordings to folds, without validation."""
     numbers, splits = candidates.numbers, candidates.splits
     parts = deal(len(numbers), splits.folds, splits.split_seed)
     for fold, part in enumerate([*parts, np.array([], np.intp)]):
-        test = {numbers[place] for place in part}
+        test = {numbers[position] for position in part}
         roles = {number: TEST if number in test else TRAIN for number in numbers}
         yield f"fold {fold}" if test else ALL_RECORDINGS, candidates.roles(roles)
 
@@ -95,10 +87,10 @@ def k_fold(candidates: Candidates) -> Folds:
 def leave_one_device_out(candidates: Candidates) -> Folds:
     """Let every IMU in turn be the unseen device: it tests, and all others train.
 
-    Where there is a split, only test recordings test and only the others train, so recordings made
-    together with a test recording never train. Without one, all of the device's recordings test
-    and all of the others' train: few recordings are all needed, and what IMUs that were recorded
-    together share is no bias. An IMU without a recording to test only trains.
+    With a split, only test recordings test and only the others train, so recordings made together
+    with a test recording never train. Without a split, all recordings of the device test and all
+    recordings of the other IMUs train: a few recordings are all needed, and IMUs that were recorded
+    together do not share their biases. An IMU without a test recording only trains.
     """
     imus, split = candidates.windows.imu.to_numpy(), candidates.split
     if len(np.unique(imus)) < 2:  # noqa: PLR2004
@@ -109,11 +101,11 @@ def leave_one_device_out(candidates: Candidates) -> Folds:
     held_out = np.ones(len(imus), bool)
     if split is not None:
         held_out = candidates.windows.recording.map(split).to_numpy() == TEST
-    kept = np.ones(len(imus), bool) if split is None else ~held_out
+    training = np.ones(len(imus), bool) if split is None else ~held_out
     for unseen in np.unique(imus).tolist():
         tests = held_out & (imus == unseen)
         if tests.any():
-            trains = kept & (imus != unseen)
+            trains = training & (imus != unseen)
             yield f"without IMU {unseen}", np.select([tests, trains], [TEST, TRAIN], UNUSED)
     yield ALL_RECORDINGS, np.full(len(imus), TRAIN, object)
 
@@ -151,41 +143,38 @@ PROTOCOLS: Mapping[str, Callable[[Candidates], Folds]] = {
     TEST_IN_TRAINING: test_in_training,
     BEST_EPOCH_ON_TEST: best_epoch_on_test,
 }
-"""By the word that a study's ``protocol`` has."""
+"""Protocols by their name in the setting ``protocol`` of a study."""
 
 
 def check_table(
-    table: pd.DataFrame,
-    apart: str,
-    contents: pd.DataFrame,
-    drawn_from: Sequence[int],
+    table: pd.DataFrame, apart: str, contents: pd.DataFrame, drawn_from: Sequence[int]
 ) -> None:
-    """Refuse what an honest windows table may not have.
+    """Refuse a windows table that breaks the rules of honest protocols.
 
     Args:
         table: Columns ``fold, role, origin, imu, recording`` and more.
-        apart: What has one role in a fold: ``recording``, of all IMUs together, or ``imu``.
+        apart: Column whose values have one role in a fold: ``recording`` or ``imu``.
         contents: A row per real recording: ``imu, recording, copies``, from
             :func:`gyro_pipeline.pipelines.windowed_splits.nodes.cut_to_common_length`.
         drawn_from: Real recordings from which the virtual ones were drawn.
 
     Raises:
-        InputError: A recording or device has two roles in a fold; a recording and a copy of it,
-            exact or nearly so, have two roles; a virtual recording that trains was drawn from one
-            that tests; or a fold that tests has nothing to train on. It names the fold and the
-            recordings.
+        InputError: A recording or device has two roles in a fold; a recording and its copy have
+            different roles; a virtual recording that trains was drawn from a test recording; or a
+            fold has nothing to train on. The message names the fold and the recordings.
     """
-    places = table.drop_duplicates(["fold", "role", "origin", "imu", "recording"])
-    for fold, rows in places.groupby("fold", observed=True, sort=False):
+    keys = table.drop_duplicates(["fold", "role", "origin", "imu", "recording"])
+    for fold, rows in keys.groupby("fold", observed=True, sort=False):
         real = rows[rows.origin == ORIGIN_REAL]
         _refuse_two_roles(str(fold), real, apart)
         _refuse_copies(str(fold), real, contents)
         tests = set(real.recording[real.role == TEST])
-        seen = sorted(tests & set(drawn_from)) if len(real) < len(rows) else []
-        if seen:
+        leaked = sorted(tests & set(drawn_from)) if len(real) < len(rows) else []
+        if leaked:
             raise InputError(
                 f"{fold}: virtual recordings that train were drawn from recordings "
-                f"{', '.join(map(str, seen))}, which test; draw them from training recordings alone"
+                f"{', '.join(map(str, leaked))}, which test; "
+                "draw them from training recordings alone"
             )
         if tests and not (rows.role == TRAIN).any():
             raise InputError(
@@ -195,15 +184,15 @@ def check_table(
 
 
 def _refuse_two_roles(fold: str, rows: pd.DataFrame, apart: str) -> None:
-    if apart == "imu":  # of a device that tests; the others may train and validate
+    if apart == "imu":  # a device that does not test may train and validate
         rows = rows.assign(role=np.where(rows.role == TEST, TEST, TRAIN))
     roles = rows.drop_duplicates([apart, "role"]).groupby(apart, observed=True).role
-    for name, own in roles:
-        if len(own) > 1:
+    for name, of_name in roles:
+        if len(of_name) > 1:
             uses = rows[rows[apart] == name].groupby("role", observed=True).imu.unique()
-            shown = (f"{role} (IMU {', '.join(map(str, imus))})" for role, imus in uses.items())
+            texts = (f"{role} (IMU {', '.join(map(str, imus))})" for role, imus in uses.items())
             raise InputError(
-                f"{fold}: {apart} {name} has more than one role: {', '.join(shown)}; a recording "
+                f"{fold}: {apart} {name} has more than one role: {', '.join(texts)}; a recording "
                 "trains, validates or tests, for all IMUs recorded together, and an unseen device "
                 "never trains"
             )
@@ -211,15 +200,15 @@ def _refuse_two_roles(fold: str, rows: pd.DataFrame, apart: str) -> None:
 
 def _refuse_copies(fold: str, rows: pd.DataFrame, contents: pd.DataFrame) -> None:
     roles = rows.groupby(["imu", "recording"]).role.agg(set).to_dict()
-    places = list(zip(contents.imu, contents.recording, strict=True))
-    for place, copies in zip(places, contents.copies, strict=True):
+    keys = list(zip(contents.imu, contents.recording, strict=True))
+    for key, copies in zip(keys, contents.copies, strict=True):
         for other, correlation in copies:
-            own, twin = roles.get(place, set()), roles.get(places[other], set())
-            if own and twin and own | twin != own & twin:
-                (imu, number), (imu_2, number_2) = place, places[other]
+            first, second = roles.get(key, set()), roles.get(keys[other], set())
+            if first and second and first != second:
+                (imu, number), (imu_2, number_2) = key, keys[other]
                 raise InputError(
-                    f"{fold}: IMU {imu} recording {number} ({', '.join(sorted(own))}) is a copy of "
-                    f"IMU {imu_2} recording {number_2} ({', '.join(sorted(twin))}): their noise "
-                    f"has a correlation of {correlation:.2f}, where two recordings have less than "
-                    "0.1; leave one of them out, or give both the same role"
+                    f"{fold}: IMU {imu} recording {number} ({', '.join(sorted(first))}) is a copy "
+                    f"of IMU {imu_2} recording {number_2} ({', '.join(sorted(second))}): their "
+                    f"noise has a correlation of {correlation:.2f}, where two recordings have less "
+                    "than 0.1; leave one of them out, or give both the same role"
                 )
