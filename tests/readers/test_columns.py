@@ -25,7 +25,7 @@ def axes(name, order="xyz"):
     ("header", "columns", "options"),
     [
         (axes("g# (DPS)"), X, {}),
-        (axes("g# [deg/h]"), X * 3600, {}),
+        (axes("g#_dph"), X * 3600, {}),
         (axes("Gyro#_dps"), X, {}),
         (f"{T}gyro[0],gyro[1],gyro[2]", X, DEG),
         (axes(""), X, BY_NUMBER),
