@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import pytest
@@ -15,6 +16,7 @@ from gyro_pipeline.run_lock import Interrupts, check_folder, only_run
 
 HOLDS = """
 import sys, time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from gyro_pipeline.run_lock import only_run
 with only_run(Path(sys.argv[1])):
@@ -76,6 +78,20 @@ def test_an_interrupt_that_python_could_not_raise_ends_the_run_at_the_next_resul
         del_me = Finaliser()
         del del_me
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_leaves_no_thread_that_python_would_wait_for(monkeypatch):
+    start = ThreadPoolExecutor._adjust_thread_count
+
+    def interrupted(pool):
+        os.kill(os.getpid(), signal.SIGINT)
+        start(pool)
+
+    monkeypatch.setattr(ThreadPoolExecutor, "_adjust_thread_count", interrupted)
+    interrupts = Interrupts()
+    with ThreadPoolExecutor(1) as pool, pytest.raises(KeyboardInterrupt), interrupts.watch():
+        assert pool.submit(int).result() == 0
+        interrupts.after_dataset_saved()
 
 
 @pytest.mark.parametrize("name", ["a?b", "%41", "a{1}"])

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -75,8 +76,9 @@ def _owner(path: Path) -> str:
 class Interrupts:
     """Ends a run on Ctrl-C, also where Python could only print and ignore the exception.
 
-    An exception that a signal raises in a finaliser or in a callback of C code is not passed on.
-    So the signal is remembered, and the exception is raised again once the next result is stored.
+    An exception that a signal raises in a finaliser or in a callback of C code is not passed on,
+    and inside ``submit`` it leaves a thread that nobody ends, for which Python waits on exit. So
+    the signal is remembered, and the exception is raised (again) once the next result is stored.
     """
 
     def __init__(self) -> None:
@@ -106,8 +108,12 @@ class Interrupts:
         """Raise an interrupt that was lost since the last result."""
         self._raise()
 
-    def _remember(self, _signal: int, _frame: FrameType | None) -> None:
+    def _remember(self, _signal: int, frame: FrameType | None) -> None:
         self._interrupted = True
+        while frame is not None:
+            if frame.f_code is ThreadPoolExecutor.submit.__code__:
+                return
+            frame = frame.f_back
         raise KeyboardInterrupt
 
     def _raise(self) -> None:
