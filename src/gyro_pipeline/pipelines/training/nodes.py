@@ -380,10 +380,10 @@ def _note(spec: RunSpec, folds: Mapping[str, TrainingSet]) -> str:
         "recordings"
         for origin, rows in windows.groupby("origin", observed=True)
     )
-    target = "all recordings, once more" if fold == ALL_RECORDINGS else f"the {fold}"
+    target = f"once more, to {fold}" if fold == ALL_RECORDINGS else f"to the {fold}"
     return (
         f"The model `{spec.estimator}` estimates the bias of {spec.sensor} from {spec.window_s:g} "
-        f"s; it was fitted to {target}: {amounts or 'no windows'} ({spec.real_gyros} real and "
+        f"s; it was fitted {target}: {amounts or 'no windows'} ({spec.real_gyros} real and "
         f"{spec.virtual_gyros} virtual gyroscopes, source {spec.source}). The metrics are those of "
         f"the protocol {spec.protocol} with {fits} fit{'s' * (fits > 1)}, none of which saw its "
         "test recordings unless the protocol is a leak."
