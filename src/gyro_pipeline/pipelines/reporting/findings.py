@@ -59,12 +59,12 @@ def _networks(rows: pd.DataFrame) -> str:
     window_s = networks.window_s.min()
     shortest = rows[rows.window_s == window_s]
     parts = [
-        f"Over all windows of {window_s:g} s the paper's network is {_gain(shortest, CNN)} % more "
+        f"Over all windows of {window_s:g} s, the paper's network is {_gain(shortest, CNN)} % more "
         "accurate than the mean of the window"
     ]
     if (shortest.estimator == CONSTANT).any():
         parts.append(
-            "a constant, the device's known mean returned without a look at the window, "
+            "a constant, the mean of the device's training recordings, "
             f"{_gain(shortest, CONSTANT)} %"
         )
     if (shortest.estimator == DEFAULT).any():
@@ -72,13 +72,9 @@ def _networks(rows: pd.DataFrame) -> str:
     limit = f"{_range(shortest[_CEILING_GAIN].dropna())} %"
     if _ORACLE_GAIN in shortest and shortest[_ORACLE_GAIN].notna().any():
         oracle = _range(shortest[_ORACLE_GAIN].dropna())
-        parts.append(
-            f"and the oracle, which knows the drawn values, {oracle} %, where {limit} is expected "
-            "of the best estimator (the ceiling)"
-        )
-    else:
-        parts.append(f"and the ceiling is {limit}")
-    return f"{', '.join(parts)}."
+        parts.append(f"the oracle, which knows the drawn values, {oracle} %")
+    parts.append(f"the ceiling, which is expected of the best estimator, is {limit}")
+    return f"{'; '.join(parts)}."
 
 
 def _gain(rows: pd.DataFrame, estimator: str) -> str:
