@@ -345,7 +345,10 @@ def test_on_simulated_data_the_oracle_stands_beside_and_chance_is_called_chance(
     assert "by chance above its ceiling in all windows" in table["Note"]
     assert table["Note"].endswith(conflict)
     assert f"network on sparkfun at 10 s: {conflict}" in page
-    assert "knows the drawn values, 62 %;" in page and "times that of the oracle on the same windows" in page
+    assert (
+        "knows the drawn values, 62 %;" in page
+        and "times that of the oracle on the same windows" in page
+    )
     for ax in figures["forest"].axes:
         realised = [one for one in ax.lines if one.get_label() == "oracle"]
         assert {float(one.get_xdata()[0]) for one in realised} == {62}
