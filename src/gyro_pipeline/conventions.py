@@ -50,7 +50,6 @@ BY_RECORDING, LEAVE_ONE_DEVICE_OUT, K_FOLD = "by_recording", "leave_one_device_o
 WINDOW_SPLIT = "window_split"
 TEST_IN_TRAINING = "test_in_training"
 BEST_EPOCH_ON_TEST = "best_epoch_on_test"
-LEAKS = (WINDOW_SPLIT, TEST_IN_TRAINING, BEST_EPOCH_ON_TEST)
 """Protocols. The leaks let test information into training on purpose, only in the leak study."""
 
 PAPER, DISJOINT, TRUE = "paper", "disjoint", "true"

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gyro_pipeline.conventions import BEST_EPOCH_ON_TEST, K_FOLD, LEAKS, TEST_IN_TRAINING
+from gyro_pipeline.conventions import BEST_EPOCH_ON_TEST, K_FOLD, TEST_IN_TRAINING, WINDOW_SPLIT
 from gyro_pipeline.datasets.array_logs import ArrayLogs
 from gyro_pipeline.pipelines.reporting.leakage import WAYS, pool_leakage
 from gyro_pipeline.studies import CNN, CNN_SHUFFLED
@@ -63,7 +63,8 @@ def simulated(make_recordings, leak_study):
         "true_noise": ("axis", np.full(3, 3e-3)),
     }
     recordings = recordings.assign(drawn).assign_attrs(simulated=1)
-    return leak_study(recordings, LEAKS, channels=16, stride=5, pool=4, hidden=64)
+    leaks = (WINDOW_SPLIT, TEST_IN_TRAINING, BEST_EPOCH_ON_TEST)
+    return leak_study(recordings, leaks, channels=16, stride=5, pool=4, hidden=64)
 
 
 def test_shuffled_labels_are_no_better_than_the_constant_and_a_networks_own_are(simulated):
