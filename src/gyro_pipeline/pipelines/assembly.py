@@ -5,15 +5,13 @@ from collections.abc import Iterable
 from kedro.pipeline import Node, Pipeline
 
 from gyro_pipeline.parameters import Parameters
-from gyro_pipeline.pipelines import (
-    evaluation,
-    ground_truth,
-    raw_logs,
-    reporting,
-    training,
-    virtual_gyros,
-    windowed_splits,
-)
+from gyro_pipeline.pipelines.evaluation import pipeline as evaluation
+from gyro_pipeline.pipelines.ground_truth import pipeline as ground_truth
+from gyro_pipeline.pipelines.raw_logs import pipeline as raw_logs
+from gyro_pipeline.pipelines.reporting import pipeline as reporting
+from gyro_pipeline.pipelines.training import pipeline as training
+from gyro_pipeline.pipelines.virtual_gyros import pipeline as virtual_gyros
+from gyro_pipeline.pipelines.windowed_splits import pipeline as windowed_splits
 from gyro_pipeline.studies import used_sensors
 
 

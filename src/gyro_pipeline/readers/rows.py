@@ -10,7 +10,6 @@ from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import AXES
@@ -165,13 +164,16 @@ def _change(rates: Floats, codes: Codes, least: float = 0.3, sigmas: float = 8) 
 
 def _coded(column: NDArray[Any]) -> tuple[Codes, Texts]:
     """The code of each row's value, and the values by code, as texts."""
+    import pandas as pd  # noqa: PLC0415 - few files need it, and every worker would wait for it
+
     codes, values = pd.factorize(column, use_na_sentinel=False)
     return codes, np.array([_as_text(value) for value in values], object)
 
 
 def _as_text(value: Any) -> str:
     """A value as a user types it: 1 for 1.0; an empty text for a missing one."""
-    return "" if pd.isna(value) else f"{value:.15g}" if isinstance(value, float) else str(value)
+    missing = value is None or value != value  # noqa: PLR0124 - NaN
+    return "" if missing else f"{value:.15g}" if isinstance(value, float) else str(value)
 
 
 def _with_counts(codes: Codes, texts: Texts, most: int = 8) -> str:

@@ -5,7 +5,6 @@ of a hundred sampled cells match the form of a time.
 """
 
 import numpy as np
-import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
@@ -65,6 +64,8 @@ def are_steps(values: NDArray[np.float64]) -> bool:
 
 def _of_parts(parts: dict[str, pa.Array]) -> NDArray[np.float64] | None:
     """Seconds (n,) from the parts of texts, each (n,); None if they are ambiguous."""
+    import pandas as pd  # noqa: PLC0415 - few files need it, and every worker would wait for it
+
     hours, minutes = _numbers(parts["h"]), _numbers(parts["m"])
     if np.isnan(hours).all() and not pc.any(pc.match_substring_regex(parts["s"], r"\D")).as_py():
         return None  # 09:50 may be hours and minutes, or minutes and seconds
@@ -82,7 +83,7 @@ def _of_parts(parts: dict[str, pa.Array]) -> NDArray[np.float64] | None:
         times[valid] += period * np.cumsum(np.diff(times[valid], prepend=0.0) < -period / 2)
         return times
     # the right order of day and month is the one that makes the recording short
-    orders = (_days(pd.Series(dates), first)[codes] + times for first in (False, True))
+    orders = (_days(dates, first)[codes] + times for first in (False, True))
     return min(orders, key=lambda t: (np.isnan(t).sum(), np.abs(np.diff(t[valid])).sum()))
 
 
@@ -100,7 +101,9 @@ def _numbers(texts: pa.Array) -> NDArray[np.float64]:
     return pc.if_else(pc.equal(texts, ""), None, texts).cast(pa.float64()).to_numpy(False)
 
 
-def _days(dates: pd.Series, day_first: bool) -> NDArray[np.float64]:
+def _days(dates: NDArray, day_first: bool) -> NDArray[np.float64]:
     """Seconds from the first date to each, NaN for texts that are not dates, then a NaN."""
-    days = pd.to_datetime(dates, errors="coerce", format="mixed", dayfirst=day_first)
+    import pandas as pd  # noqa: PLC0415 - as above
+
+    days = pd.to_datetime(pd.Series(dates), errors="coerce", format="mixed", dayfirst=day_first)
     return np.append((days - days.min()).dt.total_seconds().to_numpy(float), np.nan)

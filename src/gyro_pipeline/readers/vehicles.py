@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from gyro_pipeline.conventions import AXES, InputError
 from gyro_pipeline.logs import KEPT, Finding
@@ -68,7 +67,8 @@ def read_ardupilot(path: Path, options: ReaderOptions) -> Table:
         fields = message.to_dict()
         streams.setdefault((message.get_type(), fields.get("I", 0)), []).append(fields)
     text = "the autopilot has subtracted the bias measured at its start (INS_GYR…OFFS)"
-    rows = pd.DataFrame(streams[_pick(path, options, streams)])
+    messages = streams[_pick(path, options, streams)]
+    rows = {field: [message[field] for message in messages] for field in messages[0]}
     return _table(path, rows, [Finding("corrected rates", KEPT, text)])
 
 
