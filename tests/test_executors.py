@@ -174,6 +174,24 @@ def test_a_worker_that_is_killed_is_an_error_and_no_endless_wait(here, tmp_path)
             list(run_jobs(jobs, here.sleeps, PAIR, "killed"))
 
 
+def test_a_stopped_worker_is_named_and_finishes_its_job_when_it_continues(
+    here, tmp_path, monkeypatch, caplog
+):
+    monkeypatch.setattr(executors, "_LOG_EVERY_S", 0.1)
+    jobs = [here.Job("long", 1.0, str(tmp_path)), here.Job("short", 0.1, str(tmp_path))]
+
+    def resume():
+        soon(lambda: "kill -CONT " in caplog.text, "the stopped worker is not named")
+        os.kill(int(caplog.text.partition("kill -CONT ")[2].split()[0]), signal.SIGCONT)
+
+    user = threading.Thread(target=resume)
+    user.start()
+    with signalled(tmp_path, signal.SIGSTOP):
+        results = [result for _, result in run_jobs(jobs, here.sleeps, PAIR, "stopped")]
+    user.join()
+    assert sorted(results) == ["long", "short"]
+
+
 @pytest.fixture
 def program(tmp_path):
     """This file as a program in a process group of its own, with workers at work."""

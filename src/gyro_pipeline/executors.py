@@ -8,11 +8,12 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol, TypeVar
 
+import psutil
 from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky.process_executor import BrokenProcessPool
 from tqdm import tqdm
@@ -126,7 +127,8 @@ def _in_processes(
         )
         results = parallel(calls)
     try:
-        yield from results
+        with _stopped_workers_named():
+            yield from results
     except BrokenProcessPool as error:
         raise InputError(
             "a worker process was killed, perhaps because memory ran out; type the same command "
@@ -148,6 +150,26 @@ def _no_interrupts() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _stopped_workers_named() -> Iterator[None]:
+    """Name the processes that were stopped, which the run would else wait for without a word."""
+
+    def watch() -> None:
+        while not done.wait(_LOG_EVERY_S):
+            for worker in psutil.Process().children():
+                with suppress(psutil.Error):
+                    if worker.status() == psutil.STATUS_STOPPED:
+                        text = "process %d was stopped, and this run waits for it: kill -CONT %d"
+                        logger.warning(text, worker.pid, worker.pid)
+
+    done = threading.Event()
+    threading.Thread(target=watch, daemon=True).start()
+    try:
+        yield
+    finally:
+        done.set()
 
 
 def _start_worker(parent: int) -> None:
