@@ -643,3 +643,23 @@ def test_a_server_that_does_not_answer_is_told_at_once(tmp_path, monkeypatch):
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:9")
     with pytest.raises(InputError, match="http://127.0.0.1:9: .* does not answer"):
         tracked(tmp_path / "mlflow.db").check_reachable()
+
+
+def test_fits_that_a_server_does_not_take_are_stored_once_it_answers(
+    store, monkeypatch, tmp_path, caplog
+):
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{store}")
+    runs, folds = tracked(tmp_path / "mlflow.db", study="real2real"), ("fold 0", "fold 1", MODEL)
+    runs.save(fitted(fold="fold 0", folds=folds))
+    with monkeypatch.context() as away:
+        away.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:9")
+        server = tracked(tmp_path / "mlflow.db", study="real2real")
+        server.save(fitted(fold="fold 1", folds=folds))
+        server.save(fitted(folds=folds))
+        assert caplog.text.count("does not answer; fits are kept in") == 1
+        with pytest.raises(DatasetError, match="does not answer"):
+            server.load()
+    (run,) = runs.load()
+    assert run.trained and run.fits == set(folds)
+    assert len(runs.load()) == 1
+    assert not [*tmp_path.rglob("*.pkl")]

@@ -6,7 +6,6 @@ import socket
 import sqlite3
 from collections.abc import Mapping
 from contextlib import closing
-from functools import cache
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -57,9 +56,8 @@ def ready_store(path: Path) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
 
 
-@cache
 def check_answers(uri: str) -> None:
-    """Check once that a server or a database answers.
+    """Check that a server or a database answers.
 
     Raises:
         InputError: It does not answer.

@@ -33,6 +33,7 @@ from mlflow.entities import (
 )
 from mlflow.exceptions import MlflowException
 from mlflow.utils.file_utils import local_file_uri_to_path
+from sqlalchemy.exc import SQLAlchemyError
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.run_store import (
@@ -43,6 +44,7 @@ from gyro_pipeline.datasets.run_store import (
 )
 from gyro_pipeline.datasets.stored import digest_of
 from gyro_pipeline.datasets.tracked_models import log_model, model_fit_uri, model_of
+from gyro_pipeline.datasets.unsaved_fits import keep_fit, kept_fits
 from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.fingerprints import fingerprint
 from gyro_pipeline.tracking import (
@@ -89,6 +91,8 @@ rest."""
 
 # A progress bar for each small artifact would hide everything else on a terminal.
 os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+# MLflow would repeat a request for four minutes without a word.
+os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
 
 USER_INTERFACE = "http://127.0.0.1:5000"
 """Default address of ``mlflow ui``."""
@@ -150,6 +154,8 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
         """Tags of every new run; set once per ``kedro run``."""
         self.changed: frozenset[str] = frozenset()
         """Names of settings that differ from ``conf/base``; names of runs state their values."""
+        self._kept = self._path.parent / "data" / "06_models"
+        self._is_silent = False
         self._unfinished: dict[tuple[str, str], tuple[str, set[str]]] = {}
         """Id and completed folds, by study and fingerprint, of runs to which fits are added."""
 
@@ -159,6 +165,9 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
         Raises:
             InputError: The store is damaged, is not an MLflow store, or was moved.
         """
+        if self.study:
+            self.check_reachable()
+            self._save_kept(self.study)
         experiments = self._experiments()
         if not experiments:
             return []
@@ -190,11 +199,39 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
         return count_finished(self._path, self.study, self.only) if self._path.exists() else 0
 
     def save(self, data: FittedRun | EvaluatedRun) -> None:
-        """Add a fit to its run, or complete an evaluated run."""
-        if isinstance(data, FittedRun):
-            self._save_fitted(data)
-        else:
+        """Add a fit to its run, or complete an evaluated run.
+
+        A fit that a server does not take is kept in a file, and saved when the server answers.
+        """
+        if isinstance(data, EvaluatedRun):
             self._save_evaluated(data)
+            return
+        try:
+            self.check_reachable()
+            self._save_kept(data.run.study)
+            self._save_fitted(data)
+        except (InputError, MlflowException, SQLAlchemyError, OSError) as error:
+            is_refusal = isinstance(error, InputError) and error.__cause__ is None
+            if self._is_own_file or is_refusal:
+                raise
+            self._unfinished.clear()
+            keep_fit(self._kept, data)
+            if not self._is_silent:
+                logger.warning(
+                    "the run store does not answer; fits are kept in %s until it does, by the next "
+                    "run at the latest (%s)",
+                    *(self._kept, " ".join(str(error).split())),
+                )
+            self._is_silent = True
+
+    def _save_kept(self, study: str) -> None:
+        """Save the fits that were kept while the server did not answer."""
+        for path, fitted in kept_fits(self._kept, study):
+            same = self._same_runs(fitted)
+            if not any(fitted.fold in _fits(run) for run in same):  # an answer may have been lost
+                self._save_fitted(fitted)
+            path.unlink()
+        self._is_silent = False
 
     @cached_property
     def _uri(self) -> str:

@@ -1,0 +1,38 @@
+"""Fits that a run server did not take: files that are kept until it answers again."""
+
+import hashlib
+import logging
+import pickle
+from collections.abc import Iterator
+from pathlib import Path
+
+from gyro_pipeline.datasets.atomic import replacing
+from gyro_pipeline.tracking import FittedRun
+
+logger = logging.getLogger(__name__)
+
+
+def keep_fit(folder: Path, fitted: FittedRun) -> None:
+    """Write a fit to a file of its study, named by the digest of its content."""
+    content = pickle.dumps(fitted)
+    with replacing(_folder(folder, fitted.run.study) / f"{_digest(content)}.pkl") as path:
+        path.write_bytes(content)
+
+
+def kept_fits(folder: Path, study: str) -> Iterator[tuple[Path, FittedRun]]:
+    """The kept fits of a study, with their files; a damaged file is removed, to be fitted again."""
+    for path in sorted(_folder(folder, study).glob("*.pkl")):
+        content = path.read_bytes()
+        if _digest(content) == path.stem:
+            yield path, pickle.loads(content)
+        else:
+            logger.warning("%s: damaged, so it is removed, and the fit is made again", path)
+            path.unlink()
+
+
+def _folder(folder: Path, study: str) -> Path:
+    return folder / "unsaved_fits" / study
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
