@@ -1,4 +1,3 @@
-import json
 import logging
 import os
 import shutil
@@ -20,13 +19,41 @@ from mlflow import MlflowClient
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets import run_store
-from gyro_pipeline.datasets.tracked_runs import TrackedRuns, run_link
+from gyro_pipeline.datasets.tracked_runs import TrackedRuns
 from gyro_pipeline.store import relocate
 from gyro_pipeline.tracking import EvaluatedRun, FittedRun, RunIdentity
 
 STARTED_MS, ENDED_MS = 1_700_000_000_000, 1_700_000_060_000
 NAME = "dot constant 3+0 10 s seed 0"
 MODEL = "hold-out"
+
+
+pytestmark = pytest.mark.slow
+
+
+def test_a_fitted_run_waits_for_its_evaluation_and_has_what_a_user_of_mlflow_looks_for(store):
+    runs = tracked(store)
+    runs.provenance |= {"kedro_run": "2024-09-01T00.00.00", "data_hash": "of another"}
+    runs.save(fitted({"data_hash": "abc"}, estimator=Constant(0.1, history(3))))
+    (run,) = tracked(store).load()
+    assert (run.trained, run.finished, run.study) == (True, False, "real2real")
+    assert (run.tags["kedro_run"], run.tags["data_hash"]) == ("2024-09-01T00.00.00", "abc")
+    assert (run.started_ms, run.fingerprint, run.fits) == (STARTED_MS, "f00d0", {MODEL})
+    assert run.params == {key: str(value) for key, value in PARAMS.items()}
+    assert run.load_fit(MODEL).bias == 0.1
+    assert run.metrics == {"train_loss": pytest.approx(1 / 3), "val_loss": pytest.approx(5 / 6)}
+    pd.testing.assert_frame_equal(run.load("history.csv"), history(3), check_exact=True)
+    assert statuses(store) == {NAME: "RUNNING"}
+    client = MlflowClient(f"sqlite:///{store}")
+    shown = client.get_run(run.run_id)
+    assert shown.data.tags["mlflow.note.content"] == "It was trained on this and tested on that."
+    assert shown.data.tags["recommended"] == "True"
+    (dataset,) = shown.inputs.dataset_inputs
+    assert (dataset.dataset.name, dataset.dataset.digest) == ("dot", "abc")
+    (model,) = shown.outputs.model_outputs
+    assert client.get_logged_model(model.model_id).status == "READY"
+
+
 WINDOWS = np.random.default_rng(0).normal(0, 0.05, (2, 3, 40))
 
 
@@ -35,62 +62,32 @@ Constant = import_module("constant").Constant
 Unwritable = import_module("constant").Unwritable
 
 
-@pytest.fixture(scope="session")
-def new_store(tmp_path_factory):
-    """An MLflow store without runs; making one takes seconds."""
-    path = tmp_path_factory.mktemp("new_store") / "mlflow.db"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.delenv("MLFLOW_TRACKING_URI", raising=False)
-        assert TrackedRuns(str(path), "simulated").load() == []
-    return path
-
-
 @pytest.fixture
-def store(tmp_path, new_store, monkeypatch):
-    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    return Path(shutil.copy(new_store, tmp_path / "mlflow.db"))
+def store(tmp_path, made_once):
+    """An MLflow store without runs; making one takes seconds."""
+    empty = made_once("store", lambda folder: run_store.make_store(folder / "mlflow.db"))
+    return Path(shutil.copy(empty / "mlflow.db", tmp_path))
+
+
+PARAMS = {
+    **{"study": "real2real", "sensor": "dot", "source": "simulated", "real_gyros": 3},
+    **{"virtual_gyros": 0, "window_s": 10.0, "seed": 0, "estimator": "constant"},
+}
 
 
 def tracked(store, source="simulated", **only):
     return TrackedRuns(str(store), source, **only)
 
 
-def params(**changes):
-    given = {
-        "study": "real2real",
-        "sensor": "dot",
-        "source": "simulated",
-        "real_gyros": 3,
-        "virtual_gyros": 0,
-        "window_s": 10.0,
-        "seed": 0,
-        "estimator": "constant",
-    }
-    return given | changes
-
-
-def fitted(tags=None, fold=MODEL, folds=(MODEL,), estimator=None, **changes):
-    started_ms = changes.pop("started_ms", STARTED_MS)
-    given = params(**changes)
-    run = RunIdentity(
-        study=given["study"],
-        fingerprint=f"f00d{given['seed']}",
-        params=given,
-        tags=tags or {},
-        folds=folds,
-        name=f"dot constant 3+0 10 s seed {given['seed']}",
-        note="It was trained on this and tested on that.",
-    )
-    return FittedRun(
-        run=run,
-        fold=fold,
-        estimator=estimator or Constant(),
-        started_ms=started_ms,
-        ended_ms=ENDED_MS,
-        is_model=fold == MODEL,
-        example=WINDOWS,
-        dataset={"name": "dot", "digest": "abc", "source": "simulated", "recordings": "83"},
-    )
+def fitted(tags=None, fold=MODEL, folds=(MODEL,), estimator=None, started_ms=STARTED_MS, **changes):
+    given = PARAMS | changes
+    name = f"dot constant 3+0 10 s seed {given['seed']}"
+    note = "It was trained on this and tested on that."
+    key = f"f00d{given['seed']}"
+    run = RunIdentity(given["study"], key, given, tags or {}, folds, name, note)
+    dataset = {"name": "dot", "digest": "abc", "source": "simulated", "recordings": "83"}
+    made = estimator or Constant(), started_ms, ENDED_MS, fold == MODEL, WINDOWS, dataset
+    return FittedRun(run, fold, *made)
 
 
 def history(epochs):
@@ -105,61 +102,16 @@ def statuses(store, study="real2real"):
     return {run.info.run_name: run.info.status for run in client.search_runs([experiment])}
 
 
-def test_a_fitted_run_waits_for_its_evaluation(store):
-    runs = tracked(store)
-    runs.provenance |= {"kedro_run": "2024-09-01T00.00.00", "data_hash": "of another"}
-    runs.save(fitted({"data_hash": "abc"}, estimator=Constant(0.1, history(3))))
-    (run,) = tracked(store).load()
-    assert run.trained
-    assert run.tags["kedro_run"] == "2024-09-01T00.00.00"
-    assert not run.finished
-    assert run.study == "real2real"
-    assert run.started_ms == STARTED_MS
-    assert run.params == {key: str(value) for key, value in params().items()}
-    assert run.tags["data_hash"] == "abc"
-    assert run.fingerprint == "f00d0"
-    assert run.fits == {MODEL}
-    assert run.load_fit(MODEL).bias == 0.1
-    assert run.metrics == {"train_loss": pytest.approx(1 / 3), "val_loss": pytest.approx(5 / 6)}
-    pd.testing.assert_frame_equal(run.load("history.csv"), history(3), check_exact=True)
-    assert statuses(store) == {NAME: "RUNNING"}
-
-
-def test_what_a_user_of_mlflow_looks_for_is_there(store):
-    tracked(store).save(fitted())
-    client = MlflowClient(f"sqlite:///{store}")
-    experiment = client.get_experiment_by_name("real2real")
-    assert "One run is one row of the study" in experiment.tags["mlflow.note.content"]
-    (run,) = client.search_runs([experiment.experiment_id])
-    tags = run.data.tags
-    assert tags["mlflow.note.content"] == "It was trained on this and tested on that."
-    assert (tags["study"], tags["sensor"], tags["estimator"]) == ("real2real", "dot", "constant")
-    assert tags["recommended"] == "True"
-    (dataset,) = run.inputs.dataset_inputs
-    assert (dataset.dataset.name, dataset.dataset.digest) == ("dot", "abc")
-    assert '"recordings": "83"' in dataset.dataset.profile
-    (model,) = run.outputs.model_outputs
-    assert client.get_logged_model(model.model_id).status == "READY"
-
-
-@pytest.fixture
-def elsewhere(store):
-    """The store as a notebook sees it."""
-    mlflow.set_tracking_uri(f"sqlite:///{store}")
-    yield
-    mlflow.set_tracking_uri(None)
-
-
-def test_the_model_of_a_run_is_loaded_and_applied_to_windows(store, elsewhere):
+def test_the_model_of_a_run_is_loaded_and_applied_to_windows(store, monkeypatch):
     tracked(store).save(fitted(estimator=Constant(0.25)))
     (run,) = tracked(store).load()
-    model = mlflow.pyfunc.load_model(f"runs:/{run.run_id}/model")
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{store}")
+    model = mlflow.pyfunc.load_model(model_uri(run))
     estimates = model.predict(WINDOWS)
     np.testing.assert_array_equal(estimates["bias_dps"], np.full((2, 3), 0.25))
     np.testing.assert_array_equal(estimates["sigma_dps"], np.full((2, 3), 0.5))
     later = model.predict(WINDOWS, params={"target": "recording_mean", "start_s": [1.0, 2.0]})
     np.testing.assert_array_equal(later["bias_dps"][:, 0], [1.25, 2.25])
-    np.testing.assert_allclose(model.input_example, WINDOWS[:1], atol=1e-6)
     requirements = Path(mlflow.pyfunc.get_model_dependencies(model_uri(run)))
     assert "gyro-pipeline==" in requirements.read_text()
 
@@ -181,54 +133,42 @@ def test_the_model_of_a_class_from_outside_the_package_brings_its_code(
     store, tmp_path, monkeypatch
 ):
     monkeypatch.syspath_prepend(tmp_path / "code")
-    source = sys.modules["constant"].__file__
-    kinds = ("theirs_file", "theirs_package.__init__", "theirs_folder.inner", "theirs_importing")
+    source = Path(sys.modules["constant"].__file__).read_text()
     importing = "import theirs_file\nclass Constant(theirs_file.Constant):\n    pass\n"
-    for seed, module in enumerate(kinds):
-        file = tmp_path / "code" / f"{module.replace('.', '/')}.py"
-        file.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(source, file)
-        if seed == len(kinds) - 1:
-            file.write_text(importing)
-        kind = import_module(module.removesuffix(".__init__")).Constant
+    texts = {"theirs_file": source, "theirs_folder/inner": source, "theirs_importing": importing}
+    for name, text in texts.items():
+        file = tmp_path / "code" / f"{name}.py"
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(text)
+    for seed, module in enumerate(("theirs_folder.inner", "theirs_importing")):
+        kind = import_module(module).Constant
         tracked(store).save(fitted(estimator=kind(float(seed)), seed=seed))
-    models = [model_uri(run) for run in reversed(tracked(store).load())]
+    models = [model_uri(run) for run in tracked(store).load()]
     command = [sys.executable, "-c", APPLY, f"sqlite:///{store}", *models]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     said = {line.split()[0] for line in done.stdout.splitlines()}
-    assert said == {"0.0", "1.0", "2.0", "3.0"}, done.stderr
+    assert said == {"0.0", "1.0"}, done.stderr
 
 
-FOLDS = ("fold 0", "without IMU 3", MODEL)
+def test_loading_narrows_to_study_sensor_and_source_also_where_the_store_answers_in_pages(store):
+    everything = [
+        *(("augmentation", "dot", "simulated"), ("real2real", "dot", "simulated")),
+        ("real2real", "ng", "published"),
+    ]
+    for study, sensor, source in everything:
+        tracked(store).save(fitted(study=study, sensor=sensor, source=source))
 
+    def found(**only):
+        runs = tracked(store, **only)
+        runs._client.search_runs = partial(runs._client.search_runs, max_results=1)
+        names = ("study", "sensor", "source")
+        return sorted(tuple(run.params[name] for name in names) for run in runs.load())
 
-def test_the_fits_of_a_run_are_saved_as_they_end(store):
-    runs = tracked(store)
-    for number, fold in enumerate(FOLDS):
-        assert not any(run.trained for run in tracked(store).load())
-        runs.save(fitted(fold=fold, folds=FOLDS, estimator=Constant(number)))
-    (run,) = tracked(store).load()
-    assert run.trained
-    assert run.fits == set(FOLDS)
-    assert [run.load_fit(fold).bias for fold in FOLDS] == [0, 1, 2]
-    stored = sorted(path.parent.name for path in store.parent.rglob("estimator.pkl"))
-    assert stored == ["fit", "fold_0", "without_IMU_3"]  # each once
-
-
-@pytest.mark.parametrize(("epochs", "points"), [(7, 7), (120, 40)])
-def test_curves_are_thinned_and_keep_the_last_epoch(store, epochs, points):
-    tracked(store).save(fitted(estimator=Constant(0, history(epochs))))
-    (run,) = tracked(store).load()
-    client = MlflowClient(f"sqlite:///{store}")
-    for name in ("train_loss", "val_loss"):
-        curve = client.get_metric_history(run.run_id, name)
-        steps = sorted(point.step for point in curve)
-        assert len(steps) == points
-        assert steps[-1] == epochs
-        assert len(set(np.diff(steps))) == 1
-        whole = history(epochs).set_index("epoch")[name]
-        assert {p.step: p.value for p in curve} == pytest.approx(whole[steps].to_dict())
-        assert {p.timestamp for p in curve} == {ENDED_MS}
+    assert found() == everything[:2]
+    assert found(source=None) == everything
+    assert found(source=None, sensor="ng") == everything[2:]
+    assert found(study="augmentation") == everything[:1]
+    assert found(study="input_channels") == []
 
 
 def test_an_evaluated_run_is_finished_and_keeps_what_it_had(store):
@@ -252,40 +192,6 @@ def test_an_evaluated_run_is_finished_and_keeps_what_it_had(store):
     pd.testing.assert_frame_equal(run.load("history.csv"), history(3))
     info = MlflowClient(f"sqlite:///{store}").get_run(run.run_id).info
     assert (info.start_time, info.end_time) == (STARTED_MS, ENDED_MS)  # of the training
-
-
-def test_loading_narrows_to_study_sensor_and_source(store):
-    everything = [
-        *(("real2real", "dot", "simulated"), ("augmentation", "dot", "simulated")),
-        *(("real2real", "ng", "simulated"), ("augmentation", "ng", "published")),
-        ("real2real", "ng", "published"),
-    ]
-    for study, sensor, source in everything:
-        tracked(store).save(fitted(study=study, sensor=sensor, source=source))
-
-    def found(**only):
-        return sorted(
-            (run.study, run.params["sensor"], run.params["source"])
-            for run in tracked(store, **only).load()
-        )
-
-    assert found() == sorted(one for one in everything if one[2] == "simulated")
-    assert found(source=None) == sorted(everything)
-    assert found(source="published", sensor="ng") == [
-        ("augmentation", "ng", "published"),
-        ("real2real", "ng", "published"),
-    ]
-    assert found(study="augmentation", sensor="dot") == [("augmentation", "dot", "simulated")]
-    assert found(study="input_channels") == []
-    assert found(sensor="memsense") == []
-
-
-def test_all_runs_are_found_where_the_store_answers_in_pages(store):
-    runs = tracked(store)
-    for seed in range(5):
-        runs.save(fitted(seed=seed))
-    runs._client.search_runs = partial(runs._client.search_runs, max_results=2)
-    assert sorted(run.params["seed"] for run in runs.load()) == list("01234")
 
 
 KILLED = """
@@ -324,6 +230,7 @@ def test_after_a_kill_trained_runs_are_evaluated_and_others_continued(store):
     assert continued.run_id == runs["1"].run_id
     assert continued.trained
     assert continued.fits == {"fold 0", "fold 1", MODEL}
+    assert [continued.load_fit(fold).bias for fold in ("fold 0", MODEL)] == [0.5, 0]
 
 
 def unfinished(store, seed=0, **owner):
@@ -338,46 +245,27 @@ def unfinished(store, seed=0, **owner):
     return newest.info.run_id
 
 
-def test_the_unfinished_run_of_another_living_process_is_left_alone(store):
-    parent = psutil.Process(os.getppid())
-    theirs = unfinished(store, pid=str(parent.pid), started=str(parent.create_time()))
-    assert tracked(store).load() == []
-    assert statuses(store) == {NAME: "RUNNING"}
-    tracked(store).save(fitted())
-    (mine,) = tracked(store).load()
-    assert mine.run_id != theirs
-
-
-@pytest.fixture(scope="session")
-def gone():
-    """The number of a process that has ended."""
+def test_whose_process_is_gone_is_told_by_host_number_and_start(store):
+    """What another living process has not finished is left alone."""
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
-    return str(ended.pid)
-
-
-@pytest.mark.parametrize(
-    ("owner", "status"),
-    [
-        ({"pid": "gone"}, "KILLED"),
+    gone, parent = str(ended.pid), psutil.Process(os.getppid())
+    cases = [
+        ({"pid": str(parent.pid), "started": str(parent.create_time())}, "RUNNING"),
+        ({"pid": gone}, "KILLED"),
         ({"started": "1.5"}, "KILLED"),  # another process got its number
-        ({"host": "elsewhere", "pid": "gone"}, "RUNNING"),  # cannot be known from here ...
+        ({"host": "elsewhere", "pid": gone}, "RUNNING"),  # cannot be known from here ...
         ({"host": "elsewhere", "written": "1700000000"}, "KILLED"),  # ... but is long silent
-    ],
-)
-def test_whose_process_is_gone_is_told_by_host_number_and_start(store, gone, owner, status):
-    run_id = unfinished(store, **{key: gone if at == "gone" else at for key, at in owner.items()})
-    assert [run.run_id for run in tracked(store).load()] == [run_id] * (status == "KILLED")
-    assert statuses(store) == {NAME: status}
-
-
-def test_unfinished_runs_end_whatever_is_loaded_and_however_many_there_are(store):
-    for seed in range(3):
-        unfinished(store, seed, started="1.5")
-    runs = tracked(store, source="published", sensor="ng")
-    runs._client.search_runs = partial(runs._client.search_runs, max_results=2)
-    assert runs.load() == []
-    assert set(statuses(store).values()) == {"KILLED"}
+    ]
+    left = [unfinished(store, seed, **owner) for seed, (owner, _) in enumerate(cases)]
+    killed = {run_id for run_id, (_, status) in zip(left, cases, strict=True) if status == "KILLED"}
+    assert tracked(store, source="published").load() == []
+    names = [NAME.replace("seed 0", f"seed {seed}") for seed in range(len(cases))]
+    assert statuses(store) == dict(zip(names, (status for _, status in cases), strict=True))
+    assert {run.run_id for run in tracked(store).load()} == killed
+    tracked(store).save(fitted())
+    (mine,) = (run for run in tracked(store).load() if run.params["seed"] == "0")
+    assert mine.run_id != left[0]
 
 
 def test_a_run_that_is_not_described_yet_is_described_when_it_is_continued(store):
@@ -416,21 +304,6 @@ def test_runs_of_an_older_layout_are_counted_once_and_never_read(store, caplog):
     assert caplog.messages == ["3 runs of an older layout are not read"]
 
 
-def test_a_link_opens_the_runs_of_a_study_best_first(store):
-    everywhere = TrackedRuns(str(store), study="real2real")
-    assert run_link([everywhere]) is None
-    tracked(store).save(fitted())
-    sensors = [tracked(store, study="real2real", sensor=sensor) for sensor in ("dot", "ng")]
-    address = "http://127.0.0.1:5000/#/experiments/1/runs?workflowType=machine_learning"
-    assert run_link([everywhere, *sensors]) == f"{address}&viewStateShareKey=runs_simulated"
-    assert run_link(sensors[:1]) == f"{address}&viewStateShareKey=runs_simulated_dot"
-    tags = MlflowClient(f"sqlite:///{store}").get_experiment("1").tags
-    view = json.loads(tags["mlflow.sharedViewState.runs_simulated_dot"])
-    wanted = "tags.layout = '3' and params.source = 'simulated' and params.sensor = 'dot'"
-    assert view["searchFilter"] == wanted
-    assert view["orderByKey"] == "metrics.`accuracy_gain_pct`"
-
-
 def test_artifacts_are_never_written_to_where_a_copy_is_from(store, tmp_path):
     tracked(store).save(fitted())
     copy = tmp_path / "a copy" / "mlflow.db"
@@ -464,25 +337,17 @@ def foreign(path):
         (foreign, "expected an MLflow store, got an SQLite file with tables bookmarks"),
     ],
 )
-@pytest.mark.parametrize("use", [TrackedRuns.load, lambda runs: runs.save(fitted())])
-def test_a_file_that_is_no_sound_store_is_refused_and_left_as_it_is(store, spoil, told, use):
+def test_a_file_that_is_no_sound_store_is_refused_and_left_as_it_is(store, spoil, told):
     tracked(store).save(fitted())
     spoil(store)
-    before = store.read_bytes()
-    around = set(store.parent.iterdir())
-    with pytest.raises(DatasetError) as caught:
-        use(tracked(store))
-    refused = caught.value.__cause__
-    assert isinstance(refused, InputError)
-    pytest.raises(InputError, refuse, refused).match(told)
-    assert str(store) in str(refused)
-    assert "move it away" in str(refused)
-    assert store.read_bytes() == before
-    assert set(store.parent.iterdir()) == around
-
-
-def refuse(error):
-    raise error
+    before, around = store.read_bytes(), set(store.parent.iterdir())
+    for use in (TrackedRuns.load, lambda runs: runs.save(fitted())):
+        with pytest.raises(DatasetError, match=told) as caught:
+            use(tracked(store))
+        assert isinstance(caught.value.__cause__, InputError)
+        assert f"{store}" in str(caught.value) and "move it away" in str(caught.value)
+        assert store.read_bytes() == before
+        assert set(store.parent.iterdir()) == around
 
 
 INTERRUPTED = """
@@ -526,23 +391,6 @@ def test_a_store_is_there_complete_or_not_at_all(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_tracking_uri_of_the_environment_wins(store, new_store, tmp_path, monkeypatch):
-    other = tmp_path / "elsewhere" / "runs.db"
-    other.parent.mkdir()
-    shutil.copy(new_store, other)
-    monkeypatch.chdir(other.parent)  # where MLflow then keeps artifacts
-    before = store.read_bytes()
-    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{other}")
-    tracked(store).save(fitted(estimator=Constant(0, history(2))))
-    (run,) = tracked(store).load()
-    pd.testing.assert_frame_equal(run.load("history.csv"), history(2))
-    assert statuses(other) == {NAME: "RUNNING"}
-    assert store.read_bytes() == before
-    assert tracked(tmp_path / "none.db").exists()
-    monkeypatch.delenv("MLFLOW_TRACKING_URI")
-    assert tracked(store).load() == []
-
-
 def evaluated(store, seed=0, trained=False):
     """A finished run with its history, scores and errors."""
     runs = tracked(store)
@@ -562,20 +410,17 @@ def flip(path):
     path.write_bytes(content)
 
 
-DAMAGES = [
-    *(("errors.parquet", flip), ("scores.csv", Path.unlink), ("estimator.pkl", flip)),
-]
-
-
-@pytest.mark.parametrize(("name", "damage"), DAMAGES)
-def test_a_damaged_artifact_sets_its_run_back_and_no_other(store, name, damage, caplog):
+@pytest.mark.parametrize(
+    ("name", "damage", "again"),
+    [("scores.csv", Path.unlink, "evaluated"), ("estimator.pkl", flip, "trained")],
+)
+def test_a_damaged_artifact_sets_its_run_back_and_no_other(store, name, damage, again, caplog):
     run_id, other = evaluated(store), evaluated(store, seed=1)
     (path,) = (path for path in store.parent.rglob(name) if is_of(path, run_id, store))
     damage(path)
-    (there,) = (run for run in tracked(store).load() if run.run_id == other)
-    assert there.finished
-    (broken,) = (run for run in tracked(store).load() if run.run_id == run_id)
-    again = "trained" if name in ("history.csv", "estimator.pkl") else "evaluated"
+    runs = {run.run_id: run for run in tracked(store).load()}
+    broken = runs[run_id]
+    assert runs[other].finished
     assert f"run {run_id}: damaged or missing: " in caplog.text
     assert f"it is {again} again" in caplog.text
     assert not broken.finished
@@ -599,27 +444,28 @@ def test_an_artifact_that_is_damaged_after_its_run_was_loaded_is_refused(store):
     assert not tracked(store).load()[0].finished
 
 
-@pytest.mark.parametrize("table", ["params", "latest_metrics"])
-def test_edited_values_of_a_run_are_told(store, table):
+def test_edited_values_of_a_run_are_told(store):
     run_id = evaluated(store)
-    with sqlite3.connect(store) as connection:
-        names = ("params", "seed") if table == "params" else ("latest_metrics", "rmse_mdps")
-        connection.execute("update {} set value = '7' where key = '{}'".format(*names))
-    connection.close()
-    if table == "params":
-        with pytest.raises(DatasetError, match=f"mlflow runs delete --run-id {run_id}"):
-            tracked(store).load()
-    else:
-        assert not tracked(store).load()[0].finished
 
+    def edit(table, key):
+        with sqlite3.connect(store) as connection:
+            connection.execute(f"update {table} set value = '7' where key = '{key}'")
+        connection.close()
 
-@pytest.mark.parametrize("spoil", [Path.unlink, lambda store: store.write_bytes(b"")])
-def test_artifacts_without_their_store_are_no_new_beginning(store, spoil):
-    evaluated(store)
-    spoil(store)
-    with pytest.raises(DatasetError, match="artifacts of 1 runs; put the store back"):
+    edit("latest_metrics", "rmse_mdps")
+    assert not tracked(store).load()[0].finished
+    edit("params", "seed")
+    with pytest.raises(DatasetError, match=f"mlflow runs delete --run-id {run_id}"):
         tracked(store).load()
-    assert not store.exists() or not store.stat().st_size
+
+
+def test_artifacts_without_their_store_are_no_new_beginning(store):
+    evaluated(store)
+    for spoil in (lambda: store.write_bytes(b""), store.unlink):
+        spoil()
+        with pytest.raises(DatasetError, match="artifacts of 1 runs; put the store back"):
+            tracked(store).load()
+        assert not store.exists() or not store.stat().st_size
 
 
 def test_what_two_projects_train_at_once_is_stored_once(store, monkeypatch, tmp_path):
@@ -659,7 +505,7 @@ def test_fits_that_a_server_does_not_take_are_stored_once_it_answers(
         assert caplog.text.count("does not answer; fits are kept in") == 1
         with pytest.raises(DatasetError, match="does not answer"):
             server.load()
-    (run,) = runs.load()
+    (run,) = TrackedRuns(str(tmp_path / "mlflow.db")).load()  # of all studies
     assert run.trained and run.fits == set(folds)
-    assert len(runs.load()) == 1
     assert not [*tmp_path.rglob("*.pkl")]
+    assert len(runs.load()) == 1

@@ -165,9 +165,8 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
         Raises:
             InputError: The store is damaged, is not an MLflow store, or was moved.
         """
-        if self.study:
-            self.check_reachable()
-            self._save_kept(self.study)
+        self.check_reachable()
+        self._save_kept(self.study)
         experiments = self._experiments()
         if not experiments:
             return []
@@ -224,7 +223,7 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
                 )
             self._is_silent = True
 
-    def _save_kept(self, study: str) -> None:
+    def _save_kept(self, study: str | None) -> None:
         """Save the fits that were kept while the server did not answer."""
         for path, fitted in kept_fits(self._kept, study):
             same = self._same_runs(fitted)

@@ -11,27 +11,25 @@ from gyro_pipeline.tracking import FittedRun
 
 logger = logging.getLogger(__name__)
 
+_FOLDER = "unsaved_fits"
+
 
 def keep_fit(folder: Path, fitted: FittedRun) -> None:
     """Write a fit to a file of its study, named by the digest of its content."""
     content = pickle.dumps(fitted)
-    with replacing(_folder(folder, fitted.run.study) / f"{_digest(content)}.pkl") as path:
+    with replacing(folder / _FOLDER / fitted.run.study / f"{_digest(content)}.pkl") as path:
         path.write_bytes(content)
 
 
-def kept_fits(folder: Path, study: str) -> Iterator[tuple[Path, FittedRun]]:
-    """The kept fits of a study, with their files; a damaged file is removed, to be fitted again."""
-    for path in sorted(_folder(folder, study).glob("*.pkl")):
+def kept_fits(folder: Path, study: str | None) -> Iterator[tuple[Path, FittedRun]]:
+    """The kept fits of a study, or of all, and their files; damaged files are removed."""
+    for path in sorted((folder / _FOLDER).glob(f"{study or '*'}/*.pkl")):
         content = path.read_bytes()
         if _digest(content) == path.stem:
             yield path, pickle.loads(content)
         else:
             logger.warning("%s: damaged, so it is removed, and the fit is made again", path)
             path.unlink()
-
-
-def _folder(folder: Path, study: str) -> Path:
-    return folder / "unsaved_fits" / study
 
 
 def _digest(content: bytes) -> str:
