@@ -22,8 +22,8 @@ from gyro_pipeline.conventions import InputError
 
 logger = logging.getLogger(__name__)
 
-_READ_AS_PATTERNS = "?*[]{}#%"
-"""Characters that Kedro or MLflow reads in a path as a pattern, or as part of an address."""
+_MISREAD = '?*[]{}#%"'
+"""Characters that Kedro or MLflow reads in a path as a pattern, an address or a quoted text."""
 
 
 def check_folder(project: Path) -> None:
@@ -32,12 +32,12 @@ def check_folder(project: Path) -> None:
     Raises:
         InputError: The path has a character that has a meaning for Kedro or MLflow.
     """
-    special = [character for character in _READ_AS_PATTERNS if character in str(project)]
+    special = [character for character in _MISREAD if character in str(project)]
     if special:
         raise InputError(
-            f"{project}: Kedro and MLflow read {' '.join(special)} in a path as a pattern or as "
-            "part of an address, and would use other files; move the project to a folder whose "
-            "path has no such character"
+            f"{project}: Kedro and MLflow read {' '.join(special)} in a path as a pattern, an "
+            "address or a quoted text, and would use other files; move the project to a folder "
+            "whose path has no such character"
         )
 
 
