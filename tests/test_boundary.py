@@ -2,7 +2,7 @@
 
 import errno
 import logging
-import sqlite3
+import re
 import sys
 from concurrent.futures.process import BrokenProcessPool
 
@@ -30,47 +30,35 @@ def raised(error, cause=None):
 @pytest.mark.parametrize(
     ("error", "words"),
     [
-        (InputError("bias.csv: type make"), ["bias.csv: type make"]),
-        (OSError(errno.ENOSPC, "No space left on device", "a.nc"), ["write a.nc", "free some"]),
-        (PermissionError(errno.EACCES, "Permission denied", "x.db"), ["x.db", "readable"]),
-        (FileNotFoundError(errno.ENOENT, "No such file", "log.csv"), ["log.csv", "no such file"]),
-        (BrokenProcessPool("terminated abruptly"), ["memory", "execution.workers"]),
-        (MemoryError(), ["memory ran out"]),
-        (sqlite3.OperationalError("database or disk is full"), ["run store", "disk is full"]),
-        (MlflowException("http://u:secret@h failed"), ["run store", "http://u:***@h failed"]),
-        (KeyError("x"), None),
+        (InputError("bias.csv: type make"), "bias.csv: type make"),
+        (OSError(errno.ENOSPC, "No space left on device", "a.nc"), "write a.nc.*free some"),
+        (PermissionError(errno.EACCES, "Permission denied", "x.db"), "x.db.*readable"),
+        (RuntimeError("can't start new thread"), "memory ran out.*execution.workers"),
+        (BrokenProcessPool("terminated abruptly"), "memory.*execution.workers"),
+        (MlflowException("http://u:secret@h failed"), r"run store.*http://u:\*\*\*@h failed"),
     ],
 )
 def test_what_others_throw_becomes_a_line_and_a_defect_of_ours_does_not(tmp_path, error, words):
     said = explanation(raised(error), tmp_path)
-    if words is None:
-        assert said is None
-        return
     assert "\n" not in said
-    for word in words:
-        assert word in said
+    assert re.search(words, said)
+    assert explanation(raised(KeyError("x")), tmp_path) is None
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (b"a: 1\nb: 2\na: 3\n", "line 3: found duplicate key a"),
-        ("a: 1\nb: gr\xf6\xdfe\n".encode("latin-1"), "line 2: not UTF-8"),
-        (b"a: 1\nb: [1,\n", "line 3: "),
-    ],
-)
-def test_a_fault_in_the_configuration_is_named_by_file_and_line(tmp_path, content, words):
+def test_a_fault_in_the_configuration_is_named_by_file_and_line(tmp_path):
     base = tmp_path / "conf" / "base"
     base.mkdir(parents=True)
-    (base / "globals.yml").write_text("a: 1")
     path = base / "parameters_broken.yml"
-    path.write_bytes(content)
     loader = OmegaConfigLoader(str(tmp_path / "conf"), base_env="base", default_run_env="base")
-    with pytest.raises(Exception) as caught:  # noqa: PT011 - they have no common base
-        loader["parameters"]
-    said = explanation(caught.value, tmp_path)
-    assert said.startswith(f"configuration: {path}")
-    assert words in said
+    for content, words in (
+        (b"a: 1\nb: 2\na: 3\n", "line 3: found duplicate key a"),
+        ("a: 1\nb: gr\xf6\xdfe\n".encode("latin-1"), "line 2: not UTF-8"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(Exception) as caught:  # noqa: PT011 - they have no common base
+            loader["parameters"]
+        said = explanation(caught.value, tmp_path)
+        assert said.startswith(f"configuration: {path}") and words in said
 
 
 def test_passwords_in_addresses_are_masked_wherever_something_is_logged(tmp_path, caplog):

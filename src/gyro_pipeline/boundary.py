@@ -27,6 +27,8 @@ _ERRNO_OF_HDF5 = re.compile(r"errno = (\d+)")
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
 _CONFIGURATION = re.compile(r"-packages/(kedro/config|omegaconf|yaml)/")
+_NO_THREAD = "can't start new thread"
+"""Python's message when memory, or the allowed number of threads, is used up."""
 _OTHER_ARGUMENTS = "must only contain arguments valid for the constructor"
 """Part of Kedro's message about an unknown or missing key of a catalog entry."""
 
@@ -34,6 +36,8 @@ _OTHER_ARGUMENTS = "must only contain arguments valid for the constructor"
 def install(project: Path) -> None:
     """Explain uncaught errors, and mask passwords in everything that is logged."""
     sys.excepthook = partial(_show, project)
+    # Python would print a traceback for each incomplete object that Ctrl-C leaves behind
+    sys.unraisablehook = lambda ignored: logger.debug("ignored: %r", ignored.exc_value)
     if logging.getLogRecordFactory() is logging.LogRecord:
         logging.setLogRecordFactory(_record_without_passwords)
 
@@ -57,6 +61,8 @@ def explanation(error: BaseException, project: Path) -> str | None:
     files = [Path(frame.f_code.co_filename) for frame, _ in traceback.walk_tb(error.__traceback__)]
     if any(_CONFIGURATION.search(file.as_posix()) for file in files):
         return f"configuration: {_faulty_file(project / 'conf') or mask_passwords(_line(error))}"
+    if any(_NO_THREAD in str(cause) for cause in causes):
+        return _of_memory(error)
     if _OTHER_ARGUMENTS in str(error):
         return f"catalog: {mask_passwords(_line(error))}"
     if isinstance(error, ValueError) and _is_about_the_command(files):
