@@ -56,13 +56,11 @@ def explanation(error: BaseException, project: Path) -> str | None:
     for cause in reversed(causes):  # from the original error on
         for kind in type(cause).__mro__:
             explain = _EXPLAINED.get(f"{kind.__module__.partition('.')[0]}.{kind.__name__}")
-            if explain is not None:
-                return mask_passwords(explain(cause))
+            if explain is not None and (text := explain(cause)):
+                return mask_passwords(text)
     files = [Path(frame.f_code.co_filename) for frame, _ in traceback.walk_tb(error.__traceback__)]
     if any(_CONFIGURATION.search(file.as_posix()) for file in files):
         return f"configuration: {_faulty_file(project / 'conf') or mask_passwords(_line(error))}"
-    if any(_NO_THREAD in str(cause) for cause in causes):
-        return _of_memory(error)
     if _OTHER_ARGUMENTS in str(error):
         return f"catalog: {mask_passwords(_line(error))}"
     if isinstance(error, ValueError) and _is_about_the_command(files):
@@ -138,6 +136,10 @@ def _of_workers(error: BaseException) -> str:
     )
 
 
+def _of_threads(error: BaseException) -> str | None:
+    return _of_memory(error) if _NO_THREAD in str(error) else None
+
+
 def _of_memory(error: BaseException) -> str:
     return (
         f"memory ran out ({_line(error)}); close other programs, or use less: "
@@ -145,10 +147,11 @@ def _of_memory(error: BaseException) -> str:
     )
 
 
-_EXPLAINED: dict[str, Callable[[Any], str]] = {
+_EXPLAINED: dict[str, Callable[[Any], str | None]] = {
     "requests.RequestException": _of_store,  # also an OSError
     "builtins.OSError": _of_files,
     "builtins.MemoryError": _of_memory,
+    "builtins.RuntimeError": _of_threads,
     "numpy._ArrayMemoryError": _of_memory,
     "concurrent.BrokenExecutor": _of_workers,
     "sqlalchemy.SQLAlchemyError": _of_store,
