@@ -1,7 +1,6 @@
 """The configuration as the pipelines meet it: no dataset by accident in memory, no stray key."""
 
 from functools import cache
-from itertools import combinations
 from pathlib import Path
 
 import pytest
@@ -43,7 +42,10 @@ TYPOS = {
 }
 
 # The package says so itself, but pytest sets filters of its own.
-pytestmark = pytest.mark.filterwarnings("ignore:One or more dataset names contain")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore:One or more dataset names contain"),
+]
 
 
 @cache
@@ -132,34 +134,6 @@ def test_every_parameter_and_every_pattern_is_used(registered):
     assert {entry_name("base", name) for name in names} == set(configuration("base")["catalog"])
 
 
-def test_studies_that_take_long_are_pipelines_of_their_own(registered):
-    pipelines = registered["base"]
-    for study in ("estimators", "unseen_devices", "leakage"):
-        assert f"{study}.memsense.evaluation.runs" in pipelines[study].all_outputs()
-        for name in ("__default__", "reporting"):
-            assert not [one for one in datasets_of({name: pipelines[name]}) if f"{study}." in one]
-    for name, pipeline in pipelines.items():
-        assert (name == "leakage") == any("leakage" in node.name for node in pipeline.nodes), name
-
-
-def test_a_studys_runs_are_narrowed_to_it_and_tracked_ones_are_not():
-    runs = entry("real2real.ng.evaluation.runs")
-    assert (runs["study"], runs["sensor"], runs["source"]) == ("real2real", "ng", "simulated")
-    assert "study" not in entry("ng.training.tracked")
-
-
-def test_sources_never_share_a_path(registered):
-    names = datasets_of(registered["base"])
-    by_source = {
-        configuration(env)["globals"]["source"]: set(paths(env, names).values())
-        for env in ("base", "smoke", "memsense_real", "published")
-    }
-    assert set(by_source) == {"simulated", "simulated_smoke", "published", "published_all"}
-    for (one, theirs), (other, others) in combinations(by_source.items(), 2):
-        both_published = one.startswith("published") and other.startswith("published")
-        assert theirs & others == SHARED | ({PUBLISHED} if both_published else set())
-
-
 def leaves(tree, place=()):
     """Places of all values that are no mappings."""
     if not isinstance(tree, dict):
@@ -185,3 +159,13 @@ def test_an_environment_adds_no_key_that_base_lacks_and_no_file_that_is_not_read
         assert additions(given, base) == set()
         assert additions(given | {"stray": 1}, base) == {("stray",)}
     assert parameters(env).source == configuration(env)["globals"]["source"]
+
+
+def test_studies_that_take_long_are_pipelines_of_their_own(registered):
+    pipelines = registered["base"]
+    for study in ("estimators", "unseen_devices", "leakage"):
+        assert f"{study}.memsense.evaluation.runs" in pipelines[study].all_outputs()
+        for name in ("__default__", "reporting"):
+            assert not [one for one in datasets_of({name: pipelines[name]}) if f"{study}." in one]
+    for name, pipeline in pipelines.items():
+        assert (name == "leakage") == any("leakage" in node.name for node in pipeline.nodes), name

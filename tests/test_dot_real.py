@@ -8,9 +8,7 @@ import pandas as pd
 import pytest
 
 from gyro_pipeline.datasets.recordings import open_recordings
-from gyro_pipeline.parameters import ReaderOptions
 from gyro_pipeline.physics.bias import recording_mean
-from gyro_pipeline.readers import read_log
 from gyro_pipeline.recordings import cut_to_length, iterate_recordings
 
 IMUS, RATE_HZ = (1, 2, 3, 4, 5), 120.0
@@ -69,18 +67,6 @@ def test_each_row_of_zeros_and_the_dropout_are_found_and_cut(ran):
     assert "non-finite values: axes x, y, z, row 13001" in table.findings[0]
     assert "row 13000" in table.findings[0]
     assert table.rate_hz.tolist() == [RATE_HZ] * 5
-
-
-def test_rows_are_read_as_they_are_and_those_that_are_cut_are_what_they_are_called(folder, rows):
-    for imu in IMUS:
-        log = read_log(folder / f"dot_x_stat_{imu}.csv", ReaderOptions(), RATE_HZ)
-        np.testing.assert_array_equal(log.samples, rows[imu])
-        assert log.rate_hz == pytest.approx(RATE_HZ, rel=1e-9) and not len(log.gap_rows)
-        assert [finding.check for finding in log.findings] == ["unit"]
-        assert np.nanmedian(log.acceleration_g[:, 2]) == pytest.approx(1, abs=0.1)
-        assert (rows[imu][0] == 0).all() and np.isfinite(rows[imu][START:STOP]).all()
-    assert not np.isfinite(rows[1][13001]).any()
-    np.testing.assert_allclose(rows[1][13000], rows[1][12999] / 2, rtol=0.1)  # half scale
 
 
 def test_biases_and_noise_are_those_of_numpy_over_unmasked_rows_to_ten_digits(ran, bias, rows):

@@ -4,8 +4,6 @@ import importlib
 import io
 import logging
 import os
-import pickle
-import re
 import signal
 import subprocess
 import sys
@@ -13,9 +11,7 @@ import threading
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import count
 from pathlib import Path
-from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -28,6 +24,9 @@ from gyro_pipeline.parameters import Execution
 
 SERIAL = Execution(executor="serial", workers=None)
 PAIR = Execution(executor="processes", workers=2)
+
+
+pytestmark = pytest.mark.slow
 
 LONG_S = 120.0
 SOON_S = 60.0
@@ -108,30 +107,7 @@ def test_every_job_is_run_once_the_longest_first_where_it_was_asked_for(here, ex
     if execution is SERIAL:
         works = [job.work for job, _ in results]
         assert works == sorted(works, reverse=True)
-    assert not list(run_jobs([], square, execution, "nothing"))
     assert caplog.messages[0] == f"study: 19 jobs on {1 + (execution is PAIR)} processes"
-    assert re.fullmatch(r"study: 19 jobs in 0 min \d\d s", caplog.messages[1])
-
-
-def test_lines_tell_how_much_of_the_work_is_done_and_a_terminal_gets_a_bar(monkeypatch, caplog):
-    caplog.set_level(logging.INFO, executors.__name__)
-    clock = count(0.0, 40.0)
-    monkeypatch.setattr(executors, "time", SimpleNamespace(monotonic=lambda: next(clock)))
-    list(run_jobs([Job("a", 3.0), Job("b", 1.0)], lambda job: None, SERIAL, "study"))
-    assert "study: 1 of 2 jobs done, 75 %, about 0 min 26 s left" in caplog.text
-    caplog.clear()
-    monkeypatch.undo()
-    terminal = io.StringIO()
-    terminal.isatty = lambda: True
-    monkeypatch.setattr(sys, "stderr", terminal)
-    monkeypatch.setattr(executors, "_LOG_EVERY_S", 0)
-    list(run_jobs([Job("a", 5.0), Job("b", 7.0)], lambda job: None, SERIAL, "study"))
-    assert "study 100%" in terminal.getvalue()
-    assert " left" not in caplog.text
-
-
-@pytest.mark.parametrize("execution", [SERIAL, PAIR], ids=["serial", "processes"])
-def test_a_failing_job_raises_here(here, execution):
     jobs = [here.Job("good", 2.0), here.Job("bad", 1.0)]
     with pytest.raises(ArithmeticError, match="the loss is nan in epoch 7"):
         list(run_jobs(jobs, here.fails, execution, "failing"))
@@ -283,16 +259,6 @@ def test_a_scheduler_that_is_killed_or_was_never_there_is_an_error(here, tmp_pat
             list(run_jobs(jobs, here.sleeps, on("tcp://127.0.0.1:9"), "cluster"))
     finally:
         executors._LOG_EVERY_S = before
-
-
-def test_what_a_cluster_is_handed_is_small(tmp_path):
-    jobs = [Job("large" * 10**5, 1.0), Job("small", 1.0)]
-    starts = executors._write(jobs, tmp_path / "jobs.pkl")
-    call = executors._call_from_file, square, str(tmp_path / "jobs.pkl"), starts[1]
-    assert len(pickle.dumps(call)) < 1000
-    assert call[0](*call[1:])[2] == 1.0
-    with pytest.raises(InputError, match="--params=execution.folder=FOLDER"):
-        executors._call_from_file(square, "/not/there", 0)
 
 
 if __name__ == "__main__":

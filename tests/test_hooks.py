@@ -8,21 +8,7 @@ from kedro.runner import ParallelRunner, SequentialRunner
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.tracked_runs import TrackedRuns
 from gyro_pipeline.hooks import Provenance
-from gyro_pipeline.session import Session, settings_in_words
-
-
-@pytest.mark.parametrize(
-    ("given", "name"),
-    [
-        ({}, ""),
-        ({"execution": {"workers": 2}, "logs": "here", "reader": {"units": "mdps"}}, ""),
-        ({"only": {"sensor": "dot", "window_s": 10}}, "only.sensor=dot,only.window_s=10"),
-        ({"seeds": [0, 1]}, "seeds=-0-1"),
-        ({"only": {"sensor": "../x"}}, "only.sensor=..-x"),
-    ],
-)
-def test_settings_of_a_command_name_the_folder_of_its_report(given, name):
-    assert settings_in_words(given) == name
+from gyro_pipeline.session import Session
 
 
 @pytest.mark.parametrize(

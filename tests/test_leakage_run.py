@@ -1,7 +1,5 @@
 """``kedro run --pipeline=leakage`` on the smoke environment; no other run has any of it."""
 
-import pandas as pd
-
 FEW = {"strides_s": [10], "folds": 2, "training": {"steps": 4}, "recordings": 4}
 REPORT = "data/08_reporting/simulated_smoke"
 WRITTEN = {
@@ -46,11 +44,3 @@ def test_each_way_of_training_is_one_run_made_once(new_project):
     assert {"/".join(path.split("/")[-2:]) for path in leaks} == WRITTEN
     (results,) = [path for path in project.files() if path.endswith("leakage/results.csv")]
     assert len((project.folder / results).read_text().splitlines()) == 1 + 5
-
-    more = run(study=FEW | {"strides_s": [10, 20]})
-    assert more.code == 0, more.output
-    assert "14 runs planned, 7 skipped (made before)" in more.output
-    assert "memsense: 7 runs evaluated, 7 skipped" in more.output
-    paths = (project.folder / REPORT).rglob("tables/leakage_results.csv")
-    table = pd.read_csv(max(paths, key=lambda path: path.stat().st_mtime))
-    assert table["Window stride s"].tolist() == [10, 20]

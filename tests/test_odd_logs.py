@@ -106,7 +106,6 @@ DEG, TRUSTED = {"units": "deg/s"}, {"trust": "options"}
 BY_NUMBER: dict[str, Any] = DEG | {"columns": [1, 2, 3]}
 RAW: dict[str, Any] = {"units": "raw", "scale_dps": 0.01}
 STAMPS = np.char.mod("%d", 1_700_000_000_000_000_000 + (S * 1e9).astype(int))
-GYROFLOW = "GYROFLOW IMU LOG\nversion,1.3\norientation,YxZ\ntscale,0.001\ngscale,0.00106423\n"
 ARRAYS = ",".join(["dt,scale,samples", *(f"{axis}[{k}]" for axis in "xyz" for k in range(8))])
 SWITCH = 0.01 * np.random.default_rng(0).choice([1, 2], N)
 FLAGS = "temp (degC),sync,hundredths,status"
@@ -168,9 +167,6 @@ def test_each_kind_ends_in_advice_or_with_the_right_bias(path: Path, kind: str) 
         check(path, ending, **options)
 
 
-# -- a recording is of one device, and its values are samples ---------------------------------
-
-
 def test_kind_3_samples_written_ten_times_say_their_true_share(path: Path) -> None:
     text(path, f"{T},{G}", np.arange(60_000) / 1000, np.repeat(still(6000), 10, axis=0))
     check(path, Rejected(r"90(\.0)?%.*repeats: drop"))
@@ -199,15 +195,6 @@ def test_kind_34_a_start_of_some_rows_is_cut(path: Path) -> None:
     judged = inspect(read_log(path, ReaderOptions()), RATE, QUALITY)
     assert np.arange(4500)[judged.start : judged.stop][~judged.masked].min() >= 8
     check(path, Kept((2, 0.03, 0.3), "^(?!.*drift)", within=0.004))
-
-
-# -- a file is a table, or `row:` makes it so -------------------------------------------------
-
-
-# -- time is told by content ------------------------------------------------------------------
-
-
-# -- what is no log, and what stands beside the rates ---------------------------------------------
 
 
 def test_kind_23_files_that_are_no_logs_get_advice(tmp_path: Path) -> None:

@@ -24,71 +24,6 @@ def loaded():
     return load
 
 
-def refusal(parameters):
-    """What a user is told about parameters, before any pipeline is made."""
-    with pytest.raises(InputError) as refused:
-        parse_parameters(parameters)
-    return str(refused.value)
-
-
-def test_the_configuration_of_this_project_is_accepted(loaded):
-    assert parse_parameters(loaded()) == Parameters(**loaded())
-
-
-def of_study(name, **changes):
-    return {"studies": {name: changes}}
-
-
-REFUSED = [
-    ({"epoch": 5}, "epoch:", "unknown key; see conf/base"),
-    (
-        {"sensors": {"dot": {"simulated": {"colour": 1}}}},
-        "sensors.dot.simulated.colour:",
-        "unknown",
-    ),
-    ({"training": {"epochs": 0}}, "training.epochs:", "greater than or equal to 1"),
-    ({"source": "My Files"}, "source:", "match pattern"),
-    ({"only": {"real_gyros": 4}}, "only.real_gyros:", "multiple of 3"),
-    ({"windows_s": []}, "windows_s:", "at least 1 item"),
-    (
-        of_study("input_channels", sensors={"sparkfun": {"virtual_gyros": [12]}}),
-        "studies.input_channels.sensors.sparkfun:",
-        "method 1 has no virtual gyroscopes",
-    ),
-    (
-        of_study("real2real", sensors={"ng": {"real_gyros": [0]}}),
-        "studies.real2real.sensors.ng:",
-        "at least one IMU, 3 gyroscopes",
-    ),
-    (of_study("real2real", experiment="all"), "studies.real2real.experiment:", "'real2real'"),
-    (
-        of_study("estimators", estimators=["mean", "mean"]),
-        "studies.estimators:",
-        "estimators: expected different values, got one of them twice in ['mean', 'mean']",
-    ),
-    (of_study("leakage", strides_s=[1, 1]), "studies.leakage:", "got one of them twice"),
-    (
-        of_study("leakage", also={"leave_one_device_out": ["mean"]}),
-        "studies.leakage:",
-        "also: leave_one_device_out is a study's only protocol",
-    ),
-    (
-        {"sensors": {"ng": {"train_recordings": 100}}},
-        "sensors.ng:",
-        "train_recordings must leave at least one recording for testing",
-    ),
-    ({"training": {"stop_below": 5}}, "training:", "stop_below: 5 leaves no epoch to train"),
-    ({"reader": {"unit": "deg/s"}}, "reader.unit:", "unknown key; expected one of format, "),
-]
-
-
-@pytest.mark.parametrize(("changes", "place", "said"), REFUSED)
-def test_a_bad_parameter_is_refused_by_its_place(loaded, changes, place, said):
-    message = refusal(loaded(**changes))
-    assert place in message
-    assert said in message
-
-
 def numbers(tree, place=()):
     """Places of all numbers in a tree."""
     if isinstance(tree, dict | list):
@@ -117,83 +52,6 @@ def test_every_number_is_a_finite_number_of_its_own_type(loaded):
     Parameters(**given)
 
 
-ASKED = {
-    "unknown sensor": (
-        {"studies": {"real2real": {"sensors": {"bosch": {"method": 2, "real_gyros": [3]}}}}},
-        "real2real",
-        "studies.real2real: unknown sensor 'bosch'",
-    ),
-    "real gyroscopes": (
-        {"sensors": {"dot": {"imus": 1}}},
-        "augmentation",
-        "studies.augmentation.dot: 12 real gyroscopes needed, dot has 3 (imus: 1)",
-    ),
-    "virtual gyroscopes": (
-        {"virtual_gyros": {"imus": 4}},
-        "augmentation",
-        "studies.augmentation.sparkfun: 24 virtual gyroscopes needed, virtual_gyros.imus makes 12",
-    ),
-    "windows": (
-        {"sensors": {"dot": {"recording_s": 20}}},
-        "real2real",
-        "studies.real2real.dot: 30 s windows needed, longer than a recording of dot, 20 s",
-    ),
-    "nothing": (
-        {"only": {"sensor": "ng"}},
-        "augmentation",
-        "only={'sensor': 'ng'} matches nothing in augmentation",
-    ),
-}
-"""Changes of the parameters, the pipeline that they stop, and why."""
-
-
-@pytest.mark.parametrize("name", ASKED)
-def test_what_sensors_cannot_give_stops_the_studies_that_ask_for_it_and_no_other(loaded, name):
-    changes, pipeline, said = ASKED[name]
-    parameters = Parameters(**loaded(**changes))
-    with pytest.raises(InputError) as refused:
-        check_possible(parameters, ["ground_truth", pipeline])
-    assert said in str(refused.value)
-    for other in ("ground_truth", "virtual_gyros"):
-        check_possible(parameters, [other])
-
-
-def test_a_study_without_a_name_is_checked_like_one_with_it(loaded):
-    parameters = Parameters(**loaded(sensors={"dot": {"imus": 1}}))
-    with pytest.raises(InputError, match="12 real gyroscopes"):
-        check_possible(parameters, ["__default__"])
-    check_possible(
-        Parameters(**loaded(sensors={"dot": {"imus": 1}}, only={"sensor": "dot", "real_gyros": 3})),
-        ["real2real"],
-    )
-
-
-@pytest.mark.parametrize(
-    ("entry", "rate_hz"),
-    [
-        ({}, None),
-        ({"rate_hz": 100}, 100),
-        ({"samples": 1000, "recording_s": 20}, 50),
-        ({"samples": 1000}, None),
-    ],
-)
-def test_a_sensor_with_files_may_say_its_rate_or_nothing(loaded, entry, rate_hz):
-    parameters = Parameters(**loaded(sensors={"device": entry}, only={"sensor": "device"}))
-    assert parameters.sensors["device"].rate_hz == rate_hz
-    check_possible(parameters, ["ground_truth"])
-
-
-def test_all_problems_are_told_at_once(loaded):
-    message = refusal(loaded(training={"epochs": 0, "stride": 0}, nonsense=1))
-    for place in ("training.epochs:", "training.stride:", "nonsense:"):
-        assert place in message
-
-
-def test_groups_cannot_be_changed_after_loading(parameters):
-    with pytest.raises(ValueError, match="frozen"):
-        parameters("base").training.epochs = 1
-
-
 def test_a_number_of_steps_decides_the_epochs_of_any_number_of_windows(parameters):
     p = parameters("base")
     settings = p.studies["leakage"].training_of(p.training)
@@ -205,3 +63,49 @@ def test_a_number_of_steps_decides_the_epochs_of_any_number_of_windows(parameter
     assert settings.batch_size == p.training.batch_size  # what the study does not change
     # the last 400 of 1200 epochs could move nothing
     assert (len(p.training.learning_rates(4629)), p.training.epochs) == (800, 1200)
+
+
+def study(name, **changes):
+    return {"studies": {name: changes}}
+
+
+METHOD_1 = {"sparkfun": {"virtual_gyros": [12]}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"epoch": 5}, "epoch: unknown key; see conf/base"),
+        ({"sensors": {"dot": {"simulated": {"colour": 1}}}}, "sensors.dot.simulated.colour: unkn"),
+        ({"training": {"epochs": 0}, "windows_s": []}, "training.epochs: .*windows_s: "),
+        ({"source": "My Files"}, "source: .*match pattern"),
+        ({"only": {"real_gyros": 4}}, "only.real_gyros: .*multiple of 3"),
+        (study("input_channels", sensors=METHOD_1), "method 1 has no virtual gyroscopes"),
+        (study("real2real", experiment="all"), "studies.real2real.experiment: .*'real2real'"),
+        (study("estimators", estimators=["mean", "mean"]), "got one of them twice in .*'mean'"),
+        (study("leakage", strides_s=[1, 1]), "studies.leakage: .*got one of them twice"),
+        (study("leakage", also={"leave_one_device_out": ["mean"]}), "is a study's only protocol"),
+        ({"sensors": {"ng": {"train_recordings": 100}}}, "leave at least one recording for test"),
+        ({"training": {"stop_below": 5}}, "training: stop_below: 5 leaves no epoch to train"),
+        ({"reader": {"unit": "deg/s"}}, "reader.unit: unknown key; expected one of format, "),
+    ],
+)
+def test_bad_parameters_are_refused_by_their_places_all_at_once(loaded, changes, said):
+    with pytest.raises(InputError, match=f"(?s){said}"):
+        parse_parameters(loaded(**changes))
+
+
+def test_what_sensors_cannot_give_stops_the_studies_that_ask_for_it_and_no_other(loaded):
+    bosch = {"bosch": {"method": 2, "real_gyros": [3]}}
+    for changes, pipeline, said in (
+        (study("real2real", sensors=bosch), "real2real", "real2real: unknown sensor 'bosch'"),
+        ({"sensors": {"dot": {"imus": 1}}}, "__default__", r"dot: 12 real .* 3 \(imus: 1\)"),
+        ({"virtual_gyros": {"imus": 4}}, "augmentation", "24 virtual .* needed, .* makes 12"),
+        ({"sensors": {"dot": {"recording_s": 20}}}, "real2real", "30 s windows needed.*, 20 s"),
+        ({"only": {"sensor": "ng"}}, "augmentation", "'ng'} matches nothing in augmentation"),
+    ):
+        parameters = Parameters(**loaded(**changes))
+        with pytest.raises(InputError, match=said):
+            check_possible(parameters, ["ground_truth", pipeline])
+        for other in ("ground_truth", "virtual_gyros"):
+            check_possible(parameters, [other])

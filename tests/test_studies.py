@@ -3,7 +3,6 @@
 from dataclasses import replace
 from itertools import product
 
-import pandas as pd
 import pytest
 
 from gyro_pipeline.conventions import InputError
@@ -11,12 +10,10 @@ from gyro_pipeline.estimators import ESTIMATORS, estimator_class
 from gyro_pipeline.parameters import Only
 from gyro_pipeline.studies import (
     CNN,
-    LEFT_OUT,
     MEAN,
     RESIDUAL_NETWORK,
     RunSpec,
     check_possible,
-    possible_runs,
     run_params,
     run_spec,
     run_specs,
@@ -44,18 +41,65 @@ def runs_of(p, study, **only):
     return run_specs(rows_of(p, study, **only), p.studies[study].unseen_devices)
 
 
-def places(runs, estimator):
-    """Sensor, real and virtual gyroscopes and window of an estimator's runs, sorted."""
-    return sorted(
-        (run.sensor, run.real_gyros, run.virtual_gyros, run.window_s)
-        for run in runs
-        if run.estimator == estimator
-    )
-
-
 ROW = RunSpec(
     "augmentation", "dot", "simulated", "by_recording", CNN, 2, 12, 24, 10.0, 10.0, seed=3
 )
+
+
+def places(runs, estimator):
+    """Sensor, real and virtual gyroscopes and window of an estimator's runs, sorted."""
+    names = ("sensor", "real_gyros", "virtual_gyros", "window_s")
+    found = [run for run in runs if run.estimator == estimator]
+    return sorted(tuple(getattr(run, name) for name in names) for run in found)
+
+
+def test_a_row_is_reduced_to_what_its_estimator_uses():
+    for estimator, known, unseen in (
+        ("median", (2, 0, 0, 0), (2, 0, 0, 0)),
+        ("best_linear", (2, 3, 0, 0), (2, 12, 0, 0)),
+        ("empirical_bayes_pooled", (2, 12, 0, 0), (2, 12, 0, 0)),
+        (CNN, (2, 12, 24, 3), (2, 12, 24, 3)),
+    ):
+        row = replace(ROW, estimator=estimator)
+        for unseen_devices, expected in ((False, known), (True, unseen)):
+            run = run_spec(row, unseen_devices)
+            assert (run.method, run.real_gyros, run.virtual_gyros, run.seed) == expected
+            same = {"method": 0, "real_gyros": 0, "virtual_gyros": 0, "seed": 0}
+            assert replace(run, **same) == replace(row, **same)
+    row = replace(ROW, method=1, virtual_gyros=0)  # one IMU is the same in both methods
+    methods = [run_spec(replace(row, real_gyros=count), False).method for count in (3, 6)]
+    assert methods == [2, 1]
+
+
+@pytest.mark.parametrize(
+    ("only", "networks", "means"),
+    [
+        ({"real_gyros": 3}, 12, 4),
+        ({"sensor": "dot", "window_s": 10, "real_gyros": 12, "seed": 0}, 3, 1),
+        ({"sensor": "ng"}, 0, 0),
+    ],
+)
+def test_only_narrows_and_a_running_mean_stays_wherever_another_estimator_does(
+    base, parameters, only, networks, means
+):
+    whole, rows = rows_of(base, "augmentation"), rows_of(base, "augmentation", **only)
+    assert set(rows) <= set(whole)
+    asked = [row for row in rows if row.estimator == CNN]
+    assert len(asked) == networks
+    # a residual network, a constant and the best linear estimator are beside each
+    others = [row for row in rows if row.estimator not in (CNN, MEAN)]
+    assert len(others) == 3 * networks
+    assert len(rows) == 4 * networks + means
+    for name, value in only.items():
+        assert {getattr(row, name) for row in asked} <= {value}
+    used = used_sensors(parameters("base", only=only))["augmentation"]
+    assert set(used) == {row.sensor for row in rows}
+
+
+def test_networks_are_refused_on_devices_that_they_cannot_have_seen(parameters):
+    study = {"unseen_devices": {"estimators": ["mean", "lstm units=4"]}}
+    with pytest.raises(InputError, match="unseen_devices.*: lstm units=4 cannot be judged on uns"):
+        check_possible(parameters("base", studies=study), ["unseen_devices"])
 
 
 # the grids
@@ -118,72 +162,7 @@ def test_the_leak_study_has_every_way_of_training_at_every_stride(base):
 # what a run depends on
 
 
-@pytest.mark.parametrize(
-    ("estimator", "known", "unseen"),
-    [
-        ("median", (2, 0, 0, 0), (2, 0, 0, 0)),
-        ("best_linear", (2, 3, 0, 0), (2, 12, 0, 0)),
-        ("empirical_bayes_pooled", (2, 12, 0, 0), (2, 12, 0, 0)),
-        (CNN, (2, 12, 24, 3), (2, 12, 24, 3)),
-    ],
-)
-def test_a_row_is_reduced_to_what_its_estimator_uses(estimator, known, unseen):
-    row = replace(ROW, estimator=estimator)
-    for unseen_devices, expected in ((False, known), (True, unseen)):
-        run = run_spec(row, unseen_devices)
-        assert (run.method, run.real_gyros, run.virtual_gyros, run.seed) == expected
-        same = {"method": 0, "real_gyros": 0, "virtual_gyros": 0, "seed": 0}
-        assert replace(run, **same) == replace(row, **same)
-
-
-def test_one_imu_is_the_same_in_both_methods_and_two_are_not():
-    row = replace(ROW, method=1, virtual_gyros=0)
-    assert run_spec(replace(row, real_gyros=3), False).method == 2
-    assert run_spec(replace(row, real_gyros=6), False).method == 1
-    assert (row.real_imus, ROW.virtual_imus) == (4, 8)
-
-
-def test_a_plan_gives_its_runs_back_without_those_that_are_left_out():
-    other = replace(ROW, seed=4)
-    rows = [vars(row) | {"fingerprint": f"f{row.seed}"} for row in (ROW, other)]
-    for nothing in ("", None):  # as it is possible_runs, and as a file gives it back
-        plan = pd.DataFrame(rows).assign(**{LEFT_OUT: [nothing, "too few recordings"]})
-        assert possible_runs(plan) == {"f3": ROW}
-
-
 # only
-
-
-@pytest.mark.parametrize(
-    ("only", "networks", "means"),
-    [
-        ({"sensor": "dot"}, 12, 2),
-        ({"real_gyros": 3}, 12, 4),
-        ({"sensor": "dot", "window_s": 10, "real_gyros": 12, "seed": 0}, 3, 1),
-        ({"sensor": "ng"}, 0, 0),
-    ],
-)
-def test_only_narrows_and_a_running_mean_stays_wherever_another_estimator_does(
-    base, only, networks, means
-):
-    whole, rows = rows_of(base, "augmentation"), rows_of(base, "augmentation", **only)
-    assert set(rows) <= set(whole)
-    asked = [row for row in rows if row.estimator == CNN]
-    assert len(asked) == networks
-    # a residual network, a constant and the best linear estimator are beside each
-    others = [row for row in rows if row.estimator not in (CNN, MEAN)]
-    assert len(others) == 3 * networks
-    assert len(rows) == 4 * networks + means
-    for name, value in only.items():
-        assert {getattr(row, name) for row in asked} <= {value}
-
-
-def test_used_sensors_are_those_with_rows_left(base, parameters):
-    assert used_sensors(base)["augmentation"] == ["sparkfun", "dot"]
-    narrowed = used_sensors(parameters("base", only={"sensor": "dot", "real_gyros": 6}))
-    assert {study: sensors for study, sensors in narrowed.items() if sensors} == {
-        "real2real": ["dot"]
-    }
 
 
 # run parameters
@@ -203,12 +182,6 @@ def test_a_run_carries_its_identity_and_the_settings_that_it_depends_on(base):
     leak = params_of(replace(ROW, virtual_gyros=0), "leakage")
     assert (leak["steps"], leak["channels"], leak["window_stride_s"]) == (3000, 16, 10.0)
     assert leak.items() >= {"study": "augmentation", "seed": 3, "real_gyros": 12}.items()
-
-
-def test_networks_are_refused_on_devices_that_they_cannot_have_seen(parameters):
-    study = {"unseen_devices": {"estimators": ["mean", "lstm units=4"]}}
-    with pytest.raises(InputError, match="unseen_devices.*: lstm units=4 cannot be judged on uns"):
-        check_possible(parameters("base", studies=study), ["unseen_devices"])
 
 
 def test_a_sweep_is_a_run_for_every_combination_named_by_what_differs(parameters):

@@ -4,6 +4,7 @@ import logging
 import os
 import pickle
 import signal
+import sys
 import threading
 import time
 from collections import deque
@@ -99,7 +100,8 @@ def _with_progress(
     started = logged = time.monotonic()
     done = count = 0.0
     form = "{desc} {percentage:3.0f}%|{bar}| {elapsed}, {remaining} left"
-    with tqdm(total=sum(works), desc=label, bar_format=form, disable=None) as bar:
+    hidden = None if sys.stderr else True  # None: unless it is a terminal
+    with tqdm(total=sum(works), desc=label, bar_format=form, disable=hidden) as bar:
         for count, (number, result) in enumerate(results, start=1):
             done += works[number]
             bar.update(works[number])

@@ -2,10 +2,6 @@
 
 import json
 import os
-import pty
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
@@ -30,7 +26,6 @@ def text(samples, header="time (s),gyro_x (deg/s),gyro_y (deg/s),gyro_z (deg/s)"
 @pytest.fixture(autouse=True)
 def registry(tmp_path, monkeypatch):
     monkeypatch.setenv("GYRO_CALIBRATE_REGISTRY", str(tmp_path / "registry"))
-    return tmp_path / "registry"
 
 
 @pytest.fixture
@@ -61,25 +56,22 @@ def test_a_log_needs_no_configuration(csv):
         assert float(row.split()[1]) == pytest.approx(bias, abs=5e-3)
 
 
-def test_ten_logs_make_a_history_that_the_next_one_uses(csv):
+@pytest.mark.slow
+def test_six_logs_make_a_history_that_the_next_one_uses_but_not_the_same_one(csv):
     about = ("--device", "B17", "--type", "memsense", "--same-heading")
-    for seed in range(10):
-        assert run("log", csv(rates(20, seed), f"{seed}.csv"), *about).exit_code == 0
+    paths = [csv(rates(20, seed), f"{seed}.csv") for seed in range(6)]
+    assert run("log", *paths, *about).exit_code == 0
     alone, _ = said("log", csv(rates(5, 99)), "--type", "memsense")
     with_history, _ = said("log", csv(rates(5, 99)), *about, "--no-store")
     assert with_history["history"] == ["used"] * 3
     for now, before in zip(with_history["sigma_dps"], alone["sigma_dps"], strict=True):
-        assert now < 0.6 * before
+        assert now < 0.7 * before
     assert "B17" in run("devices", "list").stdout
     shown = run("devices", "show", "B17").stdout
-    assert "9.csv" in shown
+    assert "5.csv" in shown
     assert "tau" in shown
-
-
-def test_the_same_log_is_stored_once_and_does_not_count_for_itself(csv):
-    path = csv(rates(20))
-    run("log", path, "--device", "B17", "--type", "memsense")
-    again, result = said("log", path, "--device", "B17")
+    run("log", paths[0], "--device", "B18", "--type", "memsense")
+    again, result = said("log", paths[0], "--device", "B18")
     assert again["history"] == ["none"] * 3
     assert "stored already" in result.stderr
 
@@ -101,14 +93,6 @@ def test_exit_codes_of_a_log(csv, arguments, code, words):
     assert (result.exit_code, words in result.stderr) == (code, True)
 
 
-def test_the_highest_code_of_several_files_counts(csv, tmp_path):
-    moving = csv(rates(20) + 20 * np.sin(np.arange(2000) / 30)[:, None], "moving.csv")
-    result = run("log", csv(rates(20)), moving, "--type", "memsense", "--device", "B17")
-    assert result.exit_code == 4
-    lines = (tmp_path / "registry/B17/calibrations.jsonl").read_text().splitlines()
-    assert [json.loads(line)["rest"] for line in lines] == ["still", "moving"]
-
-
 def test_what_is_lacking_is_named_as_an_option(tmp_path):
     np.save(tmp_path / "still.npy", rates(20))
     result = run("log", tmp_path / "still.npy")
@@ -120,10 +104,10 @@ def test_what_is_lacking_is_named_as_an_option(tmp_path):
 
 def test_a_registry_that_cannot_be_written_is_said_before_measuring(csv, tmp_path):
     (tmp_path / "file").write_text("")
-    where = ("--registry", tmp_path / "file")
-    result = run("log", csv(rates(20)), "--device", "B17", *where)
+    about = ("log", csv(rates(20)), "--device", "B17", "--registry", tmp_path / "file")
+    result = run(*about)
     assert (result.exit_code, result.stdout) == (7, "")
-    assert run("log", csv(rates(20)), "--device", "B17", *where, "--no-store").exit_code == 0
+    assert run(*about, "--no-store").exit_code == 0
 
 
 def test_plan_says_how_long_or_that_it_is_not_possible():
@@ -133,13 +117,6 @@ def test_plan_says_how_long_or_that_it_is_not_possible():
     result = run("plan", "--target", "1", "--type", "dot")
     assert (result.exit_code, "not with this sensor: its floor is" in result.stdout) == (3, True)
     assert "give --type" in run("plan", "--target", "1").stderr
-
-
-def test_a_picture(csv, tmp_path):
-    pytest.importorskip("matplotlib")
-    picture = tmp_path / "a.png"
-    assert run("log", csv(rates(10)), "--type", "memsense", "--plot", picture).exit_code == 0
-    assert picture.stat().st_size > 10_000
 
 
 def test_a_bias_that_was_typed_in_stays_until_it_is_forgotten(csv):
@@ -155,17 +132,18 @@ def test_a_bias_that_was_typed_in_stays_until_it_is_forgotten(csv):
     assert answer["history"] == ["used"] * 3
 
 
-def test_attempts_are_counted_until_one_does(csv, tmp_path):
+def test_attempts_are_counted_until_one_does_and_the_highest_code_counts(csv, tmp_path):
     moving = csv(rates(20) + 20 * np.sin(np.arange(2000) / 30)[:, None], "moving.csv")
-    run("log", moving, "--device", "B17")
     once, _ = said("log", csv(rates(20)), "--no-store")
-    again, _ = said("log", csv(rates(20)), "--device", "B17")
-    assert "attempt" in {reason["code"] for reason in again["reasons"]}
-    assert again["sigma_dps"][0] > 1.1 * once["sigma_dps"][0]  # Bonferroni's limit of two
+    assert run("log", moving, csv(rates(20)), "--device", "B17").exit_code == 4
     lines = (tmp_path / "registry/B17/calibrations.jsonl").read_text().splitlines()
-    assert [json.loads(line)["attempt"] for line in lines] == [1, 2]
+    stored = [json.loads(line) for line in lines]
+    assert [(one["rest"], one["attempt"]) for one in stored] == [("moving", 1), ("still", 2)]
+    again, _ = said("log", csv(rates(20)), "--device", "B17", "--no-store")
     third, _ = said("log", csv(rates(20, 3)), "--device", "B17", "--no-store")
-    assert "attempt" not in {reason["code"] for reason in third["reasons"]}
+    attempted = ["attempt" in {reason["code"] for reason in r["reasons"]} for r in (again, third)]
+    assert attempted == [True, False]
+    assert again["sigma_dps"][0] > 1.1 * once["sigma_dps"][0]  # Bonferroni's limit of two
 
 
 def test_notes_and_withdrawals_are_appended(csv, tmp_path):
@@ -180,67 +158,51 @@ def test_notes_and_withdrawals_are_appended(csv, tmp_path):
     assert run("devices", "show", "B17").exit_code == 2
 
 
-COMMAND = [sys.executable, "-m", "gyro_pipeline.calibrator.cli", "stream", "--type", "memsense"]
-
-
-def streamed(*arguments, send=None, close=True):
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    process = subprocess.Popen([*COMMAND, *arguments], env=environment, text=True, **pipes)
-    if close:
-        return *process.communicate(send, timeout=60), process.returncode
-    process.stdin.write(send)
-    process.stdin.flush()
-    process.wait(timeout=60)
-    return process.stdout.read(), process.stderr.read(), process.returncode
+def streamed(*arguments, send, close=True):
+    """What is sent through a pipe, whose other end then closes or stays open."""
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)  # all of it has to fit into the pipe
+    with os.fdopen(reading, "rb") as source, os.fdopen(writing, "wb", 0) as sink:
+        assert sink.write(send.encode()) == len(send)
+        if close:
+            sink.close()
+        return run("stream", "--type", "memsense", *arguments, input=source)
 
 
 def test_a_stream_ends_when_the_target_is_reached():
-    out, _, code = streamed("--target", "2", "--json", send=text(rates(60)))
-    first, *_, last = map(json.loads, out.splitlines())
-    assert code == 0
+    done = streamed("--target", "2", "--json", send=text(rates(11)))
+    first, *_, last = map(json.loads, done.stdout.splitlines())
+    assert done.exit_code == 0
     assert (first["bias_dps"], first["seconds_left"]) == ([None] * 3, [7.0, 6.0, 9.5])
     assert 8 <= last["seconds_at_rest"] <= 10  # 6.0^2 / 2^2 = 9 s
 
 
 def test_a_stream_of_json_lines_with_rows_that_are_none():
     names = ("t (s)", "gyro_x (deg/s)", "gyro_y (deg/s)", "gyro_z (deg/s)")
-    rows = [dict(zip(names, [n / RATE, *row], strict=True)) for n, row in enumerate(rates(20))]
-    rows[700][names[1]] = None
+    values = rates(5).round(3)
+    rows = [dict(zip(names, [n / RATE, *row], strict=True)) for n, row in enumerate(values)]
+    rows[400][names[1]] = None
     lines = [json.dumps(row) for row in rows]
-    lines[500] = lines[500][:10]
-    out, err, code = streamed("--json", send="\n".join(lines))
-    assert code == 0
-    assert "1 lines were of another shape" in err
-    reasons = {reason["code"] for reason in json.loads(out.splitlines()[-1])["reasons"]}
+    lines[300] = lines[300][:10]
+    done = streamed("--json", send="\n".join(lines))
+    assert done.exit_code == 0
+    assert "1 lines were of another shape" in done.stderr
+    reasons = {reason["code"] for reason in json.loads(done.stdout.splitlines()[-1])["reasons"]}
     assert "not_finite" in reasons
 
 
-def test_a_sensor_that_stops_sending_is_said():
-    out, err, code = streamed(
-        "--target", "0.1", "--timeout", "0.5", send=text(rates(5)), close=False
-    )
-    assert (code, "nothing came for 0.5 s" in err) == (3, True)
-    assert "needs" in out
-
-
-def test_a_stream_without_a_rate_names_what_is_lacking():
+def test_a_sensor_that_stops_sending_or_sends_no_times_is_said():
+    stopped = ("--target", "1", "--timeout", "0.1")
+    done = streamed(*stopped, send=text(rates(5)), close=False)
+    assert (done.exit_code, "nothing came for 0.1 s" in done.stderr) == (3, True)
+    assert "needs" in done.stdout
     header = "gyro_x (deg/s),gyro_y (deg/s),gyro_z (deg/s)"
     rows = "\n".join([header, *(["0.1,0.2,0.3"] * 30)])
-    assert "give --rate" in streamed(send=rows)[1]
+    assert "give --rate" in streamed(send=rows).stderr
 
 
-def test_a_serial_port():
-    pytest.importorskip("serial")
-    leader, follower = pty.openpty()
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    port = ["--port", os.ttyname(follower), "--target", "4", "--json"]
-    process = subprocess.Popen(
-        [*COMMAND, *port], env=environment, stdout=subprocess.PIPE, text=True
-    )
-    time.sleep(1.5)
-    for row in text(rates(10)).splitlines():
-        os.write(leader, row.encode() + b"\n")
-    out, _ = process.communicate(timeout=60)
-    assert process.returncode == 0
-    assert json.loads(out.splitlines()[-1])["rest"] == "still"
+def test_a_picture(csv, tmp_path):
+    pytest.importorskip("matplotlib")
+    picture = tmp_path / "a.png"
+    assert run("log", csv(rates(10)), "--type", "memsense", "--plot", picture).exit_code == 0
+    assert picture.stat().st_size > 10_000

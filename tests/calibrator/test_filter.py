@@ -8,7 +8,6 @@ from gyro_pipeline.physics.recording_model import noise_covariances, profiles
 
 RATE, BLOCK = 100, 50
 BLOCK_S = BLOCK / RATE
-SECONDS = (1, 10, 30)
 WORLDS = {  # N, B, K in mdps and s; warm-up's mean, spread, time constant
     "white": (3.3, 0, 0, None),
     "flicker": (3.3, 3, 0, None),
@@ -65,7 +64,7 @@ def best(world, seconds):
 
 
 @pytest.mark.parametrize("world", WORLDS)
-@pytest.mark.parametrize("seconds", SECONDS)
+@pytest.mark.parametrize("seconds", [1, 10, 30])
 def test_the_filter_is_the_best_linear_estimate(world, seconds):
     """RMSE under the exact model at most 0.5 % above the least, sigma within 0.5 %."""
     blocks = round(seconds / BLOCK_S)
@@ -77,21 +76,6 @@ def test_the_filter_is_the_best_linear_estimate(world, seconds):
     squares = weights @ covariance @ weights - 2 * weights @ now + walk_s
     assert np.sqrt(squares / variance) <= 1.005
     np.testing.assert_allclose(np.sqrt(last.variance / squares), 1, atol=5e-3)
-
-
-def test_innovations_are_white_and_of_unit_variance():
-    rng = np.random.default_rng(2)
-    covariance, _, _ = exact("all", 10)
-    root = np.linalg.cholesky(covariance)
-    noise, innovations = noise_of(*WORLDS["all"][:3], None), []
-    for _ in range(200):
-        filter_ = Filter.start(noise, BLOCK_S)
-        for mean in root @ rng.standard_normal((20, 3)):
-            filter_, innovation = filter_.update(mean)
-            innovations.append(innovation)
-    innovations = np.reshape(innovations, (200, 20, 3))[:, 1:]
-    assert innovations.var() == pytest.approx(1, abs=0.03)
-    assert np.mean(innovations[:, 1:] * innovations[:, :-1]) == pytest.approx(0, abs=0.03)
 
 
 def test_a_gap_lets_the_flicker_be_forgotten():

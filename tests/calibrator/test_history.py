@@ -26,21 +26,18 @@ def past(*means, variance=1e-6, **more):
     return [Calibration((m * 1e-3,) * 3, (variance,) * 3, **more) for m in means]
 
 
-def test_one_calibration_adds_tau_twice_and_its_own_variance():
+def test_one_calibration_adds_tau_twice_and_many_are_weighted_by_their_variances():
+    """tau 1 mdps; variances 0 and 3 mdps^2: weights 1 and 1/4 about an unknown level."""
     prior = prior_of(past(5.0), kind(), DECLARED)
     np.testing.assert_allclose(prior.mean, 5e-3)
     np.testing.assert_allclose(prior.narrow, 1e-6 * (1 + 1 + 1), rtol=1e-4)
-
-
-def test_many_are_weighted_by_their_variances():
-    """tau 1 mdps; variances 0 and 3 mdps^2: weights 1 and 1/4 about an unknown level."""
     two = past(0.0, variance=1e-14) + past(5.0, variance=3e-6)
     prior = prior_of(two, kind(), DECLARED)
     np.testing.assert_allclose(prior.mean, 1e-3, rtol=1e-3)
     np.testing.assert_allclose(prior.narrow, 1e-6 * (1 + 1 / 1.25), rtol=1e-3)
 
 
-def test_a_walk_follows_the_latest_and_grows_with_age():
+def test_a_walk_follows_the_latest_and_grows_with_age_of_a_day_where_it_is_not_known():
     kinds = kind(turn_on_mdps=0.001, walk_mdps_per_rtday=1.0)
     made = [
         past(level, variance=1e-14, time=day * 86400.0)[0] for day, level in enumerate((0, 3, 9))
@@ -50,10 +47,6 @@ def test_a_walk_follows_the_latest_and_grows_with_age():
         prior = prior_of(made, kinds, now)
         np.testing.assert_allclose(prior.mean, 9e-3, rtol=1e-3)
         np.testing.assert_allclose(prior.narrow, age * 1e-6, rtol=1e-2)
-
-
-def test_a_calibration_of_unknown_age_is_a_day_old():
-    kinds = kind(turn_on_mdps=0.001, walk_mdps_per_rtday=1.0)
     prior = prior_of(past(0.0, variance=1e-14), kinds, DECLARED)
     np.testing.assert_allclose(prior.narrow, 1e-6, rtol=1e-2)
 

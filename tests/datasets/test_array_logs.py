@@ -42,13 +42,6 @@ def refusal(logs):
     return str(caught.value.__cause__)
 
 
-@pytest.mark.parametrize("order", list(permutations(LAYOUT)))
-def test_any_axis_order_gives_the_same_recordings(tmp_path, order):
-    array = made(5, 6, 200)
-    np.save(tmp_path / "all.npy", array.transpose([LAYOUT.index(name) for name in order]))
-    check(array_logs(tmp_path), array)
-
-
 def test_a_recording_says_where_it_is_and_can_be_read_by_another_process(tmp_path):
     array = np.asfortranarray(np.arange(5 * 6 * 200, dtype=np.int16).reshape(5, 6, 200))
     np.save(tmp_path / "all.npy", array)
@@ -80,6 +73,10 @@ def test_train_and_test_are_numbered_on_and_an_imu_may_lack_recordings(tmp_path)
 
 
 def test_an_ambiguous_shape_is_settled_by_the_other_file_or_axes_order(tmp_path):
+    array = made(5, 6, 200)
+    for order in permutations(LAYOUT):  # any gives the same recordings
+        np.save(tmp_path / "all.npy", array.transpose([LAYOUT.index(name) for name in order]))
+        check(array_logs(tmp_path), array)
     np.save(tmp_path / "train.npy", train := made(9, 6, 200))
     message = refusal(array_logs(tmp_path, {"all": "train.npy"}))
     assert message.startswith("memsense train.npy of shape (9, 6, 200): axes_order in the catalog")
@@ -90,34 +87,22 @@ def test_an_ambiguous_shape_is_settled_by_the_other_file_or_axes_order(tmp_path)
     check(array_logs(tmp_path, TRAIN_TEST), train, test)
     np.save(tmp_path / "all.npy", unusual := made(50, 3, 60))
     check(array_logs(tmp_path, axes_order=LAYOUT), unusual)
+    assert refusal(array_logs(tmp_path)).endswith("they can be none")
+    np.save(tmp_path / "all.npy", made(5, 3, 200))
+    message = refusal(array_logs(tmp_path, axes_order=["sample", "gyroscope", "recording"]))
+    assert message.endswith("they can be [recording, gyroscope, sample]")
 
 
-@pytest.mark.parametrize(
-    ("shape", "order", "shown"),
-    [
-        ((50, 3, 60), None, "none"),
-        ((5, 3, 200), ["sample", "gyroscope", "recording"], "[recording, gyroscope, sample]"),
-    ],
-)
-def test_an_order_that_the_shape_contradicts_is_refused(tmp_path, shape, order, shown):
-    np.save(tmp_path / "all.npy", made(*shape))
-    message = refusal(array_logs(tmp_path, axes_order=order))
-    assert (
-        "axes_order in the catalog entry in catalog.yml: expected [recording, gyroscope" in message
-    )
-    assert message.endswith(f"they can be {shown}")
-
-
-@pytest.mark.parametrize(
-    ("shape", "dtype"),
-    [((5, 3, 200), "complex64"), ((5, 3, 200), "U3"), ((2, 600), "f8"), ((0, 3, 200), "f8")],
-)
+@pytest.mark.parametrize(("shape", "dtype"), [((5, 3, 200), "complex64"), ((2, 600), "f8")])
 def test_what_is_no_array_of_rates_is_refused(tmp_path, shape, dtype):
     np.save(tmp_path / "all.npy", np.zeros(shape, dtype))
-    assert refusal(array_logs(tmp_path)) == (
-        "memsense all.npy: expected real numbers in deg/s along 3 axes (recordings, gyroscopes, "
-        f"samples in any order), got {np.dtype(dtype)} of shape {shape}"
-    )
+    message = refusal(array_logs(tmp_path))
+    assert "expected real numbers in deg/s along 3 axes" in message
+    assert f"got {np.dtype(dtype)} of shape {shape}" in message
+    with pytest.raises(InputError, match="unknown sensor 'memsens'; expected one of memsense"):
+        array_logs(tmp_path, sensor="memsens")
+    with pytest.raises(InputError, match="expected train and test, two different files"):
+        array_logs(tmp_path, {"train": "a.npy", "test": "a.npy"})
 
 
 def test_damaged_files_and_pickles_are_refused_by_name_and_nothing_is_unpickled(tmp_path):
@@ -133,20 +118,6 @@ def test_damaged_files_and_pickles_are_refused_by_name_and_nothing_is_unpickled(
         assert message.startswith("memsense all.npy: expected a plain numeric .npy file")
         assert message.endswith(f"which are never loaded; replace or delete {file}")
     assert not (tmp_path / "sprung").exists()
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ({"sensor": "memsens"}, "unknown sensor 'memsens'; expected one of memsense"),
-        ({"files": {"train": "a.npy"}}, "expected train and test, two different files"),
-        ({"files": {"train": "a.npy", "test": "a.npy"}}, "two different files"),
-    ],
-)
-def test_a_wrong_entry_is_refused_before_anything_is_read(tmp_path, options, said):
-    with pytest.raises(InputError) as caught:
-        array_logs(tmp_path, **options)
-    assert said in str(caught.value)
 
 
 def test_the_real_memsense_file_gives_the_known_running_mean():

@@ -42,25 +42,17 @@ def recordings(source):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        (
-            {"imus": None, "simulated": None},
-            ["dot has no files", "dot.raw_logs.files", "catalog.yml", "globals.yml: imus, simula"],
-        ),
-        ({"rate_hz": 90}, ["rate_hz is 90, samples / recording_s 100; correct one"]),
-        *(
-            ({"model": {"warm_up": WARM_UP | {"time_constant_s": constants}}}, ["time_constant_s"])
-            for constants in (0, [2, 1])
-        ),
+        ({"imus": None, "simulated": None}, "dot has no files: .*globals.yml: imus, s"),
+        ({"rate_hz": 90}, "rate_hz is 90, samples / recording_s 100; correct one"),
+        ({"model": {"warm_up": WARM_UP | {"time_constant_s": [2, 1]}}}, "time_constant_s"),
     ],
 )
 def test_what_it_takes_to_simulate_a_sensor_is_named(tmp_path, changes, words):
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(InputError, match=words):
         simulated(tmp_path, **changes)
-    for word in words:
-        assert word in str(refused.value)
 
 
-def test_files_have_the_published_layout_and_give_what_was_read(tmp_path):
+def test_files_have_the_published_layout_and_changed_ones_are_refused(tmp_path):
     logs = simulated(tmp_path).load()
     assert set(os.listdir(tmp_path)) == {
         *("dot_train.npy", "dot_test.npy", "dot_truth.nc", "dot_truth.nc.made.json")
@@ -68,6 +60,7 @@ def test_files_have_the_published_layout_and_give_what_was_read(tmp_path):
     train, test = np.load(tmp_path / "dot_train.npy"), np.load(tmp_path / "dot_test.npy")
     assert (train.shape, test.shape) == ((30, 6, 400), (10, 6, 400))
     assert train.dtype == test.dtype == np.float32
+    assert not (train[:10] == test).any()
     rate = recordings(simulated(tmp_path)).angular_rate
     np.testing.assert_array_equal(rate.sel(imu=2, recording=30, axis="x"), train[29, 3])
     np.testing.assert_array_equal(rate.sel(imu=2, recording=31, axis="z"), test[0, 5])
@@ -75,6 +68,52 @@ def test_files_have_the_published_layout_and_give_what_was_read(tmp_path):
     assert (logs.simulated, logs.source, logs.rate_hz) == (True, "simulated", 100)
     with pytest.raises(DatasetError, match="read only"):
         simulated(tmp_path).save(Logs("dot", "simulated", True, 100, []))
+    np.save(tmp_path / "dot_test.npy", test + np.float32(0.001))
+    with pytest.raises(DatasetError, match="changed since it was written"):
+        simulated(tmp_path).load()
+
+
+@pytest.mark.slow
+def test_a_seed_gives_the_samples_that_it_always_gave_and_colour_reaches_them(tmp_path):
+    for colour, digests in (
+        ({}, ["eec5e2778ced583b", "56e521b8166a3850"]),
+        (
+            {"flicker_mdps": 3, "lag1_correlation": -0.15},
+            ["3eead9cee4acff9f", "49168560a86be389"],
+        ),
+    ):
+        simulated(tmp_path, model=colour, recordings=3, train_recordings=2, samples=50).load()
+        arrays = np.load(tmp_path / "dot_train.npy")[0], np.load(tmp_path / "dot_test.npy")
+        found = [hashlib.sha256(array.tobytes()).hexdigest()[:16] for array in arrays]
+        assert found == digests
+    correlated = recordings(simulated(tmp_path / "a", model={"lag1_correlation": -0.3}))
+    noise = (correlated.angular_rate - correlated.true_bias).values
+    lag1 = (noise[..., 1:] * noise[..., :-1]).mean() / (noise**2).mean()
+    assert lag1 == pytest.approx(-0.3, abs=0.02)
+
+
+@pytest.mark.slow
+def test_the_seed_and_the_settings_decide_the_draws_and_a_second_load_only_reads(tmp_path, caplog):
+    caplog.set_level(logging.INFO, "gyro_pipeline")
+
+    def stamps():
+        files = (tmp_path / "a").iterdir()
+        return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in files}
+
+    first = recordings(simulated(tmp_path / "a"))
+    before = stamps()
+    for folder in ("a", "b"):
+        xr.testing.assert_identical(recordings(simulated(tmp_path / folder)), first)
+    assert stamps() == before
+    other_sensor = simulated(tmp_path / "d", sensor="ng").load()
+    assert (other_sensor.truth.true_unit_bias != first.true_unit_bias).all()
+    for changes in ({"seed": 2}, {"seed": 2, "recording_s": 8}):
+        caplog.clear()
+        new = recordings(simulated(tmp_path / "a", **changes))
+        assert "since their settings have changed" in caplog.text
+        fresh = recordings(simulated(tmp_path / f"fresh {len(changes)}", **changes))
+        xr.testing.assert_identical(new, fresh)
+        assert not (new.angular_rate == first.angular_rate).any()
 
 
 def test_samples_are_drawn_biases_plus_noise_of_the_stated_model(tmp_path):
@@ -94,34 +133,6 @@ def test_samples_are_drawn_biases_plus_noise_of_the_stated_model(tmp_path):
     # 80 means an axis: their root mean square is N / sqrt(T) to about 8 %
     means = np.sqrt((noise.mean("sample") ** 2).mean(("imu", "recording")))
     np.testing.assert_allclose(means, logs.true_noise / np.sqrt(4), rtol=0.35)
-
-
-def test_colour_reaches_the_noise(tmp_path):
-    correlated = recordings(simulated(tmp_path / "a", model={"lag1_correlation": -0.3}))
-    noise = (correlated.angular_rate - correlated.true_bias).values
-    lag1 = (noise[..., 1:] * noise[..., :-1]).mean() / (noise**2).mean()
-    assert lag1 == pytest.approx(-0.3, abs=0.02)
-    flicker = recordings(simulated(tmp_path / "b", model={"flicker_mdps": 100}))
-    means = (flicker.angular_rate - flicker.true_bias).mean("sample")
-    assert float(means.std()) > 0.02  # white noise alone gives 0.004
-
-
-@pytest.mark.parametrize(
-    ("colour", "train", "test"),
-    [
-        ({}, "eec5e2778ced583b", "56e521b8166a3850"),
-        (
-            {"flicker_mdps": 3, "lag1_correlation": -0.15},
-            "3eead9cee4acff9f",
-            "49168560a86be389",
-        ),
-    ],
-)
-def test_a_seed_gives_the_samples_that_it_always_gave(tmp_path, colour, train, test):
-    simulated(tmp_path, model=colour, recordings=3, train_recordings=2, samples=50).load()
-    arrays = np.load(tmp_path / "dot_train.npy")[0], np.load(tmp_path / "dot_test.npy")
-    digests = [hashlib.sha256(array.tobytes()).hexdigest()[:16] for array in arrays]
-    assert digests == [train, test]
 
 
 def test_random_walk_and_warm_up_are_added_and_what_was_drawn_is_kept(tmp_path):
@@ -146,32 +157,7 @@ def test_random_walk_and_warm_up_are_added_and_what_was_drawn_is_kept(tmp_path):
     assert set(np.ravel(constant.load().truth.true_time_constant)) == {1.5}
 
 
-def test_the_seed_and_the_sensor_alone_decide_the_draws_and_a_second_load_only_reads(tmp_path):
-    def stamps():
-        files = (tmp_path / "a").iterdir()
-        return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in files}
-
-    first = recordings(simulated(tmp_path / "a"))
-    before = stamps()
-    for folder in ("a", "b"):
-        xr.testing.assert_identical(recordings(simulated(tmp_path / folder)), first)
-    assert stamps() == before
-    for other in (simulated(tmp_path / "c", seed=2), simulated(tmp_path / "d", sensor="ng")):
-        assert (other.load().truth.true_unit_bias != first.true_unit_bias).all()
-
-
-@pytest.mark.parametrize("changes", [{"seed": 2}, {"recording_s": 8}])
-def test_other_settings_are_written_anew_and_said(tmp_path, caplog, changes):
-    caplog.set_level(logging.INFO, "gyro_pipeline")
-    old = recordings(simulated(tmp_path))
-    caplog.clear()
-    new = recordings(simulated(tmp_path, **changes))
-    assert not new.identical(old)
-    assert len(caplog.records) == 1
-    assert "since their settings have changed" in caplog.text
-    xr.testing.assert_identical(new, recordings(simulated(tmp_path / "fresh", **changes)))
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("at", [(simulated_logs, "simulate_noise"), (Recordings, "save")])
 def test_what_was_interrupted_is_not_there_and_is_written_again(tmp_path, monkeypatch, at):
     def interrupt(*_, **__):
@@ -189,6 +175,7 @@ def test_what_was_interrupted_is_not_there_and_is_written_again(tmp_path, monkey
     xr.testing.assert_identical(recordings(simulated(tmp_path)), expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["dot_test.npy", "dot_truth.nc"])
 def test_a_missing_file_or_a_damaged_mark_is_made_again(tmp_path, name):
     expected = recordings(simulated(tmp_path))
@@ -196,11 +183,3 @@ def test_a_missing_file_or_a_damaged_mark_is_made_again(tmp_path, name):
     xr.testing.assert_identical(recordings(simulated(tmp_path)), expected)
     (tmp_path / "dot_truth.nc").write_bytes(b"damaged")
     xr.testing.assert_identical(recordings(simulated(tmp_path)), expected)
-
-
-def test_samples_that_are_not_those_of_the_truth_are_refused(tmp_path):
-    simulated(tmp_path).load()
-    test = np.load(tmp_path / "dot_test.npy")
-    np.save(tmp_path / "dot_test.npy", test + np.float32(0.001))
-    with pytest.raises(DatasetError, match="changed since it was written"):
-        simulated(tmp_path).load()

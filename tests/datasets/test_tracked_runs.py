@@ -1,3 +1,4 @@
+import json
 import logging
 import os
 import shutil
@@ -19,7 +20,7 @@ from mlflow import MlflowClient
 
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets import run_store
-from gyro_pipeline.datasets.tracked_runs import TrackedRuns
+from gyro_pipeline.datasets.tracked_runs import TrackedRuns, run_link
 from gyro_pipeline.store import relocate
 from gyro_pipeline.tracking import EvaluatedRun, FittedRun, RunIdentity
 
@@ -268,19 +269,6 @@ def test_whose_process_is_gone_is_told_by_host_number_and_start(store):
     assert mine.run_id != left[0]
 
 
-def test_a_run_that_is_not_described_yet_is_described_when_it_is_continued(store):
-    """As a kill leaves it that comes before its parameters are written."""
-    run_id = unfinished(store)
-    with sqlite3.connect(store) as connection:
-        connection.execute("delete from params")
-    connection.close()
-    assert tracked(store).load() == []
-    tracked(store).save(fitted(folds=("fold 0", MODEL)))
-    (run,) = tracked(store).load()
-    assert (run.run_id, run.fits, run.trained) == (run_id, {"fold 0", MODEL}, True)
-    assert run.params["sensor"] == "dot"
-
-
 def test_a_fit_that_cannot_be_written_is_not_taken_for_stored(store):
     with pytest.raises(DatasetError, match="not to be written"):
         tracked(store).save(fitted(estimator=Unwritable()))
@@ -302,20 +290,6 @@ def test_runs_of_an_older_layout_are_counted_once_and_never_read(store, caplog):
         for _ in range(2):
             assert len(tracked(store, study="real2real").load()) == 1
     assert caplog.messages == ["3 runs of an older layout are not read"]
-
-
-def test_artifacts_are_never_written_to_where_a_copy_is_from(store, tmp_path):
-    tracked(store).save(fitted())
-    copy = tmp_path / "a copy" / "mlflow.db"
-    shutil.copytree(store.parent / "mlruns", copy.parent / "mlruns")
-    shutil.copy(store, copy)
-    for use in (TrackedRuns.load, lambda runs: runs.save(fitted(seed=1))):
-        with pytest.raises(DatasetError, match="--artifacts-in mlruns"):
-            use(tracked(copy))
-    relocate(copy, str(copy.parent / "mlruns"))
-    tracked(copy).save(fitted(seed=1))
-    shutil.rmtree(store.parent / "mlruns")
-    assert [run.load_fit(MODEL).bias for run in tracked(copy).load()] == [0, 0]
 
 
 def cut_short(path):
@@ -348,30 +322,6 @@ def test_a_file_that_is_no_sound_store_is_refused_and_left_as_it_is(store, spoil
         assert f"{store}" in str(caught.value) and "move it away" in str(caught.value)
         assert store.read_bytes() == before
         assert set(store.parent.iterdir()) == around
-
-
-INTERRUPTED = """
-import os, signal, sqlite3, sys
-connection = sqlite3.connect(sys.argv[1], isolation_level=None)
-connection.execute("pragma cache_size = 1")  # what does not fit is written before the commit
-connection.execute("begin")
-for row in range(2000):
-    connection.execute("insert into experiment_tags values (?, ?, 0)", (f"{row}", "x" * 500))
-os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-def test_a_store_whose_writer_was_killed_in_mid_write_is_not_taken_for_damaged(store):
-    tracked(store).save(fitted())
-    done = subprocess.run([sys.executable, "-c", INTERRUPTED, str(store)], check=False, timeout=60)
-    assert done.returncode == -signal.SIGKILL
-    assert store.with_name("mlflow.db-journal").stat().st_size > 0
-    (run,) = tracked(store).load()
-    assert run.fingerprint == "f00d0"
-    with sqlite3.connect(store) as connection:  # what was half written is rolled back
-        rows = connection.execute("select count(*) from experiment_tags where value like 'x%'")
-        assert rows.fetchone() == (0,)
-    connection.close()
 
 
 def test_a_store_is_there_complete_or_not_at_all(tmp_path, monkeypatch):
@@ -509,3 +459,32 @@ def test_fits_that_a_server_does_not_take_are_stored_once_it_answers(
     assert run.trained and run.fits == set(folds)
     assert not [*tmp_path.rglob("*.pkl")]
     assert len(runs.load()) == 1
+
+
+def test_a_link_opens_the_runs_of_a_study_best_first(store):
+    everywhere = TrackedRuns(str(store), study="real2real")
+    assert run_link([everywhere]) is None
+    tracked(store).save(fitted())
+    sensors = [tracked(store, study="real2real", sensor=sensor) for sensor in ("dot", "ng")]
+    address = "http://127.0.0.1:5000/#/experiments/1/runs?workflowType=machine_learning"
+    assert run_link([everywhere, *sensors]) == f"{address}&viewStateShareKey=runs_simulated"
+    assert run_link(sensors[:1]) == f"{address}&viewStateShareKey=runs_simulated_dot"
+    tags = MlflowClient(f"sqlite:///{store}").get_experiment("1").tags
+    view = json.loads(tags["mlflow.sharedViewState.runs_simulated_dot"])
+    wanted = "tags.layout = '3' and params.source = 'simulated' and params.sensor = 'dot'"
+    assert view["searchFilter"] == wanted
+    assert view["orderByKey"] == "metrics.`accuracy_gain_pct`"
+
+
+def test_artifacts_are_never_written_to_where_a_copy_is_from(store, tmp_path):
+    tracked(store).save(fitted())
+    copy = tmp_path / "a copy" / "mlflow.db"
+    shutil.copytree(store.parent / "mlruns", copy.parent / "mlruns")
+    shutil.copy(store, copy)
+    for use in (TrackedRuns.load, lambda runs: runs.save(fitted(seed=1))):
+        with pytest.raises(DatasetError, match="--artifacts-in mlruns"):
+            use(tracked(copy))
+    relocate(copy, str(copy.parent / "mlruns"))
+    tracked(copy).save(fitted(seed=1))
+    shutil.rmtree(store.parent / "mlruns")
+    assert [run.load_fit(MODEL).bias for run in tracked(copy).load()] == [0, 0]

@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 import torch
 import xarray as xr
+from threadpoolctl import threadpool_limits
 
 from gyro_pipeline.conventions import AXES, DIMENSIONS, ORIGIN_REAL, RECORDING_MEAN, TRAIN
 from gyro_pipeline.estimators.training import TrainingSet
@@ -28,10 +29,13 @@ def labelled(rates, rate_hz):
     return xr.Dataset(data, coords, attrs)
 
 
-@pytest.fixture(autouse=True)
-def torch_settings_restored():
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """More only get in each other's way on tensors so small; a training changes both settings."""
     threads = torch.get_num_threads()
-    yield
+    torch.set_num_threads(1)
+    with threadpool_limits(1):
+        yield
     torch.set_num_threads(threads)
     torch.use_deterministic_algorithms(False)
 

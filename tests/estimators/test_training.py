@@ -38,14 +38,12 @@ def drawn(imus=3, recordings=6, seed=0):
 
 def table(*rows):
     """Rows of role, origin, IMU, recordings and starts."""
-    return pd.DataFrame(
-        [
-            (role, origin, imu, number, start)
-            for role, origin, imu, numbers, starts in rows
-            for number in numbers
-            for start in starts
-        ],
-        columns=["role", "origin", "imu", "recording", "start"],
+    columns = ["role", "origin", "imu", "recording", "start"]
+    return (
+        pd.DataFrame(rows, columns=columns)
+        .explode("recording")
+        .explode("start")
+        .astype({"recording": int, "start": int})
     )
 
 
@@ -67,31 +65,24 @@ def places(training):
     return [(origin, imu, one.numbers.tolist()) for (origin, imu), one in training.imus.items()]
 
 
-def test_real_imus_come_before_virtual_ones_and_the_device_first(training):
+def test_the_device_comes_first_virtual_imus_last_and_a_part_is_what_an_estimator_uses(training):
     assert places(training) == [
         *(("real", 2, [1, 3, 6]), ("real", 1, [2]), ("real", 3, [4, 5])),
         ("virtual", 1, [1, 2]),
     ]
     assert [s.tolist() for s in training.imus["real", 3].starts] == [[0, 20], [0, 20]]
-
-
-@pytest.mark.parametrize(
-    ("device", "uses", "imus"),
-    [
-        (2, NOTHING, []),
-        (2, OWN, [2]),
-        (2, REAL, [2, 1, 3]),
-        (9, OWN, [1, 2, 3]),
-        (9, REAL, [1, 2, 3]),
-    ],
-)
-def test_a_part_is_what_an_estimator_says_that_it_uses(device, uses, imus):
-    training = TrainingSet(drawn(), drawn(2, 2, seed=1), WINDOWS, SIZE, device)
-    part = training.part(uses)
-    assert [imu for _, imu, _ in places(part)] == imus
-    assert {origin for origin, *_ in places(part)} <= {ORIGIN_REAL}
-    assert part.part(uses) is part
-    assert training.part(ALL) is training
+    unseen = TrainingSet(training.real, training.virtual, WINDOWS, SIZE, device=9)
+    for one, uses, imus in (
+        (training, NOTHING, []),
+        (training, OWN, [2]),
+        (training, REAL, [2, 1, 3]),
+        (unseen, OWN, [1, 2, 3]),
+        (unseen, REAL, [1, 2, 3]),
+    ):
+        part = one.part(uses)
+        assert [imu for _, imu, _ in places(part)] == imus
+        assert {origin for origin, *_ in places(part)} <= {ORIGIN_REAL}
+    assert len(training.part(ALL).imus) == 4
 
 
 def test_of_a_device_its_own_recordings_tell_and_of_an_unseen_one_all_real_ones(training):
@@ -120,28 +111,20 @@ def test_keys_tell_training_sets_and_recordings_apart(training):
     assert other(moved).recordings_key == training.recordings_key
 
 
-@pytest.fixture
-def filed(tmp_path, monkeypatch):
-    """Recordings in a file, and nothing remembered of any."""
+def test_recordings_of_a_file_are_read_once_for_all_folds_and_go_to_a_worker_as_references(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr(module, "_FILE_CACHE", module._ArrayCache())
     drawn().to_netcdf(tmp_path / "recordings.nc", engine="h5netcdf")
-    return xr.open_dataset(tmp_path / "recordings.nc", engine="h5netcdf")
-
-
-def test_folds_share_what_is_read_and_worked_out(filed, monkeypatch):
+    filed = xr.open_dataset(tmp_path / "recordings.nc", engine="h5netcdf")
     windows = table((TRAIN, ORIGIN_REAL, 1, range(1, 7), [0]))
     first = TrainingSet(filed, None, windows, SIZE, 1)
-    noise = first.white_noise, first.labels[1]
+    noise, means = first.white_noise, first.labels[1]
     monkeypatch.setattr(module, "allan_variance", lambda *_: pytest.fail("once is enough"))
     again = TrainingSet(filed, None, windows[1:], SIZE, 1)
-    np.testing.assert_allclose(again.labels[1], noise[1][1:])
-    assert np.isfinite(again.white_noise).all()
+    np.testing.assert_allclose(again.labels[1], means[1:])
+    assert np.isfinite([noise, again.white_noise]).all()
     np.testing.assert_array_equal(again.rates, drawn().angular_rate.to_numpy()[0, 1:])
-
-
-def test_recordings_of_a_file_go_to_a_worker_as_references(filed):
-    training = TrainingSet(filed, None, table((TRAIN, ORIGIN_REAL, 1, [1, 2], [0])), SIZE, 1)
-    assert training.rates.any()  # read, but not kept
-    pickled = pickle.dumps(training)
+    pickled = pickle.dumps(again)
     assert len(pickled) < filed.angular_rate.nbytes
-    np.testing.assert_array_equal(pickle.loads(pickled).rates, training.rates)
+    np.testing.assert_array_equal(pickle.loads(pickled).rates, again.rates)

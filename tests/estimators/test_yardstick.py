@@ -10,7 +10,7 @@ from gyro_pipeline.physics.recording_model import RecordingModel, best_linear, c
 
 pytestmark = pytest.mark.slow
 
-SAMPLES, RECORDING_S = 1300, 87.0  # a tenth of SparkFun's rate: what matters is N, not sigma
+SAMPLES, RECORDING_S = 650, 87.0  # a twentieth of SparkFun's rate: what matters is N, not sigma
 RATE = SAMPLES / RECORDING_S
 N, TAU = 3.3 * MDPS, 0.31 * MDPS
 WHITE = constant_bias(SAMPLES, RATE, NoiseFigures(N, 0, 0), 0.0, TAU)
@@ -62,19 +62,21 @@ def ratios_to_the_oracle(simulate, judged, training_set, model, names, training,
     return np.array(rows)
 
 
-def test_on_white_noise_ten_recordings_make_them_nearly_as_good_as_the_oracle(
+def test_they_are_nearly_as_good_as_the_oracle_with_ten_recordings_of_white_noise(
     simulate, judged, training_set
 ):
     names = ["empirical_bayes", "best_linear"]
-    ratios = ratios_to_the_oracle(simulate, judged, training_set, WHITE, names, 10, seeds=6)
+    ratios = ratios_to_the_oracle(simulate, judged, training_set, WHITE, names, 10, seeds=4)
     assert (ratios.mean(axis=0) <= 1.08).all(), ratios
     assert (ratios.mean(axis=0) > 0.99).all(), ratios
 
 
-def test_with_flicker_random_walk_and_warm_up_the_default_is(simulate, judged, training_set):
+def test_the_default_is_with_flicker_random_walk_and_warm_up_as_well(
+    simulate, judged, training_set
+):
     names = ["best_linear", "empirical_bayes"]
-    (aware, stationary), *_ = ratios_to_the_oracle(
-        simulate, judged, training_set, WARMING, names, 80, seeds=1
+    ((aware, stationary),) = ratios_to_the_oracle(
+        simulate, judged, training_set, WARMING, names, 60, seeds=1
     )
     assert 0.98 < aware <= 1.08
     assert stationary >= 2
@@ -101,33 +103,23 @@ RECOMMENDED = ["empirical_bayes", "best_linear"]
 
 @pytest.mark.parametrize("name", RECOMMENDED)
 @pytest.mark.parametrize(("window_s", "bar"), [(1, 0.30), (10, 0.72), (30, 1.05)])
-def test_memsense_against_the_running_mean(leave_one_out, name, window_s, bar):
-    ratio = rms(leave_one_out[name, window_s][0]) / rms(leave_one_out["mean", window_s][0])
-    assert ratio <= bar
-    if window_s == 10:
-        assert ratio >= 0.53, "less than chance allows an honest method: look for a leak"
-
-
-@pytest.mark.parametrize("name", RECOMMENDED)
-@pytest.mark.parametrize("window_s", [1, 10, 30])
-def test_coverage_on_memsense(leave_one_out, name, window_s):
+def test_memsense_against_the_running_mean_and_coverage(leave_one_out, name, window_s, bar):
     errors, sigma = leave_one_out[name, window_s]
+    ratio = rms(errors) / rms(leave_one_out["mean", window_s][0])
+    assert ratio <= bar
+    assert window_s != 10 or ratio >= 0.53, "less than chance allows: look for a leak"
     assert 0.60 <= np.mean(np.abs(errors) < sigma) <= 0.78
     assert 0.90 <= np.mean(np.abs(errors) < 2 * sigma) <= 0.98
 
 
 @pytest.mark.parametrize(
-    ("model", "name"),
-    [
-        (COLOURED, "best_linear"),
-        (WARMING, "best_linear_warm_up"),
-    ],
+    ("model", "name"), [(COLOURED, "best_linear"), (WARMING, "best_linear_warm_up")]
 )
 def test_coverage_on_many_simulated_recordings(simulate, judged, model, name, training_set):
     """Of two devices: 80 recordings fix the spread of one, and so its sigma, to a tenth or so."""
     ratios = []
     for device in range(2):
-        made = simulate(model, 280, seed=device)
+        made = simulate(model, 160, seed=device)
         estimator = make_estimator(name, None, 0).fit(training_set(made.isel(recording=slice(80))))
         errors, sigma = judged(estimator, made.isel(recording=slice(80, None)), 10)
         ratios.append(np.abs(errors) / sigma)
@@ -135,29 +127,21 @@ def test_coverage_on_many_simulated_recordings(simulate, judged, model, name, tr
     assert 0.93 <= np.mean(np.array(ratios) < 2) <= 0.97
 
 
-@pytest.fixture(scope="module")
-def sources(simulate):
-    return {name: simulate(m, 100) for name, m in {"white": WHITE, "coloured": COLOURED}.items()}
-
-
-def of_five(recordings, judged, training_set, resamples):
-    """Mean ratios of the recommended estimators to the running mean at 1, 10 and 30 s."""
-    rows = []
-    for resample in range(resamples):
-        order = np.random.default_rng(resample).permutation(recordings.sizes["recording"])
-        training = recordings.isel(recording=np.sort(order[:5]))
-        tested = recordings.isel(recording=np.sort(order[5:45]))
+@pytest.mark.parametrize("model", [WHITE, COLOURED], ids=["white", "coloured"])
+def test_five_training_recordings_suffice_not_to_be_worse_than_the_mean(
+    simulate, judged, model, training_set
+):
+    """The mean of two draws, at 1, 10 and 30 s."""
+    recordings, rows = simulate(model, 100), []
+    for draw in range(2):
+        order = np.random.default_rng(draw).permutation(100)
+        training, tested = (
+            recordings.isel(recording=np.sort(order[part])) for part in np.s_[:5, 5:45]
+        )
         fitted = [
             make_estimator(name, None, 0).fit(training_set(training))
             for name in ("mean", *RECOMMENDED)
         ]
         errors = [[rms(judged(one, tested, w)[0]) for w in (1, 10, 30)] for one in fitted]
         rows.append(np.array(errors[1:]) / errors[0])
-    return np.mean(rows, axis=0)
-
-
-@pytest.mark.parametrize("source", ["white", "coloured"])
-def test_five_training_recordings_suffice_not_to_be_worse_than_the_mean(
-    sources, judged, source, training_set
-):
-    assert (of_five(sources[source], judged, training_set, 2) <= 1.05).all()
+    assert (np.mean(rows, axis=0) <= 1.05).all()

@@ -13,13 +13,14 @@ from gyro_pipeline.learning import trainings
 from gyro_pipeline.learning.design import Design, options_of
 from gyro_pipeline.learning.examples import Device, training_examples
 from gyro_pipeline.learning.jobs import StoredNetwork, TrainingJob, run_training
-from gyro_pipeline.learning.trainings import batch_device, in_batches, run_trainings
+from gyro_pipeline.learning.trainings import batch_device, run_trainings
 from gyro_pipeline.physics.bias import windows_at
 
 WINDOW = 40
 STARTS = np.array([0, WINDOW])
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 PAPER = "gyro_pipeline.learning.network:CalibrationNetwork"
+OTHERS = {"seed": 0, "path": PAPER, "cell": None}
 BOTH = pytest.mark.parametrize("imus", [((1,), (2,)), ((2, 1),)], ids=["training data", "channels"])
 
 
@@ -44,18 +45,10 @@ def device(rates, bias, imus, numbers):
 def make(recorded, schedule):
     """A job: ``make(seed=1, epochs=3)``."""
 
-    def made(
-        data=None,
-        imus=((1,), (2,)),
-        train=range(1, 9),
-        validate=(9, 10),
-        seed=0,
-        path=PAPER,
-        cell=None,
-        **changes,
-    ):
+    def made(data=None, imus=((1,), (2,)), train=range(1, 9), *, validate=(9, 10), **given):
+        seed, path, cell = (given.pop(name, default) for name, default in OTHERS.items())
         rates, bias = data or recorded()
-        settings = schedule(**{"batch_size": 8, "epochs": 6, "decay_every": 4, **changes})
+        settings = schedule(**{"batch_size": 8, "epochs": 6, "decay_every": 4, **given})
         devices = [device(rates, bias, one, train) for one in imus]
         validation = device(rates, bias, imus[0], validate) if validate else None
         design = Design(path, 3 * len(imus[0]), WINDOW, options_of(path, settings, {}))
@@ -156,16 +149,6 @@ def test_networks_trained_at_once_are_those_trained_one_by_one(make, recorded, m
     assert not list(run_trainings([], DEVICE, "none"))
 
 
-def test_batches_are_of_equal_designs_and_schedules_and_fit_the_memory(make, recorded):
-    jobs = grid(make, recorded)
-    more = [make(imus=((1,),), learning_rate=1e-2), make(imus=((1,),), validate=())]
-    assert sorted(map(len, in_batches(jobs + more, 1e12))) == [1, 1, 4, 4]
-    memory = 2.5 * trainings._bytes(jobs[-1])
-    assert [len(batch) for batch in in_batches(jobs[4:], memory)] == [2, 2]
-    assert [len(batch) for batch in in_batches(jobs, 1.0)] == [1] * 8
-    assert 0 < trainings.free_memory(DEVICE) < 1e15
-
-
 def test_what_cannot_be_trained_at_once_is_trained_one_by_one_and_the_log_says_why(
     make, recorded, monkeypatch, caplog
 ):
@@ -182,17 +165,12 @@ def test_what_cannot_be_trained_at_once_is_trained_one_by_one_and_the_log_says_w
     assert "Dropping: trained one by one: vmap: called random operation" in caplog.text
 
 
-@pytest.mark.parametrize(
-    ("executor", "cuda", "chosen"),
-    [
+def test_the_gpu_is_used_where_there_is_one_and_asked_for_nowhere_else(monkeypatch):
+    for executor, cuda, chosen in (
         *(("auto", True, "cuda"), ("auto", False, None)),
         *(("batched", True, "cuda"), ("batched", False, "cpu")),
         *(("processes", True, None), ("serial", True, None)),
-    ],
-)
-def test_the_gpu_is_used_where_there_is_one_and_asked_for_nowhere_else(
-    monkeypatch, executor, cuda, chosen
-):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
-    place = batch_device(executor)
-    assert (place and place.type) == chosen
+    ):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda cuda=cuda: cuda)
+        place = batch_device(executor)
+        assert (place and place.type) == chosen

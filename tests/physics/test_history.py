@@ -1,3 +1,5 @@
+"""The prior of a bias that walks from one calibration to the next."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -48,10 +50,11 @@ def test_only_what_came_before_counts():
     assert history.prior(MODEL, 3) is MODEL  # two calibrations came before
 
 
+@pytest.mark.slow
 def test_the_walk_is_found():
-    steps = [BiasHistory.fit(*walked(80, 1.0, 0.5, seed), MODEL).step for seed in range(5)]
+    steps = [BiasHistory.fit(*walked(80, 1.0, 0.5, seed), MODEL).step for seed in range(3)]
     assert np.mean(steps) == pytest.approx(1.0, rel=0.2)
-    steady = [BiasHistory.fit(*walked(80, 0.0, 1.0, seed), MODEL) for seed in range(5)]
+    steady = [BiasHistory.fit(*walked(80, 0.0, 1.0, seed), MODEL) for seed in range(3)]
     assert np.mean([found.step for found in steady]) < 0.1
     assert np.mean([found.deviation for found in steady]) == pytest.approx(1.0, rel=0.1)
 

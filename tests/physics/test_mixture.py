@@ -25,8 +25,8 @@ def test_axes_that_speak_for_the_history_do_not_suffer_from_one_that_does_not():
     np.testing.assert_allclose(found.mean[0], 9 * 25 / 26, rtol=1e-2)
 
 
-@pytest.mark.parametrize(("narrow", "least", "most"), [(0.31, 0.945, 0.97), (0.6, 0.945, 0.97)])
-def test_the_charged_variance_covers_where_the_history_is_right(narrow, least, most):
+@pytest.mark.parametrize("narrow", [0.31, 0.6])
+def test_the_charged_variance_covers_where_the_history_is_right(narrow):
     rng = np.random.default_rng(2)
     for seconds in (1, 10, 30):
         own = 3.3**2 / seconds
@@ -34,7 +34,7 @@ def test_the_charged_variance_covers_where_the_history_is_right(narrow, least, m
         estimate = truth + rng.normal(0, np.sqrt(own), truth.shape)
         found = mixture_posterior(estimate, own, 0.0, narrow**2, 25.0)
         covered = np.mean(np.abs(found.mean - truth) <= 1.96 * np.sqrt(found.charged))
-        assert least < covered < most
+        assert 0.945 < covered < 0.97
 
 
 def test_the_mean_ratio_exceeds_its_limit_as_seldom_as_it_says():

@@ -1,32 +1,23 @@
 """A sensor small enough to plan, train and evaluate its whole grid in a second."""
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
 
-from gyro_pipeline.parameters import (
-    Execution,
-    Grid,
-    Only,
-    Splits,
-    Study,
-    Training,
-    VirtualGyros,
-)
+from gyro_pipeline.parameters import Execution, Grid, Only, Splits, Study, Training, VirtualGyros
 from gyro_pipeline.pipelines.evaluation.nodes import evaluate
 from gyro_pipeline.pipelines.ground_truth.nodes import measure_allan_variance, measure_bias
 from gyro_pipeline.pipelines.training.nodes import plan_runs, train
 from gyro_pipeline.pipelines.virtual_gyros.nodes import synthesise
 from gyro_pipeline.pipelines.windowed_splits.nodes import cut_to_common_length, split_windows
-from gyro_pipeline.studies import RunSpec, possible_runs
-from gyro_pipeline.tracking import FINGERPRINT, EvaluatedRun, FittedRun, StoredRun
+from gyro_pipeline.studies import possible_runs
+from gyro_pipeline.tracking import FINGERPRINT, StoredRun
 
 NOISE, SPREAD = 0.003, 0.002
 RATE_HZ, SAMPLES = 20.0, 1040
@@ -49,67 +40,65 @@ class World:
     only: Only = field(default_factory=Only)
 
     @cached_property
-    def _cut(self) -> tuple[xr.Dataset, pd.DataFrame, pd.DataFrame]:
+    def _cut(self):
         return cut_to_common_length(self.raw, self.raw_bias, quality_of(self.raw))
 
     @property
-    def recordings(self) -> xr.Dataset:
+    def recordings(self):
         """All of one length."""
         return self._cut[0]
 
     @property
-    def bias(self) -> pd.DataFrame:
+    def bias(self):
         """The ground truth of these."""
         return self._cut[1]
 
     @cached_property
-    def virtual(self) -> xr.Dataset | None:
+    def virtual(self):
         """Virtual recordings, where the study uses some."""
         if not any(self.study.grid_of("sparkfun").virtual_gyros):
             return None
         return synthesise(self.raw, self.raw_bias, self.virtual_gyros)
 
     @cached_property
-    def windows(self) -> pd.DataFrame:
+    def windows(self):
         given = self.study, self.recordings, self._cut[2], self.splits, list(self.windows_s)
         return split_windows(*given, self.only, self.virtual)
 
     @cached_property
-    def plan(self) -> pd.DataFrame:
+    def plan(self):
         given = self.study, self.recordings, self.windows, list(self.windows_s), list(self.seeds)
         return plan_runs(*given, self.only, self.training, self.virtual)
 
     @property
-    def specs(self) -> dict[str, RunSpec]:
+    def specs(self):
         """The runs that can be made, by fingerprint."""
         return possible_runs(self.plan)
 
     @property
-    def fingerprints(self) -> dict[tuple[Any, ...], str]:
+    def fingerprints(self):
         """By estimator, gyroscopes, window, seed and method."""
         names = ["estimator", "real_gyros", "virtual_gyros", "window_s", "seed", "method"]
         rows = self.plan[names].itertuples(index=False, name=None)
         return dict(zip(rows, self.plan[FINGERPRINT], strict=True))
 
-    def train(
-        self, tracked: Sequence[StoredRun] = (), execution: Execution = SERIAL
-    ) -> list[FittedRun]:
+    def train(self, tracked=(), execution=SERIAL):
         given = self.study, self.plan, list(tracked), self.recordings, self.windows, self.training
         settings = self.splits, self.virtual_gyros, execution
         return list(train(*given, *settings, self.virtual))
 
-    def evaluate(self, runs: Sequence[StoredRun]) -> list[EvaluatedRun]:
+    def evaluate(self, runs):
         given = self.plan, list(runs), self.recordings, self.windows, self.bias
         return list(evaluate(*given, self.allan))
 
-    def judged(self) -> dict[str, EvaluatedRun]:
+    def judged(self):
         """All runs, trained and evaluated, by estimator, the last of each."""
         runs = stored_runs(self.train())
         names = {run.run_id: run.params["estimator"] for run in runs}
         return {names[run.run_id]: run for run in self.evaluate(runs)}
 
 
-def quality_of(recordings: xr.Dataset) -> pd.DataFrame:
+def quality_of(recordings):
     """What the raw-logs stage says of recordings, which it found five rows into their files."""
     rows = recordings["samples"].to_dataframe().reset_index()
     stop = rows.samples.where(rows.samples > 0) + 5
@@ -117,9 +106,9 @@ def quality_of(recordings: xr.Dataset) -> pd.DataFrame:
     return rows[["imu", "recording"]].assign(file=files, start=stop * 0 + 5, stop=stop)
 
 
-def stored_runs(fitted: Sequence[FittedRun], **changes: Any) -> list[StoredRun]:
+def stored_runs(fitted, **changes):
     """What a store gives back of some fits: each run with those of its folds that are there."""
-    by_run: dict[str, dict[str, FittedRun]] = {}
+    by_run = {}
     for fit in fitted:
         by_run.setdefault(fit.run.fingerprint, {})[fit.fold] = fit
     runs = []
@@ -147,39 +136,37 @@ def stored_runs(fitted: Sequence[FittedRun], **changes: Any) -> list[StoredRun]:
     return runs
 
 
-def study_of(name: str, estimators: Sequence[str] = ("cnn",), **grid: Any) -> Study:
+def study_of(name, estimators=("cnn",), **grid):
     settings = Grid(**{"method": 2, "real_gyros": [3], **grid})
     return Study(experiment=name, estimators=list(estimators), sensors={"sparkfun": settings})
 
 
 @pytest.fixture(scope="session")
-def make_study() -> Callable[..., Study]:
+def make_study():
     """A study of one sensor: ``make_study(name, estimators, real_gyros=[...])``."""
     return study_of
 
 
 @pytest.fixture(scope="session")
-def as_stored() -> Callable[..., list[StoredRun]]:
+def as_stored():
     """What a store gives back of some fits."""
     return stored_runs
 
 
 @pytest.fixture(scope="session")
-def make_quality() -> Callable[[xr.Dataset], pd.DataFrame]:
+def make_quality():
     """What the raw-logs stage says of recordings."""
     return quality_of
 
 
 @pytest.fixture(scope="session")
-def make_bias(parameters: Callable[..., Any]) -> Callable[..., pd.DataFrame]:
+def make_bias(parameters):
     """The ground truth of recordings, from their Allan variances."""
     return lambda recordings, allan: measure_bias(recordings, allan, parameters().ground_truth)
 
 
 @pytest.fixture(scope="session")
-def make_world(
-    parameters: Callable[..., Any], make_bias: Callable[..., pd.DataFrame]
-) -> Callable[..., World]:
+def make_world(parameters, make_bias):
     """A world of some recordings: ``make_world(recordings, study=...)``."""
     p = parameters(
         virtual_gyros={"recordings": 6, "train_recordings": 5},
@@ -187,7 +174,7 @@ def make_world(
     )
     settings = ("training", "splits", "virtual_gyros")
 
-    def make(recordings: xr.Dataset, **changes: Any) -> World:
+    def make(recordings, **changes):
         allan = measure_allan_variance(recordings)
         given = {name: getattr(p, name) for name in settings} | {"study": study_of("some")}
         return World(recordings, allan, make_bias(recordings, allan), **given | changes)
@@ -196,7 +183,7 @@ def make_world(
 
 
 @pytest.fixture(scope="session")
-def world(make_recordings: Callable[..., xr.Dataset], make_world: Callable[..., World]) -> World:
+def world(make_recordings, make_world):
     """Two IMUs with 14 measured recordings, of which 8 train and 4 test, and 8 virtual IMUs."""
     generator = np.random.default_rng(5)
     bias = generator.uniform(-1, 1, (2, 1, 3)) + generator.normal(0, SPREAD, (2, 14, 3))
@@ -206,12 +193,12 @@ def world(make_recordings: Callable[..., xr.Dataset], make_world: Callable[..., 
 
 
 @pytest.fixture(scope="session")
-def fitted(world: World) -> list[FittedRun]:
+def fitted(world):
     """The whole grid of the small world."""
     return world.train()
 
 
 @pytest.fixture(scope="session")
-def stored(fitted: list[FittedRun]) -> list[StoredRun]:
+def stored(fitted):
     """The same as the store gives it, waiting for its evaluation."""
     return stored_runs(fitted)

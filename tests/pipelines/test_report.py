@@ -20,6 +20,9 @@ SENSORS = ("dot", "sparkfun", "ng")
 WARM_UP_S, AMPLITUDE = 5.0, 0.02
 
 
+pytestmark = pytest.mark.slow
+
+
 @pytest.fixture(scope="module")
 def recordings(make_recordings):
     """Two IMUs of each sensor, ten recordings of which three test; DOT warms up by 20 mdps."""
@@ -108,22 +111,6 @@ def test_hours_are_counted_and_what_was_not_read_says_so(report):
     assert (virtual["Training recordings"], virtual["Test recordings"]) == (9 * 6, 0)
     assert virtual["Source"].startswith("virtual, from test")
     assert table.loc["6", "Note"] == table.loc["4", "Note"] == "not made"
-    assert table.loc["2", "Note"].startswith("the text's 400 recordings")
-    assert table["Paper's total h"][["1", "real", "all"]].tolist() == [24.65, 76.2, 186.6]
-
-
-def test_recordings_of_a_k_fold_train_and_test_and_count_once(recordings, described):
-    counted = described["ng/description"]().iloc[0]
-    assert (counted.train_recordings, counted.test_recordings) == (6 * 7, 3 * 3)
-    from gyro_pipeline.pipelines.reporting.recordings import _counts  # noqa: PLC0415
-
-    row = _counts(recordings["ng"].drop_vars("split"), None)
-    assert (row["train_recordings"], row["test_recordings"], row["all_recordings"]) == (60, 30, 60)
-
-
-def line(ax, label):
-    (found,) = [one for one in ax.lines if str(one.get_label()).startswith(label)]
-    return found
 
 
 def test_datasheets_and_signals_are_shown_from_the_recordings(report, recordings):
@@ -142,15 +129,11 @@ def test_datasheets_and_signals_are_shown_from_the_recordings(report, recordings
     assert np.mean(calibrated.get_ydata()) == pytest.approx(0, abs=1e-6)
     settled = [text.get_text() for text in figures["running_average"].legends[0].get_texts()]
     assert any(re.fullmatch(r"stays within from \d+\.\d s on", text) for text in settled)
-    convergence = figures["mg_convergence"]
-    titles = [ax.get_title() for ax in convergence.axes]
+    titles = [ax.get_title() for ax in figures["mg_convergence"].axes]
     assert [title.split()[0] for title in titles] == ["1", "4"]  # there are six
-    ends = line(convergence.axes[1], "average of all").get_ydata()
-    assert ends[-1] == pytest.approx(0, abs=1e-6)  # each is centred
     allan = figures["allan_deviation"].axes[0]
     assert len(allan.lines) == 6 + 1 + 1  # each gyroscope, the fit, the datasheet
     assert "N = " in allan.texts[0].get_text()
-    assert [ax.get_title() for ax in figures["drift"].axes] == ["Movella DOT", "SparkFun", "NG"]
 
 
 def test_the_warm_up_that_a_published_gain_would_need_is_in_the_answer(
@@ -174,12 +157,8 @@ def test_the_warm_up_that_a_published_gain_would_need_is_in_the_answer(
 # the page
 
 
-@pytest.fixture
-def page(tmp_path):
-    return ReportPage(str(tmp_path / "simulated" / "report.html"), str(tmp_path / "report.html"))
-
-
-def test_the_page_needs_no_other_file_and_a_list_links_to_all_reports(page, tmp_path):
+def test_the_page_needs_no_other_file_and_a_list_links_to_all_reports(tmp_path):
+    page = ReportPage(str(tmp_path / "simulated" / "report.html"), str(tmp_path / "report.html"))
     figure = ReportFigure(str(tmp_path / "simulated" / "figures" / "<i>dot 3.png"))
     figure.save(plt.subplots()[0])
     hostile = (
@@ -189,27 +168,19 @@ def test_the_page_needs_no_other_file_and_a_list_links_to_all_reports(page, tmp_
     page.save(f"# A title\n\n## The answer\n\n{table}\n![a plot](figures/%3Ci%3Edot%203.png)\n")
     html = (tmp_path / "simulated" / "report.html").read_text()
     (picture,) = re.findall(r'src="([^"]*)"', html)
-    assert base64.b64decode(picture.removeprefix("data:image/png;base64,")) == (
-        figure.load().read_bytes()
-    )
-    assert not re.search(
-        r"<(script|link|iframe|i|em|code)>|@import|url\(|javascript:alert\(1\)\"", html
-    )
+    stored = figure.load().read_bytes()
+    assert base64.b64decode(picture.removeprefix("data:image/png;base64,")) == stored
+    forbidden = r"<(script|link|iframe|i|em|code)>|@import|url\(|javascript:alert\(1\)\""
+    assert not re.search(forbidden, html)
     assert "&lt;img src=x onerror=alert(1)&gt; ![x](http://evil/x) [y](javascript" in html
     assert "&amp;lt; `c` *b*</td>" in html and "# _a_ | b</td>" in html
     assert re.findall(r'href="([^"]*)"', html) == ["#the-answer"]
-    assert 'id="the-answer"' in html and "<title>A title</title>" in html
     for folder in ("only.sensor=dot", "../logs"):
         other = tmp_path / "simulated" / folder / "report.html"
         ReportPage(str(other), str(tmp_path / "report.html")).save("# Another\n")
     links = re.findall(r'href="([^"]*)"', (tmp_path / "report.html").read_text())
     names = ("logs", "simulated", "simulated/only.sensor=dot")
     assert links == [f"{name}/report.html" for name in names]
-    assert page.load().startswith("# A title")
-
-
-def test_a_picture_that_is_not_there_is_refused_and_nothing_half_written(page, tmp_path):
-    page.save("# First\n")
     with pytest.raises(DatasetError, match="no such picture"):
         page.save("# Second\n\n![x](figures/none.png)\n")
-    assert "First" in (tmp_path / "simulated" / "report.html").read_text()
+    assert (tmp_path / "simulated" / "report.html").read_text() == html  # nothing half written

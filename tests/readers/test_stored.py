@@ -38,17 +38,16 @@ def save_fields(path, arrays):
         np.save(file, table)
 
 
-@pytest.mark.parametrize(
-    ("structure", "save"),
-    [
-        ("", lambda path, arrays: np.savez(path, **arrays)),
-        ("", scipy.io.savemat),
-        ("log.", lambda path, arrays: scipy.io.savemat(path, {"log": arrays | {"name": "A"}})),
-        ("", save_v73),
-        ("log.", save_hdf5),
-        ("", save_fields),
-    ],
-)
+STORED = [
+    ("", lambda path, arrays: np.savez(path, **arrays)),
+    ("log.", lambda path, arrays: scipy.io.savemat(path, {"log": arrays | {"name": "A"}})),
+    ("", save_v73),
+    ("log.", save_hdf5),
+    ("", save_fields),
+]
+
+
+@pytest.mark.parametrize(("structure", "save"), STORED)
 def test_named_arrays_fields_and_structures_are_columns(structure, save, rates, table):
     log = table(lambda path: save(path, {"t": T, "gyro": rates}), name="log.npz")
     named = dict(zip(log.names, log.columns, strict=True))
@@ -58,12 +57,12 @@ def test_named_arrays_fields_and_structures_are_columns(structure, save, rates, 
     np.testing.assert_array_equal(values, np.column_stack([T, rates]))
 
 
-@pytest.mark.parametrize("turn", [np.asarray, np.transpose])
-def test_the_longer_side_of_an_array_is_that_of_the_rows(turn, rates, table, dtype=np.int16):
-    values = (rates * 100).astype(dtype)
-    log = table(lambda path: np.save(path, turn(values)), name="log.npy")
-    assert log.names == ("x", "y", "z")
-    np.testing.assert_array_equal(np.transpose(log.columns), values.astype(float))
+def test_the_longer_side_of_an_array_is_that_of_the_rows(rates, table):
+    values = (rates * 100).astype(np.int16)
+    for turned in (values, values.T):
+        log = table(lambda path, turned=turned: np.save(path, turned), name="log.npy")
+        assert log.names == ("x", "y", "z")
+        np.testing.assert_array_equal(np.transpose(log.columns), values.astype(float))
 
 
 def test_objects_are_never_unpickled_and_arrays_keep_their_lengths(rates, table):
@@ -77,27 +76,22 @@ def test_objects_are_never_unpickled_and_arrays_keep_their_lengths(rates, table)
 def test_parquet_columns_are_numbers_texts_and_times(table):
     dates = pd.Timestamp("2024-03-01") + pd.to_timedelta(np.arange(60) * 5, unit="ms")
     columns = {
-        "date": pa.array(dates),
         "zone": pa.array(dates).cast(pa.timestamp("us", "UTC")),
         "since": pa.array(pd.to_timedelta(np.arange(60) * 5, unit="ms")),
         "clock": pa.array(dates.time),
         "count": pa.array([None, *range(1, 60)], pa.int32()),
         "kind": pa.array(["acc", None] * 30).dictionary_encode(),
-        "text": pa.array([str(k) for k in range(60)]),
         "list": pa.array([[1.0, 2.0]] * 60),
     }
-    content = pa.table(columns)
-    log = table(lambda path: pq.write_table(content, path), name="log.parquet")
+    log = table(lambda path: pq.write_table(pa.table(columns), path), name="log.parquet")
     assert log.names == tuple(columns)
-    for values, dtype in zip(log.columns, ["M8[ns]", "M8[ns]", "m8[ns]"], strict=False):
-        assert values.dtype == dtype
-        assert np.ptp(values) == np.timedelta64(295, "ms")
-    assert log.columns[3][1] == "00:00:00.005000"
-    np.testing.assert_array_equal(log.columns[4], [np.nan, *range(1, 60)])
-    assert log.columns[5][:2].tolist() == ["acc", None]
-    assert log.columns[6].tolist() == list(range(60))
+    assert [values.dtype for values in log.columns[:2]] == ["M8[ns]", "m8[ns]"]
+    assert {np.ptp(values) for values in log.columns[:2]} == {np.timedelta64(295, "ms")}
+    assert log.columns[2][1] == "00:00:00.005000"
+    np.testing.assert_array_equal(log.columns[3], [np.nan, *range(1, 60)])
+    assert log.columns[4][:2].tolist() == ["acc", None]
     with pytest.raises(InputError, match=r"expected numbers in 'list'.*got '\[1. 2.\]' in row 0,"):
-        log.numbers(7)
+        log.numbers(5)
 
 
 def written(save, *content, **options):

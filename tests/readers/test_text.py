@@ -1,6 +1,5 @@
 """Delimited texts, odd and damaged ones: each is the table that it should be, or a message."""
 
-import io
 import re
 
 import numpy as np
@@ -25,8 +24,8 @@ def cell(row, column, text):
     return lines(change)
 
 
-def replaced(old, new, count=-1):
-    return lambda text: text.replace(old, new, count)
+def replaced(old, new):
+    return lambda text: text.replace(old, new)
 
 
 def inserted(at, *new):
@@ -47,7 +46,6 @@ WHOLE = {  # all rows come back and nothing is said
     "tabs": ("general", replaced(";", "\t")),
     "decimal commas": ("general", replaced(".", ",")),
     "commas in texts": ("general", replaced("\n", ";Sun, 31\n")),
-    "no trailing delimiter in the header": ("angles", replaced("z,\n", "z\n")),
     "lines between header and rows": ("general", inserted(1, "", "started; at noon", "# 1")),
     "zeros of a card at the end": ("angles", lambda t: t.encode() + bytes(4096)),
 }  # fmt: skip
@@ -61,7 +59,6 @@ DAMAGED = {  # rows that are NaN, and what is said
     "the last line cut": (lambda t: t[:-20], [59], SAID),
     "a field too many in the first row": (cell(0, 2, "1,2"), [0], SAID),
     "a message between rows": (inserted(31, "SD card slow"), [30], SAID),
-    "comments between rows": (inserted(31, "# a, b", "// c"), [30, 31], SAID),
 }  # fmt: skip
 
 
@@ -114,17 +111,6 @@ def test_what_cannot_be_read_safely_is_refused(case, good, table):
         samples(table(change(good[logger])))
 
 
-@pytest.mark.parametrize("options", [{"fmt": "%12.6f"}, {"delimiter": "\t"}])
-def test_numpys_texts_are_tables_with_or_without_header(options, table, columns=60):
-    values = np.random.default_rng(0).normal(size=(30, columns))
-    names = [f"c{number} (deg/s)" for number in range(columns)]
-    for header in ("", " ".join(names), ",".join(names), "\t".join(names)):
-        np.savetxt(buffer := io.BytesIO(), values, header=header, **options)
-        log = table(buffer.getvalue())
-        np.testing.assert_allclose(np.transpose(log.columns), values, atol=1e-6)
-        assert log.names == (tuple(names) if header else ("",) * columns)
-
-
 @pytest.mark.parametrize(
     ("header", "names", "preamble"),
     [
@@ -163,25 +149,19 @@ def test_options_say_how_a_text_is_coded_and_split(table):
     assert "not UTF-8: if names look odd, give `encoding`" in table(text.encode("gbk")).where
     assert table(text.encode("utf-16-le"), encoding="utf-16-le").names[1] == "角速度x"
     assert "encoding" not in table(text).where
-    with pytest.raises(InputError, match="not UTF-8.*give `encoding`.*as the rows, 4, got 5"):
-        table(f"号,{text}".encode("gbk"))
     with pytest.raises(InputError, match="`encoding` in `reader:`.*unknown encoding: gkb"):
         table(text, encoding="gkb")
     assert table("a|b|c\n" + "1|2|3\n" * 9, delimiter="|").names == ("a", "b", "c")
 
 
-@pytest.mark.parametrize(("rows", "most"), [(1000, 10)])
-def test_one_row_in_a_hundred_may_be_unreadable_but_no_more(rows, most, table):
-    broken = ["x,y,z", *["1,2,3"] * (rows - most), *["1,2"] * most]
-    assert np.isnan(table("\n".join(broken)).columns[0]).sum() == most
-    with pytest.raises(InputError, match=f"got {most + 1} of {rows + 1} that are not.*row: '"):
+def test_one_row_in_a_hundred_may_be_unreadable_but_no_more_and_takes_no_other_with_it(table):
+    broken = ["x,y,z", *["1,2,3"] * 990, *["1,2"] * 10]
+    assert np.isnan(table("\n".join(broken)).columns[0]).sum() == 10
+    with pytest.raises(InputError, match="got 11 of 1001 that are not.*row: '"):
         table("\n".join([*broken, "1,2"]))
-
-
-@pytest.mark.parametrize("stray", ['"9","1.5","', '"9,"1.5","3"'])
-def test_a_stray_quote_takes_no_other_row_with_it(stray, table):
-    rows = ['"1","2","3"'] * 9
-    log = table("\n".join(['"x","y","z"', *rows, stray, *rows, stray, *rows]))
-    assert np.flatnonzero(np.isnan(log.columns[0])).tolist() == [9, 19]
-    assert "row 19 (line 21)" in log.findings[0].detail
-    assert len(log.columns[0]) == 29
+    for stray in ('"9","1.5","', '"9,"1.5","3"'):
+        rows = ['"1","2","3"'] * 9
+        log = table("\n".join(['"x","y","z"', *rows, stray, *rows, stray, *rows]))
+        assert np.flatnonzero(np.isnan(log.columns[0])).tolist() == [9, 19]
+        assert "row 19 (line 21)" in log.findings[0].detail
+        assert len(log.columns[0]) == 29

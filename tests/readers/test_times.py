@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from gyro_pipeline.readers.times import are_steps, seconds
+from gyro_pipeline.readers.times import seconds
 
 
 @pytest.mark.filterwarnings("error")
@@ -28,12 +28,9 @@ def test_texts_of_times_are_told_by_content(texts, expected):
     assert np.isnan(times[1])
 
 
-@pytest.mark.parametrize(
-    "texts",
-    [["acc", "gyr"], ["09:50", "09:51"], ["2023-05-04", "2023-05-05"], ["1.5", "1.6"], ["a:b", ""]],
-)
-def test_texts_that_are_no_times_or_may_be_two_are_none(texts):
-    assert seconds(np.array([*texts, None], object), 1.0) is None
+def test_texts_that_are_no_times_or_may_be_two_are_none():
+    for texts in (["acc", "gyr"], ["09:50", "09:51"], ["2023-05-04", "2023-05-05"], ["1.5", "1.6"]):
+        assert seconds(np.array([*texts, None], object), 1.0) is None
 
 
 def test_numbers_need_a_unit_of_any_size_and_datetimes_none():
@@ -43,15 +40,3 @@ def test_numbers_need_a_unit_of_any_size_and_datetimes_none():
     dates = pd.to_datetime(["2023-05-04 10:00:00.00", None, "2023-05-04 10:00:00.01"]).to_numpy()
     for column in (dates, dates - dates[0]):
         np.testing.assert_allclose(seconds(column, None), [0, np.nan, 0.01])
-
-
-STEPS = np.random.default_rng(0).normal(8333, 20, 500)
-
-
-@pytest.mark.parametrize("values", [np.where(STEPS > 8333, 10, 20), np.r_[0, STEPS], STEPS * 0 + 1])
-def test_steps_since_the_last_row_are_told_from_times(values):
-    assert are_steps(values * 1.0)
-    # a counter that starts anew, times that go back, a coarse clock, and nothing
-    n = np.arange(500)
-    for times in (np.cumsum(values), np.mod(n * 997, 2**16), n % 300, n // 10, 0 * n, n * np.nan):
-        assert not are_steps(times * 1.0)

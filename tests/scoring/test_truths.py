@@ -1,3 +1,5 @@
+"""Truths of test recordings, errors against them, and the curve of the running mean."""
+
 import math
 
 import numpy as np
@@ -24,23 +26,16 @@ def of(samples, figures=FIGURES, rate_hz=RATE_HZ, true_bias=None, tested=(0,)):
     return truths.TestRecording(4, samples, rate_hz, figures, true_bias, 1, np.array(tested))
 
 
-def non_overlapping(one, size):
-    """First samples of the windows that are not dropped."""
-    return usable_starts(one.masked, size)
-
-
 def brute_force(one, size, starts):
-    """Window means and each truth, one window and axis at a time."""
+    """Window means and each truth, one window at a time."""
     n = one.samples.shape[1]
-    means, found = [], {PAPER: [], TRUE: []} | ({DISJOINT: []} if size < n else {})
-    for start in starts:
-        inside = np.arange(start, start + size)
-        means.append([np.nanmean(axis[inside]) for axis in one.samples])
-        found[PAPER].append([np.nanmean(axis) for axis in one.samples])
-        if size < n:
-            found[DISJOINT].append([np.nanmean(np.delete(axis, inside)) for axis in one.samples])
-        found[TRUE].append(list(one.true_bias))
-    return np.array(means), {truth: np.array(values) for truth, values in found.items()}
+    inside = [np.arange(start, start + size) for start in starts]
+    means = np.array([np.nanmean(one.samples[:, part], axis=1) for part in inside])
+    found = {PAPER: np.tile(np.nanmean(one.samples, axis=1), (len(starts), 1)), TRUE: one.true_bias}
+    if size < n:
+        rest = [np.delete(one.samples, part, axis=1) for part in inside]
+        found[DISJOINT] = np.array([np.nanmean(samples, axis=1) for samples in rest])
+    return means, found
 
 
 @pytest.mark.parametrize("masked", [(), (3, 30, 31)])
@@ -52,14 +47,14 @@ def test_truths_are_those_of_brute_force_wherever_the_windows_are(size, starts, 
     found = one.truths(starts, size)
     assert set(found) == set(expected)
     for truth, (value, _) in found.items():
-        np.testing.assert_allclose(value, expected[truth], atol=1e-12)
+        np.testing.assert_allclose(value - expected[truth], 0, atol=1e-12)
 
 
 @pytest.mark.parametrize("figures", [NoiseFigures(1, 0, 0), NoiseFigures(1, 1, 0.5)])
 def test_the_disjoint_variance_is_what_that_truth_scatters_by(figures):
     noise = simulate_noise(
         np.random.default_rng(4),
-        (2000, 3, 48),
+        (1000, 3, 48),
         RATE_HZ,
         np.full(3, figures.white),
         flicker_dps=figures.instability,
@@ -68,7 +63,7 @@ def test_the_disjoint_variance_is_what_that_truth_scatters_by(figures):
     starts = np.array([0, 16, 32])
     found = [of(one, 3 * (figures,)).truths(starts, 16)[DISJOINT] for one in noise]
     scatter = np.array([value for value, _ in found]).var(axis=(0, 2))
-    np.testing.assert_allclose(scatter, found[0][1][:, 0], rtol=0.08)
+    np.testing.assert_allclose(scatter, found[0][1][:, 0], rtol=0.1)
     walks = figures.random_walk > 0
     assert (scatter[0] > 1.2 * scatter[2]) == walks  # what comes later has walked further
 
@@ -117,7 +112,7 @@ def test_the_curve_is_that_of_brute_force(masked):
         np.testing.assert_allclose(first.index, np.array(shown) / RATE_HZ)
         np.testing.assert_allclose(everything.index, np.array(shown) / RATE_HZ)
         for row, length in enumerate(shown):
-            starts = non_overlapping(one, length)
+            starts = usable_starts(one.masked, length)
             means, expected = brute_force(one, length, starts)
             squares = (means - expected[truth]) ** 2
             if truth == DISJOINT:
