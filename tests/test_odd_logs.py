@@ -144,7 +144,7 @@ KINDS: dict[str, tuple[str, list[Any], list[tuple[dict[str, Any], Ending]]]] = {
        for unit, dps in {"rpm": 6, "deg/h": 1 / 3600, "mrad/s": RAD**-1 / 1e3, "°/sec": 1,
                          "rad s^-1": 1 / RAD, "mdps": 1e-3}.items()},
     "33 a level that settles to zero": (f"{T},{G}", [S, FREED + LEVEL * np.exp(-S / 0.6)[:, None]],
-        [({}, Rejected("zero|taken off"))]),
+        [({}, Rejected("subtracts its bias"))]),
     "33 a name of Core Motion": (",".join([T, *(f"motionRotationRate{a}(rad/s)" for a in "XYZ")]),
         [S, FREED * RAD], [({}, Kept((0, 0, 0), "bias"))]),
     "36 lost decimal points": (f"{T},{G}", [S, np.rint(X * 1e8)],

@@ -74,5 +74,9 @@ LAST, BEST = "last", "best"
 """Weights at the last epoch (the paper's way), or at the best validation epoch."""
 
 
+IN_READER = "in `reader:` of the catalog entry in catalog.yml"
+"""Where users give options of the reader, for messages."""
+
+
 class InputError(ValueError):
     """Input that cannot be used; the message says what, where, and what to do."""

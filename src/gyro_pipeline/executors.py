@@ -129,7 +129,7 @@ def _in_processes(
         )
         results = parallel(calls)
     try:
-        with _stopped_workers_named():
+        with _warnings_of_suspended_workers():
             yield from results
     except BrokenProcessPool as error:
         raise InputError(
@@ -155,8 +155,8 @@ def _no_interrupts() -> Iterator[None]:
 
 
 @contextmanager
-def _stopped_workers_named() -> Iterator[None]:
-    """Name the processes that were stopped, which the run would else wait for without a word."""
+def _warnings_of_suspended_workers() -> Iterator[None]:
+    """Warn about suspended workers, for which the run would otherwise wait silently."""
 
     def watch() -> None:
         while not done.wait(_LOG_EVERY_S):

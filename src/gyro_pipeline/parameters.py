@@ -57,12 +57,12 @@ class WarmUp(Parameter):
 
     @field_validator("time_constant_s", mode="before")
     @classmethod
-    def _one_number_is_both(cls, value: Any) -> Any:
+    def _expand_number(cls, value: Any) -> Any:
         return (value, value) if type(value) in (int, float) else value
 
     @field_validator("time_constant_s")
     @classmethod
-    def _the_shortest_is_first(cls, value: tuple[float, float]) -> tuple[float, float]:
+    def _check_order(cls, value: tuple[float, float]) -> tuple[float, float]:
         if value[0] > value[1]:
             raise ValueError(f"time_constant_s: expected shortest, longest; got {value}")
         return value
@@ -494,7 +494,7 @@ class Study(Parameter):
     protocol: Protocol = Field(
         "by_recording",
         description="the test data: recordings of the first IMU, or every IMU in turn, as an "
-        "unseen device (docs/honest_protocol.md)",
+        "unseen device (docs/protocol.md)",
     )
     also: dict[Protocol, list[str]] = Field(
         {}, description="further protocols, and the estimators to compare under each"

@@ -190,8 +190,15 @@ def test_rows_are_named_as_the_file_has_them_and_the_longest_stretch_is_kept(sti
     inspected = inspect(log, RATE_HZ, quality)
     assert (inspected.outcome, inspected.start, inspected.stop) == (REPAIRED, 500, 5700)
     assert [f.check for f in inspected.findings] == ["sample rate", "gaps"]
-    words = "the longest stretch, of 6000 rows, is rows 1001 to 11399 (5 to 56.99 s)"
+    words = "kept are rows 1001 to 11399 (5 to 56.99 s), the longest of 3 stretches without a gap"
     assert detail(inspected, "gaps") == words
+
+
+def test_a_wrong_rate_does_not_hide_two_devices(still, quality):
+    still[1::2] += 1
+    rate = Finding("sample rate", REJECTED, "expected 200 Hz, got 100 Hz")
+    inspected = inspect(Log(still, findings=(rate,)), RATE_HZ, quality)
+    assert [finding.check for finding in inspected.findings] == ["sample rate", "mixed rows"]
 
 
 def test_what_is_masked_at_the_ends_is_cut(still, quality):

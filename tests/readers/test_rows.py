@@ -25,7 +25,7 @@ def read_beside(read):
 
 @pytest.mark.parametrize("numbers", [ROWS % 4, RNG.integers(0, 3, N)], ids=["turns", "random"])
 def test_devices_that_take_turns_are_refused_and_picked(numbers, details, read_beside):
-    with pytest.raises(InputError, match="device_id' alternates among .*by its name.*rows: {dev"):
+    with pytest.raises(InputError, match="device_id' has the values .*by its name.*rows: {dev"):
         read_beside("device_id", numbers, WHITE)
     log = read_beside("device_id", numbers, WHITE, rows={"device_id": 1})
     np.testing.assert_array_equal(log.samples, WHITE[numbers == 1])

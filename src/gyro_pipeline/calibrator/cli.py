@@ -112,8 +112,8 @@ def _parse(text: str) -> Any:
 
 def _name_options(message: str) -> str:
     """A message of a reader, with options of the command line in place of catalog keys."""
+    from gyro_pipeline.conventions import IN_READER  # noqa: PLC0415
     from gyro_pipeline.parameters import ReaderOptions  # noqa: PLC0415
-    from gyro_pipeline.readers.table import IN_READER  # noqa: PLC0415
 
     if IN_READER not in message:
         return message
@@ -180,8 +180,8 @@ def log(files: tuple[Path, ...], **values: Any) -> int:
 
 def _calibrate(path: Path, job: SimpleNamespace) -> int:
     """Calibrate from a file; returns the exit code."""
+    from gyro_pipeline.conventions import IN_READER  # noqa: PLC0415
     from gyro_pipeline.readers import read_log  # noqa: PLC0415
-    from gyro_pipeline.readers.table import IN_READER  # noqa: PLC0415
 
     try:
         recording = read_log(path, job.reader, job.rate_hz)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gyro_pipeline.calibrator.filter import Array
 from gyro_pipeline.conventions import MDPS
-from gyro_pipeline.quality.rest import RestDetector, spent_limits
+from gyro_pipeline.quality.rest import RestDetector, alpha_spending_limits
 
 MOTION, ATTITUDE, NOISE, ROTATION = "motion", "attitude", "noise", "rotation"
 """Alarms: a brief motion, a turn during a motion, and two signs that the device never rested."""
@@ -105,7 +105,7 @@ class RestMonitor:
         self.blocks, squares, self._squares = int(count[-1]), self._squares, self._squares[-1]
         if self.freedom is None:
             return np.full(squares.shape, np.nan)
-        ratio, limits = squares / count[:, None], spent_limits(_FALSE_ALARM / 6)
+        ratio, limits = squares / count[:, None], alpha_spending_limits(_FALSE_ALARM / 6)
         spread = np.sqrt(2 / 9 * (1 / count[:, None] + 1 / self.freedom))
         limit = limits[np.frexp(count)[1] - 1][:, None] * spread
         high = (np.cbrt(ratio) > np.cbrt(_MIN_RISE**2) + limit) & (count >= _MIN_BLOCKS)[:, None]

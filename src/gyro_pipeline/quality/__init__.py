@@ -12,6 +12,7 @@ apart if rows are lost, and may miss more than 16 devices in turn. They take a s
 half, a third or a quarter of the sample rate for several devices.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,7 @@ from gyro_pipeline.quality.rest import Mask
 
 if TYPE_CHECKING:
     from gyro_pipeline.parameters import Quality
+    from gyro_pipeline.quality.recording import Recording
 
 
 @dataclass(frozen=True)
@@ -54,20 +56,13 @@ def inspect(log: Log, rate_hz: float, quality: "Quality") -> Inspected:
         InputError: The samples are not three columns.
     """
     # here, as the calibrator uses the rest detector only, which needs no more than NumPy
-    from gyro_pipeline.quality import masks, motion, values  # noqa: PLC0415
     from gyro_pipeline.quality.recording import Recording  # noqa: PLC0415
 
     if log.samples.shape[1:] != (len(AXES),):
         raise InputError(f"expected samples of 3 axes, (n, 3), got shape {log.samples.shape}")
     recording = Recording(log, rate_hz, quality)
-    for step in (
-        *(masks.cut_zero_rows, masks.mask_non_finite, masks.mask_stuck, values.check_equal_axes),
-        *(masks.mask_dropouts, masks.keep_longest_stretch, masks.require_length),
-        *(values.check_dead_band, values.check_repeats, values.check_steps, motion.check_bias),
-        *(masks.mask_bursts, masks.require_length, values.check_levels, values.check_turns),
-        *(values.check_noise, motion.check_rest, motion.report_drift),
-    ):
-        step(recording)
+    for check in _checks():
+        check(recording)
         if recording.rejected:
             break
     recording.trim()
@@ -75,3 +70,33 @@ def inspect(log: Log, rate_hz: float, quality: "Quality") -> Inspected:
     outcome = max(outcomes, key=(KEPT, REPAIRED, REJECTED).index, default=KEPT)
     masked, start = recording.masked, recording.start
     return Inspected(outcome, start, start + masked.size, masked, tuple(recording.findings))
+
+
+def _checks() -> tuple[Callable[["Recording"], None], ...]:
+    """The checks in their order: each may rely on what the earlier ones masked or rejected."""
+    from gyro_pipeline.quality import masks, motion, values  # noqa: PLC0415 - as above
+
+    return (
+        # rows that hold no measurement
+        masks.cut_zero_rows,
+        masks.mask_non_finite,
+        masks.mask_stuck,
+        values.check_equal_axes,
+        masks.mask_dropouts,
+        masks.keep_longest_stretch,
+        masks.require_length,
+        # values that no gyroscope measures
+        values.check_dead_band,
+        values.check_repeats,
+        values.check_steps,
+        motion.check_bias,
+        # disturbances, which the noise of blocks shows once the rows above are masked
+        masks.mask_bursts,
+        masks.require_length,
+        values.check_levels,
+        values.check_interleaved_devices,
+        values.check_noise,
+        # rest, once everything brief is masked
+        motion.check_rest,
+        motion.report_drift,
+    )

@@ -77,7 +77,8 @@ def keep_longest_stretch(recording: Recording) -> None:
         used = np.add.reduceat(~recording.masked, edges[:-1], dtype=np.intp)
         others = np.ones_like(recording.masked)
         others[slice(*edges[used.argmax() :][:2])] = False
-        detail = f"the longest stretch, of {edges[-1]} rows, is {recording.where(~others)}"
+        kept = recording.where(~others)
+        detail = f"kept are {kept}, the longest of {len(used)} stretches without a gap"
         recording.add("gaps", REPAIRED, detail)
         recording.leave_out(others)
     recording.trim()
@@ -104,19 +105,19 @@ def mask_bursts(recording: Recording, few: int = 3) -> None:
     A shock in the first rows is a start. Anything longer than a shock is a motion.
     """
     size, level = recording.size, median(recording.blocks.means)[:, None]
-    spikes, shocks, start, motion = np.zeros((4, recording.masked.size), bool)
+    kinds = {kind: np.zeros_like(recording.masked) for kind in ("motion", "start", "shocks")}
+    spikes, bursts = np.zeros((2, recording.masked.size), bool)
     for first, last in runs(exceeds_noise(recording)):
         if last - first < few:
             spikes[first:last] = True
         else:
-            shocks[max(first - size, 0) : last + size] = True
+            bursts[max(first - size, 0) : last + size] = True
     longest = recording.quality.shock_s * recording.rate_hz + 2 * size
-    for first, last in runs(shocks):
-        kind = motion if last - first >= longest else shocks if first else start
-        shocks[first:last], kind[first:last] = False, True
-    kinds = {"motion": motion, "start": start, "shocks": shocks, "spikes": spikes}
-    for check, kind in kinds.items():
-        rows = kind & ~recording.masked
+    for first, last in runs(bursts):
+        kind = "motion" if last - first >= longest else "shocks" if first else "start"
+        kinds[kind][first:last] = True
+    for check, bursts_of_kind in (kinds | {"spikes": spikes}).items():
+        rows = bursts_of_kind & ~recording.masked
         if rows.any() and not recording.rejected:
             peaks = np.abs(recording.rates[:, rows] - level).max(axis=1)
             detail = f"up to {peaks.max():.3g} deg/s from the level, axis {AXES[peaks.argmax()]}, "

@@ -28,8 +28,8 @@ def check_bias(recording: Recording, least_dps: float = 3e-3, longest: int = 8) 
         axis = np.argmax(np.abs(level))
         falling = np.abs(means[axis] / level[axis] - 0.5) < 0.3  # noqa: PLR2004
         if np.count_nonzero(falling) <= longest:
-            detail = "the sensor takes its level to zero on all axes; log its raw rates"
-            recording.add("bias taken off", REJECTED, detail)
+            detail = "the sensor subtracts its bias on all axes; log its uncorrected rates"
+            recording.add("bias subtracted", REJECTED, detail)
 
 
 def fit_drift(recording: Recording, shortest: float = 0.5) -> Array:

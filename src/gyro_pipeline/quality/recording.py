@@ -38,8 +38,9 @@ class Recording:
 
     @property
     def rejected(self) -> bool:
-        """Whether a finding rejects the recording."""
-        return any(finding.outcome == REJECTED for finding in self.findings)
+        """Whether a check rejects the recording; a file may have more problems than its rate."""
+        checked = self.findings[len(self.log.findings) :]
+        return any(finding.outcome == REJECTED for finding in checked)
 
     @cached_property
     def used(self) -> Array:

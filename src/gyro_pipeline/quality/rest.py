@@ -101,7 +101,7 @@ class RestDetector:
         observed = (sums[2 * axes : 4 * axes] + prior * white) / np.maximum(worth - 1, 1)
         freedom = np.maximum(worth - 1, 1e-3) * 2 / 3  # of differences between neighbours
         tests = 8 * axes * len(self.lags)  # two sides of the mean, noise, sways; two limits each
-        z = spent_limits(self.false_alarm / tests)[np.frexp(np.maximum(count, 1))[1] - 1]
+        z = alpha_spending_limits(self.false_alarm / tests)[np.frexp(np.maximum(count, 1))[1] - 1]
         chance = np.minimum(
             student_limits(z, freedom) * np.sqrt(np.maximum(observed, white)),
             student_limits(z, worth * (self.size - 1)) * np.sqrt(largest),
@@ -112,8 +112,11 @@ class RestDetector:
 
 
 @cache
-def spent_limits(probability: float) -> Array:
-    """Normal limits for blocks 1, 2-3, 4-7, ..., with shares 1/(1*2), 1/(2*3), ... of it each."""
+def alpha_spending_limits(probability: float) -> Array:
+    """Normal critical values for blocks 1, 2-3, 4-7, ..., so that all tests share a probability.
+
+    The blocks of these epochs spend 1/(1*2), 1/(2*3), ... of the error probability.
+    """
     epochs = [e * (e + 1) * 2 ** (e - 1) for e in range(1, 40)]
     return np.array([-NormalDist().inv_cdf(probability / blocks) for blocks in epochs])
 

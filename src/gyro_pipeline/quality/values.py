@@ -7,12 +7,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from gyro_pipeline.conventions import AXES, MDPS
+from gyro_pipeline.conventions import AXES, IN_READER, MDPS
 from gyro_pipeline.logs import KEPT, REJECTED
 from gyro_pipeline.quality.recording import Recording, median
 from gyro_pipeline.quality.rest import Array
-
-READER = "in `reader:` of the catalog entry in catalog.yml"
 
 
 def check_equal_axes(recording: Recording) -> None:
@@ -21,7 +19,7 @@ def check_equal_axes(recording: Recording) -> None:
         used = recording.used
         if used.size and np.array_equal(used[first], used[second]):
             detail = f"axes {AXES[first]} and {AXES[second]} have the same values"
-            recording.add("equal axes", REJECTED, f"{detail}; correct `columns` {READER}")
+            recording.add("equal axes", REJECTED, f"{detail}; correct `columns` {IN_READER}")
 
 
 def check_repeats(recording: Recording, reported: float = 0.01, most: float = 0.2) -> None:
@@ -39,7 +37,7 @@ def check_repeats(recording: Recording, reported: float = 0.01, most: float = 0.
         share = (same.all(axis=0).mean() - chance) / (1 - chance)
         detail = f"{share:.1%} of the rows repeat the previous row"
         if share > most:
-            detail += f", {1 / (1 - share):.3g} rows per sample; type `repeats: drop` {READER}"
+            detail += f", {1 / (1 - share):.3g} rows per sample; type `repeats: drop` {IN_READER}"
             recording.add("repeated rows", REJECTED, detail)
             return
         if share > reported + 4 * np.sqrt(chance / same.shape[1]):
@@ -134,7 +132,7 @@ def frequent_values(
     return values, counts, excess * (np.count_nonzero(excess) <= most)
 
 
-def check_turns(recording: Recording) -> None:
+def check_interleaved_devices(recording: Recording) -> None:
     """Reject rows of several devices, whose levels alternate, or are far apart in any order."""
     widths = np.maximum(0.4 * np.sqrt(recording.squares), recording.steps)
     sizes = [jump_size(*axis) for axis in zip(recording.changes, widths, strict=True)]
@@ -142,7 +140,7 @@ def check_turns(recording: Recording) -> None:
     if jumps.any():
         detail = f"axis {AXES[jumps.argmax()]} jumps by {jumps.max():.2g} deg/s from row to row; "
         detail += "several sensors in one file? Split it by device, or log a column that names the "
-        detail += f"device and pick one by `rows: {{NAME: VALUE}}` {READER}"
+        detail += f"device and pick one by `rows: {{NAME: VALUE}}` {IN_READER}"
         recording.add("mixed rows", REJECTED, detail)
 
 
@@ -196,4 +194,4 @@ def check_noise(recording: Recording, least_mdps_rts: float = 0.2) -> None:
         recording.add("noise level", REJECTED, f"{detail}the unit (quality.largest_noise_dps)")
     elif density < least_mdps_rts:
         detail = f"N is {density:.2g} mdps sqrt(s), less noise than any MEMS gyroscope has; check "
-        recording.add("little noise", KEPT, f"{detail}the unit (`units` {READER})")
+        recording.add("little noise", KEPT, f"{detail}the unit (`units` {IN_READER})")

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from gyro_pipeline.logs import Log
 from gyro_pipeline.parameters import ReaderOptions
 from gyro_pipeline.readers.columns import Auxiliary, acceleration_of, rate_columns, temperature_of
-from gyro_pipeline.readers.counts import contradict_values, to_signed
+from gyro_pipeline.readers.counts import check_values, to_signed
 from gyro_pipeline.readers.file import File
 from gyro_pipeline.readers.formats import FORMATS
-from gyro_pipeline.readers.rows import contradict_turns, sample_rows
+from gyro_pipeline.readers.rows import check_single_device, sample_rows
 from gyro_pipeline.readers.scales import scale_of
 from gyro_pipeline.readers.stamps import compare_rates, counted_gaps, timing_of
 from gyro_pipeline.readers.table import Table, read_table
@@ -73,9 +73,9 @@ def log_of(
     keep = sample_rows(file, raw)
     timing = timing_of(file, keep)
     raw = raw if keep.all() else raw[keep]
-    rates = _in_dps(file, raw, scale, timing.rate_hz or expected_rate_hz)
-    contradict_values(file, raw, rates, are_counts)
-    contradict_turns(file, {*columns, *temperature[0], *acceleration[0]}, keep, rates)
+    rates = _to_dps(file, raw, scale, timing.rate_hz or expected_rate_hz)
+    check_values(file, raw, rates, are_counts)
+    check_single_device(file, {*columns, *temperature[0], *acceleration[0]}, keep, rates)
     compare_rates(file, timing.rate_hz, expected_rate_hz, keep)
     file.settle()
     gap_rows = np.union1d(timing.gap_rows, counted_gaps(file, keep)).astype(np.intp)
@@ -91,7 +91,7 @@ def log_of(
     )
 
 
-def _in_dps(file: File, raw: Floats, scale: float, rate_hz: float | None) -> Floats:
+def _to_dps(file: File, raw: Floats, scale: float, rate_hz: float | None) -> Floats:
     """Convert the file's numbers to rates; increments are divided by the step between samples."""
     options = file.options
     if options.signed_bits is not None:

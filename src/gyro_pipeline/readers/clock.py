@@ -90,17 +90,17 @@ def _fit(
     # the mean of the steps near the median: losses make others longer, repeated rows shorter
     slopes = np.diff(times) / np.diff(rows)
     middle = _step_over(times, rows, len(rows) / 20), np.quantile(slopes, 0.5, method="lower")
-    near = max((np.abs(slopes - step) < 0.45 * step for step in middle), key=np.count_nonzero)
-    step = float(slopes[near].mean())
+    usual = max((np.abs(slopes - step) < 0.45 * step for step in middle), key=np.count_nonzero)
+    step = float(slopes[usual].mean())
     resolution = _resolution(stamps, np.median(np.diff(times)))
-    doubled = np.diff(rows, prepend=rows[0]) > 1
+    several = np.diff(rows, prepend=rows[0]) > 1  # rows share a stamp
     for _ in range(4):  # gaps depend on the step, and the step on the gaps
         delays = times - step * rows
         scatter = np.ptp(np.quantile(np.diff(delays), [0.15, 0.85]))
         least = max(step / 2, 1.25 * resolution, 2 * scatter)
         losses = _rises(delays, least, step) / step
         losses = np.where(losses < pause, np.rint(losses), losses)
-        repeats = doubled * np.rint(_rises(-delays, least, step) / step)
+        repeats = several * np.rint(_rises(-delays, least, step) / step)
         even = times - step * np.cumsum(losses - repeats)
         step = _step_over(even, rows, 0.9 * len(rows)) or step
     return step, losses, even
@@ -112,17 +112,23 @@ def _rises(delays: Floats, least: float, step: float, near: int = 50, few: int =
     Before a stamp, the envelope is the median of a few delays. After it, it is the least delay of
     near stamps, unless a later stamp has an even lower one, within ten stamps per step of delay.
     """
-    excess = np.diff(delays, prepend=delays[0])
-    rows = np.flatnonzero(excess[: len(delays) - few] > least)
+    jumps = np.diff(delays, prepend=delays[0])
+    late = np.flatnonzero(jumps[: len(delays) - few] > least)
     rises = np.zeros(len(delays))
-    if len(rows):
-        ends = np.minimum(rows + near + 10 * excess[rows] / step, len(delays)).astype(np.intp)
-        spans = np.stack([rows, np.minimum(rows + near, ends - 1), ends], axis=1).ravel()
-        lowest = np.minimum.reduceat(np.append(delays, np.inf), spans)
-        before = np.median([delays[np.maximum(rows - n, 0)] for n in range(1, few + 1)], axis=0)
-        lasting = np.minimum(lowest[::3], lowest[1::3]) - before > least
-        rises[rows] = lasting * np.minimum(lowest[::3] - before, excess[rows])
+    if len(late):
+        far_ends = np.minimum(late + near + 10 * jumps[late] / step, len(delays)).astype(np.intp)
+        near_ends = np.minimum(late + near, far_ends - 1)
+        before = np.median([delays[np.maximum(late - n, 0)] for n in range(1, few + 1)], axis=0)
+        after = _lowest(delays, late, near_ends) - before
+        lasting = np.minimum(after, _lowest(delays, near_ends, far_ends) - before) > least
+        rises[late] = lasting * np.minimum(after, jumps[late])
     return rises
+
+
+def _lowest(delays: Floats, starts: Rows, ends: Rows) -> Floats:
+    """The least delay in each range from a start to before an end, (k,)."""
+    ranges = np.stack([starts, ends], axis=1).ravel()
+    return np.minimum.reduceat(np.append(delays, np.inf), ranges)[::2]
 
 
 def _step_over(times: Floats, rows: Rows, stamps: float) -> float:

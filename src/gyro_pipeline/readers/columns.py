@@ -77,16 +77,17 @@ def _by_options(file: File, columns: Sequence[Column]) -> Columns:
     permuted = [triple for triple in overlapping if {*triple} == {*rates}]
     if overlapping and tuple(rates) not in permuted:
         belong = f"{file.listed((permuted or overlapping)[0])} belong together in this order"
-        file.contradict(f"{intro} by their names {belong}; give these, or no columns")
+        file.add_contradiction(f"{intro} by their names {belong}; give these, or no columns")
     arrays = [INDEX.sub("", header.name) for header in headers]
     samples = min(arrays.count(arrays[number]) for number in rates)
     if samples > 1 and len({arrays[number] for number in rates}) == len(AXES):
-        file.contradict(f"{intro} a row holds {samples} samples; write a row for each sample")
+        text = f"a row holds {samples} samples; write a row for each sample"
+        file.add_contradiction(f"{intro} {text}")
     others = [number for number in rates if not _may_be_rate(file, headers[number])]
     if others or is_quaternion(headers, rates):
         kind = "no angular rate" if others else "of a quaternion"
         text = f"{file.listed(others or rates)} is by name {kind}; give columns of angular rates"
-        file.contradict(f"{intro} {text}")
+        file.add_contradiction(f"{intro} {text}")
     return rates
 
 

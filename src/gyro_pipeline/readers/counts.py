@@ -15,7 +15,7 @@ from gyro_pipeline.readers.file import File
 Floats = NDArray[np.float64]
 
 
-def contradict_values(file: File, raw: Floats, rates: Floats, are_counts: bool) -> None:
+def check_values(file: File, raw: Floats, rates: Floats, are_counts: bool) -> None:
     """Contradict values that no gyroscope at rest measures, unless the options explain them.
 
     Args:
@@ -31,7 +31,7 @@ def contradict_values(file: File, raw: Floats, rates: Floats, are_counts: bool) 
         text = text or ("" if are_counts else lost_decimal_points(raw))
     text = text or ("" if has_offset else implausible_level(rates))
     if text:
-        file.contradict(text)
+        file.add_contradiction(text)
 
 
 def wrapped(values: Floats, bits: Sequence[int] = (*range(12, 25), 32), compact: float = 8) -> str:

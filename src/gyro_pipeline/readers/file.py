@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from gyro_pipeline.conventions import InputError
+from gyro_pipeline.conventions import IN_READER, InputError
 from gyro_pipeline.logs import KEPT, Finding
 from gyro_pipeline.parameters import Column, ReaderOptions
 from gyro_pipeline.readers.formats import Format, format_of
 from gyro_pipeline.readers.names import Header, read_headers
-from gyro_pipeline.readers.table import IN_READER, Table
+from gyro_pipeline.readers.table import Table
 
 
 @dataclass
@@ -32,7 +32,7 @@ class File:
         """Add a finding."""
         self.findings.append(Finding(check, outcome, text))
 
-    def contradict(self, text: str) -> None:
+    def add_contradiction(self, text: str) -> None:
         """Add a contradiction, which is refused unless the options are trusted."""
         self.contradictions.append(text)
 
@@ -47,10 +47,8 @@ class File:
             InputError: A contradiction exists, and the options are not trusted.
         """
         if self.contradictions and self.options.trust is None:
-            others = len(self.contradictions) - 1
-            more = f" (and {others} more)" if others else ""
-            text = f"{self.contradictions[0]}{more}; or, if the options are right, trust: options"
-            raise self.refusal(text)
+            text = "; and ".join(self.contradictions)
+            raise self.refusal(f"{text}; or, if the options are right, trust: options")
         for text in self.contradictions:
             self.note("trust: options", f"overruled: {text}")
 

@@ -8,8 +8,8 @@ import re
 from dataclasses import dataclass
 from functools import lru_cache
 
-from gyro_pipeline.conventions import InputError
-from gyro_pipeline.readers.table import IN_READER, Table
+from gyro_pipeline.conventions import IN_READER, InputError
+from gyro_pipeline.readers.table import Table
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from itertools import islice
 
 import pyarrow as pa
 
-from gyro_pipeline.conventions import InputError
+from gyro_pipeline.conventions import IN_READER, InputError
 from gyro_pipeline.logs import KEPT, Finding
-from gyro_pipeline.readers.table import IN_READER, Table, columns_of, unreadable
+from gyro_pipeline.readers.table import Table, columns_of, unreadable
 
 _CHECKSUM = re.compile(r"\*[0-9A-Fa-f]{2}\s*$")  # of NMEA 0183
 _DATE, _CLOCK = r"\d{4}[-/.]\d\d[-/.]\d\d", r"\d{1,2}:\d\d(?::\d\d)?(?:[.:]\d+|,\d{3})?"

@@ -65,7 +65,7 @@ def _with_value(file: File, number: int, value: str | float, count: int) -> Mask
     if len(mask) != count or not mask.any():
         raise file.refusal(f"expected {count} rows, some with {got}; correct rows")
     if Header(_as_text(value)).quantity not in ("", RATE):
-        file.contradict(f"rows of the options pick, by its name no angular rate, {got}")
+        file.add_contradiction(f"rows of the options pick, by its name no angular rate, {got}")
     return mask
 
 
@@ -96,11 +96,11 @@ def repeats_previous(rates: Floats) -> Mask:
     return np.r_[False, (rates[1:] == rates[:-1]).all(axis=1)]
 
 
-def contradict_turns(file: File, used: Collection[int], keep: Mask, rates: Floats) -> None:
-    """Contradict unused columns that tell that the rows are of several devices.
+def check_single_device(file: File, used: Collection[int], keep: Mask, rates: Floats) -> None:
+    """Add a contradiction for each unused column by which the rows are of several devices.
 
-    Such a column has few values: texts that alternate, values of a column that is named as a
-    device, or numbers with which the rates change.
+    Such a column has few values: texts that say what a row is, values of a column that is named as
+    a device, or numbers with which the rates change.
 
     Args:
         file: Collects the contradictions.
@@ -109,24 +109,32 @@ def contradict_turns(file: File, used: Collection[int], keep: Mask, rates: Float
         rates: (m, 3), rates of the remaining rows.
     """
     for number, (header, column) in enumerate(zip(file.headers, file.table.columns, strict=True)):
-        measures = column.dtype.kind == "f" and (header.unit_text or header.names_time)
-        if number in used or measures or len(column) != len(keep):
-            continue
-        cells = column[:: len(column) // 100 + 1].tolist()
-        if len({cell for cell in cells if cell == cell}) > MOST_VALUES:  # noqa: PLR0124 - not NaN
+        if number in used or len(column) != len(keep) or not _may_name_devices(header, column):
             continue
         codes, texts = _coded(column[keep])
-        if 1 < len(texts) <= MOST_VALUES and (
-            evidence := _evidence(header.name, codes, texts) or _change(rates, codes)
-        ):
-            # to pick: a rate by its word, else one without a quantity
-            ranked = [text for q in (RATE, "") for text in texts if Header(text).quantity == q]
-            pick = next((text for text in ranked if text), "…")
-            file.contradict(
-                f"{file.listed([number])} alternates among {_with_counts(codes, texts)}, "
-                f"{evidence}, but a recording is of one device; pick its rows, such as rows: "
-                f"{{{file.table.names[number] or number}: {pick}}}"
+        evidence = ""
+        if 1 < len(texts) <= MOST_VALUES:
+            evidence = _evidence(header.name, codes, texts) or _change(rates, codes)
+        if evidence:
+            file.add_contradiction(
+                f"{file.listed([number])} has the values {_with_counts(codes, texts)}, {evidence}, "
+                "but a recording is of one device; pick its rows, such as rows: "
+                f"{{{file.table.names[number] or number}: {_suggestion(texts)}}}"
             )
+
+
+def _may_name_devices(header: Header, column: NDArray[Any]) -> bool:
+    """Whether a column has no unit or name of a measurement, and few values in a sample of rows."""
+    if column.dtype.kind == "f" and (header.unit_text or header.names_time):
+        return False
+    cells = column[:: len(column) // 100 + 1].tolist()
+    return len({cell for cell in cells if cell == cell}) <= MOST_VALUES  # noqa: PLR0124 - not NaN
+
+
+def _suggestion(texts: Texts) -> str:
+    """The value whose rows are probably wanted: a word for a rate, else one without a quantity."""
+    ranked = [text for q in (RATE, "") for text in texts if Header(text).quantity == q]
+    return next((text for text in ranked if text), "…")
 
 
 def _evidence(name: str, codes: Codes, texts: Texts) -> str:

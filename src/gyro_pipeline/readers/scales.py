@@ -56,7 +56,7 @@ def scale_of(file: File, rates: Sequence[int]) -> tuple[float, bool]:
             text = f"{first}, but {other}, of {names}"
             if not by_options:
                 raise file.refusal(f"{text}; give units and trust: options")
-            file.contradict(f"{text}; correct units")
+            file.add_contradiction(f"{text}; correct units")
     scale, are_counts = unit.factor, unit.quantity == "count"
     if are_counts and not by_options and scale == 1:
         text = f"{names} are raw counts: give units: raw and scale_dps, deg/s per count{to_type},"
@@ -64,14 +64,14 @@ def scale_of(file: File, rates: Sequence[int]) -> tuple[float, bool]:
     for where, readings in factors.items():
         equal = [reading for reading, dps in readings.items() if isclose(dps, scale, rel_tol=1e-3)]
         if not equal:
-            file.contradict(
+            file.add_contradiction(
                 f"{where}, but the scale is {scale:g} deg/s; give {_options_for(readings)}"
             )
         elif len(readings) > 1:
             file.note("scale", f"{where}, which is taken for {equal[0]}")
     if file.options.scale_dps is None and all(_FACTOR.search(file.table.names[n]) for n in rates):
         text = f"{names} name a factor, and the scale is {scale:g} deg/s"
-        file.contradict(f"{text}; give units: raw and scale_dps, deg/s per count")
+        file.add_contradiction(f"{text}; give units: raw and scale_dps, deg/s per count")
     return scale, are_counts
 
 
@@ -110,7 +110,7 @@ def _of_headers(file: File, rates: Sequence[int]) -> Iterator[Statement]:
         angles = "give increments: true if they are angles turned since the last row"
         hint = angles if others[0].measures("angle") else "give columns of angular rates"
         names = f"{file.listed(rates)} say {others[0].unit_text!r}"
-        file.contradict(f"{names}, but that is no {kind}; {hint}")
+        file.add_contradiction(f"{names}, but that is no {kind}; {hint}")
     units = {h.unit: h.unit_text for h in headers if h.unit and h not in others}
     yield from ((f"the header says {text}", unit) for unit, text in units.items())
 

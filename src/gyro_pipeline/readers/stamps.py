@@ -5,6 +5,7 @@ If no column of times is found, or its unit is unknown, a finding says so.
 
 import re
 from math import isclose
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,14 @@ _TIME_SCALE = re.compile(r"(?im)^\W*t(?:ime)?[ _]?scale\W+([\d.]+(?:e[-+]?\d+)?)
 _UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
+class TimeColumn(NamedTuple):
+    """A candidate for the column of times."""
+
+    number: int
+    unit_s: float | None  # seconds per unit, by the file
+    by_name: bool  # whether its name, its content or the options say that it holds times
+
+
 def timing_of(file: File, keep: Mask) -> Timing:
     """Rate and gaps of the rows in the mask ``keep`` (n,).
 
@@ -47,11 +56,12 @@ def timing_of(file: File, keep: Mask) -> Timing:
             continue
         if stepwise:
             times = np.cumsum(np.nan_to_num(times))  # over all rows, including those left out
-        if _increase(times[keep], 0.0 if by_name else 0.95):
+        least_share = 0.0 if by_name else 0.95  # other columns must prove that they hold times
+        if _increase(times[keep], least_share):
             unit_s = _unit_s(file, number, header_s)
             timing = from_stamps(times[keep], unit_s, np.flatnonzero(keep))
             file.findings += timing.findings
-            _contradict_rate(file, number, timing.rate_hz, unit_s)
+            _check_rate(file, number, timing.rate_hz, unit_s)
             return timing
     if file.options.time_column is not None:
         problem = problem or f"{file.options.time_column!r} holds no times that can be read"
@@ -71,8 +81,8 @@ def _increase(times: Floats, share: float) -> bool:
     return share == 0 or bool(np.count_nonzero(np.diff(finite) >= 0) > share * (len(finite) - 1))
 
 
-def time_columns(file: File) -> list[tuple[int, float | None, bool]]:
-    """Candidates for columns of times: number, seconds per unit by the file, and whether by name.
+def time_columns(file: File) -> list[TimeColumn]:
+    """Candidates for the column of times.
 
     The format's columns come first, then the others in order; columns with a name of times and an
     uncontradicted unit come before the rest. A column without such a name must increase.
@@ -88,7 +98,7 @@ def time_columns(file: File) -> list[tuple[int, float | None, bool]]:
         by_name = is_text or column is not None or number in by_format or header.names_time
         certain = is_text or len({unit_s, options_s} - {None}) == 1
         if by_name or (unit_s and not header.names_duration):
-            candidates.append(((not by_name, not certain), (number, unit_s, by_name)))
+            candidates.append(((not by_name, not certain), TimeColumn(number, unit_s, by_name)))
     return [candidate for _, candidate in sorted(candidates, key=lambda pair: pair[0])]
 
 
@@ -111,7 +121,7 @@ def _unit_s(file: File, number: int, header_s: float | None) -> float | None:
     }.items():
         if unit_s and stated_s and not isclose(stated_s, unit_s):
             text = f"a unit of {stated_s:g} s, but {unit_s:g} s is used; correct time_units"
-            file.contradict(f"{where} {text}")
+            file.add_contradiction(f"{where} {text}")
     if not unit_s:
         text = f"{name} has no unit: the rate is not measured; give time_units"
         if file.options.time_column is not None:
@@ -120,7 +130,7 @@ def _unit_s(file: File, number: int, header_s: float | None) -> float | None:
     return unit_s
 
 
-def _contradict_rate(
+def _check_rate(
     file: File, number: int, hz: float | None, unit_s: float | None,
     slow: float = 0.1, fast: float = 2e4,
 ) -> None:  # fmt: skip
@@ -128,7 +138,7 @@ def _contradict_rate(
     if hz and unit_s and not slow <= hz <= fast:
         rates = {u: hz * unit_s / s for u, s in _UNITS_S.items() if 1 <= hz * unit_s / s < fast}
         units = [f"time_units: {unit}, which makes {rate:.6g} Hz" for unit, rate in rates.items()]
-        file.contradict(
+        file.add_contradiction(
             f"{file.listed([number])}, in units of {unit_s:g} s, makes {hz:.6g} Hz, at which no "
             f"gyroscope is read; give {', or '.join(units) or 'time_units'}"
         )
@@ -163,4 +173,4 @@ def compare_rates(file: File, rate_hz: float | None, expected_hz: float | None, 
     hz, source = (rate_hz, "measured") if rate_hz else (expected_hz, "expected")
     if stated_hz and hz and abs(hz / stated_hz - 1) > tolerance:
         text = f"lines above the header state {stated_hz:g} Hz, {hz:.6g} Hz is {source}"
-        file.contradict(f"{text}; give time_units")
+        file.add_contradiction(f"{text}; give time_units")

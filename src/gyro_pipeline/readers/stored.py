@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gyro_pipeline.conventions import AXES, InputError
+from gyro_pipeline.conventions import AXES, IN_READER, InputError
 from gyro_pipeline.parameters import ReaderOptions
 from gyro_pipeline.readers import mat5
-from gyro_pipeline.readers.table import IN_READER, Reader, Table, column
+from gyro_pipeline.readers.table import Reader, Table, column
 
 
 def check_claim(path: Path, size: float, options: ReaderOptions) -> None:

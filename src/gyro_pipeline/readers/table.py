@@ -16,11 +16,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from gyro_pipeline.conventions import InputError
+from gyro_pipeline.conventions import IN_READER, InputError
 from gyro_pipeline.logs import KEPT, Finding
 from gyro_pipeline.parameters import ReaderOptions
-
-IN_READER = "in `reader:` of the catalog entry in catalog.yml"
 
 _NUMBER = r"^[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|(?i:inf|infinity|nan))$"
 
@@ -84,7 +82,7 @@ def column(values: NDArray[Any]) -> NDArray[Any]:
     if values.dtype.kind in "mM":
         return values.astype(f"{values.dtype.kind}8[ns]")
     texts = [v.decode("utf-8", "replace") if isinstance(v, bytes) else v for v in values.tolist()]
-    return _of_texts(pa.array([t if t is None else str(t) for t in texts], pa.string()))[0]
+    return _to_numbers(pa.array([t if t is None else str(t) for t in texts], pa.string()))[0]
 
 
 def columns_of(
@@ -93,7 +91,7 @@ def columns_of(
     """Columns from Arrow strings or numbers, and the texts in columns of numbers, by row."""
     columns, damage = [], dict[int, str]()
     for number, (name, cells) in enumerate(zip(names, texts, strict=True)):
-        values, unreadable_cells = _of_texts(cells, decimal_point)
+        values, unreadable_cells = _to_numbers(cells, decimal_point)
         columns.append(values)
         damage |= {
             row: f"{text[:40]!r} in {name or number!r}" for row, text in unreadable_cells.items()
@@ -111,7 +109,7 @@ def unreadable(
         yield Finding("unreadable rows", KEPT, detail + first + ", …" * (len(damage) > 3))  # noqa: PLR2004
 
 
-def _of_texts(texts: Any, decimal_point: str = ".") -> tuple[NDArray[Any], dict[int, str]]:
+def _to_numbers(texts: Any, decimal_point: str = ".") -> tuple[NDArray[Any], dict[int, str]]:
     """Convert Arrow strings to numbers if almost all are numbers, else to texts.
 
     Numbers with thousands separators, or with a point where commas are decimal, are texts.

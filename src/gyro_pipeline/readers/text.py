@@ -17,10 +17,10 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.csv
 
-from gyro_pipeline.conventions import InputError
+from gyro_pipeline.conventions import IN_READER, InputError
 from gyro_pipeline.parameters import ReaderOptions
 from gyro_pipeline.readers.lines import advice, read_lines
-from gyro_pipeline.readers.table import IN_READER, Table, columns_of, few, unreadable
+from gyro_pipeline.readers.table import Table, columns_of, few, unreadable
 
 DELIMITERS = ",;\t "  # a blank stands for one or more blanks
 

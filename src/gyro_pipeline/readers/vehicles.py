@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from gyro_pipeline.conventions import AXES, InputError
+from gyro_pipeline.conventions import AXES, IN_READER, InputError
 from gyro_pipeline.logs import KEPT, Finding
 from gyro_pipeline.parameters import ReaderOptions
-from gyro_pipeline.readers.table import IN_READER, Reader, Table
+from gyro_pipeline.readers.table import Reader, Table
 
 Stream = tuple[str, int | None]
 """A topic, and the number of the device in formats that have one."""

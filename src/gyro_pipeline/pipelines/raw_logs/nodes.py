@@ -23,7 +23,7 @@ from gyro_pipeline.splits import split_recordings
 logger = logging.getLogger(__name__)
 
 _MIN_PARALLEL_BYTES = 10**8
-"""Fewer bytes are read by this process before other processes could start."""
+"""Reading fewer bytes here is faster than starting other processes."""
 _BATCH, _BATCH_BYTES = 16, 16 * 10**6
 """Maximum number of recordings, and their bytes, that go to a process together."""
 _USED_COLUMNS = ["start", "stop", "masked"]

@@ -36,7 +36,7 @@ from gyro_pipeline.windows import describe_losses, usable_windows, window_size
 logger = logging.getLogger(__name__)
 
 APART = {BY_RECORDING: "recording", K_FOLD: "recording", LEAVE_ONE_DEVICE_OUT: "imu"}
-"""Column whose values have only one role in a fold of an honest protocol; leaks have none."""
+"""Column whose values have only one role in a fold of a protocol without leaks; leaks have none."""
 
 _KEYS = ["imu", "recording"]
 

@@ -1,7 +1,8 @@
 """Protocols: functions that decide which windows train, validate and test in each fold.
 
-In an honest protocol a recording (of all IMUs, which were recorded together) or a device has only
-one role in a fold. The leaks of the leak study break this rule on purpose.
+Without a leak, a recording (of all IMUs, which were recorded together) or a device has only one
+role in a fold. The leaks of the leak study break this rule on purpose: they yield a fold twice, once
+for each role of its windows.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -128,7 +129,7 @@ def test_in_training(candidates: Candidates) -> Folds:
 
 
 def best_epoch_on_test(candidates: Candidates) -> Folds:
-    """Leak: an honest k-fold by recording whose test windows also choose the best epoch."""
+    """Leak: a k-fold by recording whose test windows also choose the best epoch."""
     for fold, roles in k_fold(candidates):
         if fold != ALL_RECORDINGS:
             yield fold, roles
@@ -149,7 +150,7 @@ PROTOCOLS: Mapping[str, Callable[[Candidates], Folds]] = {
 def check_table(
     table: pd.DataFrame, apart: str, contents: pd.DataFrame, drawn_from: Sequence[int]
 ) -> None:
-    """Refuse a windows table that breaks the rules of honest protocols.
+    """Refuse a windows table that breaks the rules of protocols without leaks.
 
     Args:
         table: Columns ``fold, role, origin, imu, recording`` and more.
