@@ -1,8 +1,8 @@
 """Protocols: functions that decide which windows train, validate and test in each fold.
 
 Without a leak, a recording (of all IMUs, which were recorded together) or a device has only one
-role in a fold. The leaks of the leak study break this rule on purpose: they yield a fold twice, once
-for each role of its windows.
+role in a fold. The leaks of the leak study break this rule on purpose. One of them yields a fold
+twice, once for each role of its windows.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
