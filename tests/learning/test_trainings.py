@@ -174,3 +174,21 @@ def test_the_gpu_is_used_where_there_is_one_and_asked_for_nowhere_else(monkeypat
         monkeypatch.setattr(torch.cuda, "is_available", lambda cuda=cuda: cuda)
         place = batch_device(executor)
         assert (place and place.type) == chosen
+
+
+def test_estimates_are_equal_for_any_number_of_threads():
+    sizes = {"channels": 8, "kernel": 10, "stride": 10, "pool": 8, "hidden": 32}
+    design = Design(PAPER, 3, 108, sizes)
+    weights = design.build(seed=0).state_dict()
+    scaling = {"centre": torch.zeros(3), "input_scale": 1.0, "target_scale": 1.0}
+    network = StoredNetwork({"network": vars(design), "scaling": scaling, "last": weights}, "last")
+    windows = np.random.default_rng(0).normal(size=(8, 3, 108)).astype(np.float32)
+    threads, estimates = torch.get_num_threads(), []
+    try:
+        for number in (1, 2, 4):
+            torch.set_num_threads(number)
+            estimates.append(network.biases(windows))
+            assert torch.get_num_threads() == number
+    finally:
+        torch.set_num_threads(threads)
+    np.testing.assert_array_equal(estimates[1:], [estimates[0]] * 2)

@@ -1,7 +1,8 @@
 """A training as a pure function: all inputs are arguments, all results are returned."""
 
 import time
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -182,5 +183,17 @@ class StoredNetwork:
         scaled = (windows - centre[:, None].astype(np.float32)) / self._scaling["input_scale"]
         inputs = aligned_zeros((len(windows), *self._layout.shape))
         self._layout.write(scaled.transpose(1, 0, 2), inputs)
-        outputs = predict(self._network, torch.from_numpy(inputs)).double().numpy()
+        with _one_thread():
+            outputs = predict(self._network, torch.from_numpy(inputs)).double().numpy()
         return np.asarray(centre + self._scaling["target_scale"] * outputs)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Use one thread: PyTorch's results for a few windows depend on the number of threads."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
