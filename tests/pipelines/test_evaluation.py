@@ -64,7 +64,9 @@ class Off(Estimator):
     """Knows the mean of the whole recording and is off by a constant."""
 
     def __init__(self, bench, by):
-        self._means = {r.number: r.samples.mean(axis=1, dtype=np.float64) for r in bench.tested}
+        self._means = {
+            r.number: r.samples.mean(axis=1, dtype=np.float64) for r in bench.test_recordings
+        }
         self._by = by
 
     def _estimate(self, windows):

@@ -20,7 +20,6 @@ from gyro_pipeline.scoring.scores import (
     leave_one_out,
     paired_difference,
     prior_conflict,
-    rmse_difference,
     score,
     squared_errors,
     with_interval,
@@ -226,11 +225,11 @@ def test_a_difference_is_paired_over_recordings():
     hard = generator.uniform(0.1, 10, (30, 1))  # what makes a recording hard for both
     worse = squares(hard * [1.1, -1.1])
     better, weights = squares(hard * [1, -1]), leave_one_out(30)
-    less = rmse_difference(better, worse, weights)
+    less = paired_difference(better, worse, weights, root=True)
     whole = np.sqrt((hard**2).mean())
     assert less.value == pytest.approx(-0.1 * whole)
     assert -0.15 * whole < less.lo < less.value < less.hi < -0.05 * whole
-    own = rmse_difference(worse, worse, weights)
+    own = paired_difference(worse, worse, weights, root=True)
     assert own.value == own.lo == own.hi == 0
     square = paired_difference(better, worse, weights, 99)
     assert square.value == pytest.approx((1 - 1.1**2) * (hard**2).mean())

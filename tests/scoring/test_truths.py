@@ -79,7 +79,7 @@ def test_error_table_by_hand():
     samples = np.array([[1.0, 3, 5, 7, 100], [0, 0, 0, 0, 5], [2, 2, 2, 2, 2]])
     one = of(samples, rate_hz=2.0, true_bias=np.array([1.0, 1, 1]), tested=(0, 3))
     estimates, sigma = np.array([[2.0, 0, 2], [6, 1, 3]]), np.arange(6.0).reshape(2, 3)
-    known = one.truths(one.tested, 2).items()
+    known = one.truths(one.starts, 2).items()
     table = truths.stack_columns(
         [truths.error_columns(one, *each, estimates, sigma) for each in known]
     )

@@ -59,6 +59,11 @@ class Estimate:
     lo: float | None = None
     hi: float | None = None
 
+    def lies_above(self, other: "Estimate") -> bool:
+        """Whether the entire interval lies above that of another estimate."""
+        lo, value, hi = np.array([self.lo, other.value, other.hi], float)
+        return bool(lo > (value if np.isnan(hi) else hi))
+
 
 def clusters(table: pd.DataFrame) -> pd.Series:
     """The units that a jackknife leaves out: recordings, or devices where several are tested.
@@ -284,35 +289,23 @@ def paired_difference(
     reference: SquaredErrors,
     weights: np.ndarray,
     confidence_pct: float = CONFIDENCE_PCT,
+    root: bool = False,
 ) -> Estimate:
-    """Mean squared error of an estimator minus that of a reference on the same windows.
+    """Mean squared error, or RMSE, of an estimator minus that of a reference on the same windows.
 
     Args:
         errors: Squared errors of the estimator.
         reference: Squared errors of the reference, for the same recordings.
         weights: From :func:`leave_one_out`; a recording is left out of both at once.
         confidence_pct: Confidence of the interval, percent.
+        root: Whether RMSEs are compared, deg/s, rather than mean squares, (deg/s)^2.
 
     Returns:
-        (deg/s)^2; negative where the estimator is better, significantly so if both ends are.
+        Negative where the estimator is better, significantly so if both ends are.
     """
-    return with_interval(errors.mean(weights) - reference.mean(weights), confidence_pct)
-
-
-def rmse_difference(
-    errors: SquaredErrors, reference: SquaredErrors, weights: np.ndarray
-) -> Estimate:
-    """RMSE of an estimator minus that of a reference on the same windows, paired over recordings.
-
-    Args:
-        errors: Squared errors of the estimator.
-        reference: Squared errors of the reference, in the same order of recordings.
-        weights: From :func:`leave_one_out`.
-
-    Returns:
-        deg/s; negative where the estimator is better.
-    """
-    return with_interval(np.sqrt(errors.mean(weights)) - np.sqrt(reference.mean(weights)))
+    ours, theirs = (squares.mean(weights) for squares in (errors, reference))
+    difference = np.sqrt(ours) - np.sqrt(theirs) if root else ours - theirs
+    return with_interval(difference, confidence_pct)
 
 
 def gain_difference(

@@ -32,7 +32,7 @@ class TestRecording:
         noise: N, B and K of each axis from training recordings, or the simulated values.
         true_bias: Simulated bias, shape (3,), deg/s; None for measured data.
         imu: Number of the IMU.
-        tested: First samples of the test windows, in order.
+        starts: First samples of the test windows, in order.
     """
 
     number: int
@@ -41,7 +41,7 @@ class TestRecording:
     noise: tuple[NoiseFigures, ...]
     true_bias: np.ndarray | None
     imu: int
-    tested: np.ndarray
+    starts: np.ndarray
 
     @cached_property
     def running_sums(self) -> np.ndarray:
@@ -141,7 +141,7 @@ def error_columns(
         "imu": np.full(rows, recording.imu),
         "recording": np.full(rows, recording.number),
         "window": np.repeat(np.arange(n), len(AXES)),
-        "start": np.repeat(recording.tested, len(AXES)),
+        "start": np.repeat(recording.starts, len(AXES)),
         "axis": np.tile(AXES, n),
         "truth": np.full(rows, truth),
         "error_dps": (estimates - value).ravel(),

@@ -28,20 +28,14 @@ from gyro_pipeline.physics.ceiling import oracle
 from gyro_pipeline.physics.recording_model import LinearEstimate, RecordingModel, best_linear
 from gyro_pipeline.pipelines.evaluation.ceilings import Ceilings
 from gyro_pipeline.pipelines.evaluation.device import TestDevice
+from gyro_pipeline.scoring.scorer import Scorer, View, squares_by_view
 from gyro_pipeline.scoring.scores import (
     Estimate,
     SquaredErrors,
-    WeightedCurve,
     beats_oracle,
-    clusters,
     coverage,
-    curve_errors,
-    gain_pct,
-    leave_one_out,
     prior_conflict,
-    score,
     squared_errors,
-    with_interval,
 )
 from gyro_pipeline.scoring.truths import (
     TestRecording,
@@ -84,13 +78,13 @@ class Bench:
         return self.recordings.sizes["sample"] / self.recordings.attrs["rate_hz"]
 
     @cached_property
-    def tested(self) -> list[TestRecording]:
+    def test_recordings(self) -> list[TestRecording]:
         """The test recordings, with their noise and starts of windows."""
-        simulated, tested = "true_bias" in self.recordings, []
+        simulated, recordings = "true_bias" in self.recordings, []
         for key, rows in self.tests.groupby(["imu", "recording"]):
             imu, number = map(int, map(str, key))
             recording = self.recordings.sel(imu=imu, recording=number)
-            tested.append(
+            recordings.append(
                 TestRecording(
                     number=number,
                     samples=recording.angular_rate.to_numpy(),
@@ -98,15 +92,15 @@ class Bench:
                     noise=self.device.figures[self._axes(imu)],
                     true_bias=recording.true_bias.to_numpy() if simulated else None,
                     imu=imu,
-                    tested=np.unique(rows.start.to_numpy()),
+                    starts=np.unique(rows.start.to_numpy()),
                 )
             )
-        return tested
+        return recordings
 
     @cached_property
     def _truths(self) -> list[dict[str, tuple[np.ndarray, np.ndarray]]]:
         """The truths of each test recording."""
-        return [recording.truths(recording.tested, self.size) for recording in self.tested]
+        return [recording.truths(recording.starts, self.size) for recording in self.test_recordings]
 
     def _axes(self, imu: int) -> slice:
         """Position of the axes of an IMU among those of ``device``."""
@@ -127,7 +121,7 @@ class Bench:
         """
         fits = {fold: self._with_calibrations(str(fold), fit) for fold, fit in estimators.items()}
         parts = []
-        for recording, truths in zip(self.tested, self._truths, strict=True):
+        for recording, truths in zip(self.test_recordings, self._truths, strict=True):
             estimates = self._estimates(fits, recording, imus)
             parts += [
                 error_columns(recording, truth, value, *estimates[TARGET_OF[truth]])
@@ -143,11 +137,11 @@ class Bench:
         return errors
 
     def _with_calibrations(self, fold: str, estimator: Estimator) -> Estimator:
-        """The fit of a fold with its test recordings as calibrations, for the later ones."""
+        """The fit of a fold, which may use a test recording as a calibration of later ones."""
         numbers = np.unique(self.tests.recording[self.tests.fold == fold])
         if len(self.device.imus) > 1:
             return estimator
-        means = {recording.number: recording.mean for recording in self.tested}
+        means = {recording.number: recording.mean for recording in self.test_recordings}
         return estimator.with_calibrations(numbers, np.stack([means[n] for n in numbers.tolist()]))
 
     def _estimates(
@@ -159,12 +153,12 @@ class Bench:
             rates = self.recordings.angular_rate.isel(imu=slice(imus))
             samples = np.concatenate(rates.sel(recording=recording.number).to_numpy())
         rows = self._rows(recording)
-        shape = (len(recording.tested), len(AXES))
+        shape = (len(recording.starts), len(AXES))
         estimates = {t: (np.full(shape, np.nan), np.full(shape, np.nan)) for t in TARGETS}
         for fold, in_fold in rows.groupby("fold", observed=True):
             starts = np.sort(in_fold.start.to_numpy())
-            positions = np.searchsorted(recording.tested, starts)
-            # even where the IMUs beside the tested one lost samples
+            positions = np.searchsorted(recording.starts, starts)
+            # windows count also where the IMUs beside the tested one lost samples
             windows = windows_at(samples, self.size, starts).transpose(1, 0, 2)
             starts_s = starts / self.recordings.attrs["rate_hz"]
             for target, arrays in estimates.items():
@@ -182,32 +176,20 @@ class Bench:
         return self.errors(dict.fromkeys(folds, RunningMean()))
 
     @cached_property
-    def _means(self) -> dict[tuple[str, str], SquaredErrors]:
-        """Squared errors of the running mean by truth and windows."""
-        return _by_view(self.mean_errors)
-
-    @cached_property
-    def _references(self) -> dict[str, dict[tuple[str, str], SquaredErrors]]:
+    def _references(self) -> dict[str, dict[View, SquaredErrors]]:
         """Squared errors of the oracle and the constant, if they exist."""
         tables = {"oracle": self.oracle_errors, "constant": self.constant_errors}
-        return {name: _by_view(errors) for name, errors in tables.items() if errors is not None}
-
-    @cached_property
-    def _weights(self) -> np.ndarray:
-        """Weights of recordings, with each left out in turn."""
-        return leave_one_out(int(clusters(self.mean_errors).nunique()))
+        return {n: squares_by_view(errors) for n, errors in tables.items() if errors is not None}
 
     @cached_property
     def curve(self) -> pd.DataFrame:
         """The running-mean curve of every test recording."""
-        curves = [running_mean_curve(recording, self.size) for recording in self.tested]
+        curves = [running_mean_curve(recording, self.size) for recording in self.test_recordings]
         return pd.concat(curves, ignore_index=True)
 
     @cached_property
-    def curves(self) -> dict[tuple[str, str], WeightedCurve]:
-        """The running-mean curve by truth and windows, with each recording left out in turn."""
-        views = product(self.curve.truth.unique(), (FIRST, ALL))
-        return {view: curve_errors(self.curve, *view).of(self._weights) for view in views}
+    def _scorer(self) -> Scorer:
+        return Scorer(self.mean_errors, self.curve, self.window_s)
 
     @cached_property
     def oracle_errors(self) -> pd.DataFrame | None:
@@ -232,7 +214,7 @@ class Bench:
         self, estimate: Callable[[TestRecording, str], np.ndarray]
     ) -> pd.DataFrame:
         parts = []
-        for recording, truths in zip(self.tested, self._truths, strict=True):
+        for recording, truths in zip(self.test_recordings, self._truths, strict=True):
             for truth, value in truths.items():
                 biases = estimate(recording, truth)
                 sigma = np.full(biases.shape, np.nan)
@@ -247,12 +229,14 @@ class Bench:
         """
         if not self.labels:
             return {}
-        means = {(recording.imu, recording.number): recording.mean for recording in self.tested}
+        means = {
+            (recording.imu, recording.number): recording.mean for recording in self.test_recordings
+        }
         p_values = []
         for fold, rows in self.tests.groupby("fold", observed=True):
             keys = rows[["imu", "recording"]].drop_duplicates().itertuples(index=False, name=None)
-            tested = np.stack([means[key] for key in keys])
-            p_values.append(prior_conflict(self.labels[str(fold)], tested))
+            of_fold = np.stack([means[key] for key in keys])
+            p_values.append(prior_conflict(self.labels[str(fold)], of_fold))
         least = np.minimum(len(p_values) * np.min(p_values, axis=0), 1.0)
         return dict(zip(AXES, least.tolist(), strict=True))
 
@@ -266,11 +250,11 @@ class Bench:
         device, size = self.device, self.size
         if device.models is None:
             assert device.unit_bias is not None
-            means = recording.window_means(recording.tested, size)
+            means = recording.window_means(recording.starts, size)
             axes = self._axes(recording.imu)
             prior = device.unit_bias[axes], device.spread[0, axes], device.noise[axes]
             return oracle(means, *prior, self.window_s, self.recording_s, truth)
-        starts = recording.tested
+        starts = recording.starts
         windows = cut_windows(recording.samples, size, starts)
         estimates = [
             [
@@ -303,7 +287,7 @@ class Bench:
             return {}
         return {
             (axis, model.time_constant_s): model
-            for recording in self.tested
+            for recording in self.test_recordings
             for axis, model in self._models(recording)
         }
 
@@ -325,64 +309,54 @@ class Bench:
         samples, rate_hz = self.recordings.sizes["sample"], self.recordings.attrs["rate_hz"]
         return Ceilings(self.device, distinct, self.size, samples, rate_hz)
 
-    def scores(self, errors: pd.DataFrame, weights: str) -> pd.DataFrame:
+    def scores(self, errors: pd.DataFrame, epoch: str) -> pd.DataFrame:
         """All finite scores of a table of errors.
 
         Args:
             errors: Errors from :meth:`errors`.
-            weights: ``last``, or ``best`` for a network.
+            epoch: ``last``, or ``best`` for a network.
 
         Returns:
-            Columns ``weights, truth, windows, score, value, lo, hi``; ``lo`` and ``hi`` are the
-            ends of the 95 % interval, None without an interval.
+            Columns ``weights, truth, windows, score, value, lo, hi``: the epoch of the weights of
+            a network, the score, and the ends of its 95 % interval, None without an interval.
         """
         rows = []
         for truth, windows in product(errors.truth.unique(), (FIRST, ALL)):
-            squares, mean = squared_errors(errors, truth, windows), self._means[truth, windows]
-            curve = self.curves[truth, windows]
-            scores = score(squares, mean, curve, self.window_s, self._weights)
-            if weights == LAST:
-                scores |= self.ceilings.of(truth, windows) | self._realised(truth, windows)
-            if truth != DISJOINT:
-                scores |= self._gains_by_axis(errors, truth, windows)
-            if windows == ALL and truth != DISJOINT and errors.sigma_dps.notna().any():
-                for name, sigmas in SIGMAS.items():
-                    scores[name] = Estimate(100 * coverage(errors, truth, sigmas))
-            if "oracle" in self._references and len(self._weights) > 1:
-                p = beats_oracle(squares, self._references["oracle"][truth, windows])
-                scores["beats_oracle_p"] = Estimate(p)
-            if (truth, windows) == (PAPER, ALL):
-                scores |= {f"prior_p_{axis}": Estimate(p) for axis, p in self.prior_p.items()}
-                scores |= self._turn_on_correlations()
+            scores = self._scores(errors, (truth, windows))
+            if epoch == LAST:
+                scores |= self.ceilings.of(truth, windows) | self._of_references((truth, windows))
             rows += [
-                (weights, truth, windows, name, *_finite(estimate))
+                (epoch, truth, windows, name, *_finite(estimate))
                 for name, estimate in scores.items()
                 if np.isfinite(estimate.value)
             ]
         return pd.DataFrame(rows, columns=SCORES)
 
-    def _realised(self, truth: str, windows: str) -> dict[str, Estimate]:
-        """Scores of the oracle and the constant on the same windows."""
-        scores, mean = {}, self._means[truth, windows].mean(self._weights)
-        for name, squares in self._references.items() if truth != DISJOINT else ():
-            square = squares[truth, windows].mean(self._weights)
-            ratio = with_interval(np.sqrt(square / mean), positive=True)
-            scores[f"{name}_rmse_dps"] = with_interval(np.sqrt(square), positive=True)
-            scores[f"{name}_accuracy_gain_pct"] = gain_pct(ratio)
+    def _scores(self, errors: pd.DataFrame, view: View) -> dict[str, Estimate]:
+        """Scores over some windows, against one truth."""
+        scores, (truth, windows) = self._scorer.scores(errors, view), view
+        if truth != DISJOINT:
+            scores |= self._scorer.gains_by_axis(errors, view)
+        if windows == ALL and truth != DISJOINT and errors.sigma_dps.notna().any():
+            for name, sigmas in SIGMAS.items():
+                scores[name] = Estimate(100 * coverage(errors, truth, sigmas))
+        if "oracle" in self._references and len(self._scorer.weights) > 1:
+            oracle_squares = self._references["oracle"][view]
+            p = beats_oracle(squared_errors(errors, *view), oracle_squares)
+            scores["beats_oracle_p"] = Estimate(p)
+        if view == (PAPER, ALL):
+            scores |= {f"prior_p_{axis}": Estimate(p) for axis, p in self.prior_p.items()}
+            scores |= self._turn_on_correlations()
         return scores
 
-    def _gains_by_axis(self, errors: pd.DataFrame, truth: str, windows: str) -> dict[str, Estimate]:
-        """A of each axis."""
-        scores = {}
-        for axis in AXES:
-            square, mean = (
-                squared_errors(table[table.axis == axis], truth, windows).mean(self._weights)
-                for table in (errors, self.mean_errors)
-            )
-            with np.errstate(divide="ignore", invalid="ignore"):
-                ratio = with_interval(np.sqrt(square / mean), positive=True)
-            scores[f"accuracy_gain_pct_{axis}"] = gain_pct(ratio)
-        return scores
+    def _of_references(self, view: View) -> dict[str, Estimate]:
+        """Scores of the oracle and the constant on the same windows."""
+        return {
+            f"{name}_{score}": estimate
+            for name, squares in self._references.items()
+            if view[0] != DISJOINT
+            for score, estimate in self._scorer.rmse_and_gain(squares[view], view).items()
+        }
 
     def _turn_on_correlations(self) -> dict[str, Estimate]:
         """Correlations of the training labels between axes, with intervals (Fisher 1915)."""
@@ -400,8 +374,3 @@ class Bench:
 def _finite(estimate: Estimate) -> list[float | None]:
     values = (estimate.value, estimate.lo, estimate.hi)
     return [value if value is not None and np.isfinite(value) else None for value in values]
-
-
-def _by_view(errors: pd.DataFrame) -> dict[tuple[str, str], SquaredErrors]:
-    views = product(errors.truth.unique(), (FIRST, ALL))
-    return {view: squared_errors(errors, *view) for view in views}

@@ -42,7 +42,7 @@ class TestDevice:
     # recordings, and on simulated data, where axes are independent.
     joint: np.ndarray | None = None
     # Variance of the next bias given the calibrations before it, mean over the test recordings,
-    # (axes,), (deg/s)^2; None likewise.
+    # (axes,), (deg/s)^2; None with few recordings, and on simulated data.
     history: np.ndarray | None = None
 
     @property
@@ -74,9 +74,9 @@ def describe_devices(
             return _describe_drawn(recordings, imus[0])
         of_imu = bias[bias.imu == imus[0]]
         means = of_imu.pivot(index="recording", columns="axis", values="bias_dps")
-        tested = rows.recording[rows.role == TEST].unique()
+        numbers = rows.recording[rows.role == TEST].unique()
         trained = means.loc[means.index.isin(training[0].recording)]
-        return _describe_known(recordings, trained, means.loc[sorted(tested)], allan, imus[0])
+        return _describe_known(recordings, trained, means.loc[sorted(numbers)], allan, imus[0])
     keys = learning[learning.fold.isin(tests.explode())][_KEYS].drop_duplicates()
     return _describe_unseen(recordings, allan, sorted(map(tuple, keys.to_numpy().tolist())), imus)
 
@@ -92,11 +92,11 @@ def training_labels(bias: pd.DataFrame, table: pd.DataFrame) -> dict[str, np.nda
         Means by test fold; empty if a fold has no training recording, or several devices test.
     """
     rows = table[table.origin == ORIGIN_REAL].drop_duplicates(["fold", "role", *_KEYS])
-    tested = rows.imu[rows.role == TEST].unique().tolist()
-    if len(tested) > 1:
+    imus = rows.imu[rows.role == TEST].unique().tolist()
+    if len(imus) > 1:
         return {}
-    means = bias[bias.imu == tested[0]].pivot(index="recording", columns="axis", values="bias_dps")
-    training = rows[(rows.imu == tested[0]) & (rows.role != TEST)]
+    means = bias[bias.imu == imus[0]].pivot(index="recording", columns="axis", values="bias_dps")
+    training = rows[(rows.imu == imus[0]) & (rows.role != TEST)]
     labels = {
         str(fold): means.loc[sorted(training.recording[training.fold == fold].unique())].to_numpy()
         for fold in rows.fold[rows.role == TEST].unique()
@@ -158,14 +158,14 @@ def _describe_drawn(recordings: xr.Dataset, imu: int) -> TestDevice:
 
 
 def _describe_known(
-    recordings: xr.Dataset, means: pd.DataFrame, tested: pd.DataFrame, allan: xr.Dataset, imu: int
+    recordings: xr.Dataset, means: pd.DataFrame, tests: pd.DataFrame, allan: xr.Dataset, imu: int
 ) -> TestDevice:
     """Describe a measured IMU by its recordings.
 
     Args:
         recordings: Measured recordings.
         means: Means of the training recordings, a row each.
-        tested: Means of the test recordings.
+        tests: Means of the test recordings.
         allan: Allan variances.
         imu: Number of the IMU.
     """
@@ -180,20 +180,20 @@ def _describe_known(
     spread = np.vstack([turn_on_spread(labels, averaging), spread_draws(labels, averaging, _DRAWS)])
     joint = history = None
     if models is not None:
-        history = _history(models, means, tested)
+        history = _history(models, means, tests)
         joint = joint_draws(labels, averaging, _DRAWS) if len(labels) > len(AXES) else None
     return TestDevice((imu,), noise, spread, None, models, joint, history)
 
 
 def _history(
-    models: Sequence[RecordingModel], means: pd.DataFrame, tested: pd.DataFrame
+    models: Sequence[RecordingModel], means: pd.DataFrame, tests: pd.DataFrame
 ) -> np.ndarray:
     """Variance of a bias given the calibrations before it, mean over test recordings, (axes,)."""
     variances = []
     for model, axis in zip(models, AXES, strict=True):
         fitted = BiasHistory.fit(means.index.to_numpy(), means[axis].to_numpy(), model)
-        history = fitted.extended(tested.index.to_numpy(), tested[axis].to_numpy())
-        priors = [history.prior(model, number) for number in tested.index.tolist()]
+        history = fitted.extended(tests.index.to_numpy(), tests[axis].to_numpy())
+        priors = [history.prior(model, number) for number in tests.index.tolist()]
         variances.append(np.mean([prior.covariance[0, 0] for prior in priors]))
     return np.array(variances)
 

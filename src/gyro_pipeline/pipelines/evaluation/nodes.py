@@ -9,13 +9,14 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from gyro_pipeline.conventions import ALL, FIRST, LAST, MDPS, PAPER, TEST, TRUE
+from gyro_pipeline.conventions import ALL, AXES, FIRST, MDPS, PAPER, TEST, TRUE
 from gyro_pipeline.estimators import ORIENTATION_NOTE
 from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.fingerprints import code_hash, data_hash, fingerprint
 from gyro_pipeline.pipelines.evaluation.bench import Bench
 from gyro_pipeline.pipelines.evaluation.ceilings import PREMISE
 from gyro_pipeline.pipelines.evaluation.device import TestDevice, describe_devices, training_labels
+from gyro_pipeline.scoring.scorer import MISSING, Scores, read_scores
 from gyro_pipeline.scoring.truths import CURVE_STEP_S
 from gyro_pipeline.studies import MEAN, RunSpec, possible_runs
 from gyro_pipeline.tracking import CURVE, ERRORS, EVALUATED_WITH, SCORES, EvaluatedRun, StoredRun
@@ -125,14 +126,15 @@ def _evaluate_run(run: StoredRun, spec: RunSpec, bench: Bench, evaluated_with: s
     fits = {fold: run.load_fit(fold) for fold in bench.tests.fold.unique()}
     first = next(iter(fits.values()))
     imus = spec.real_imus if spec.method == 1 else 1
-    errors, scores = [], []
-    for weights in first.variants():
-        variants: Mapping[str, Estimator] = {f: fit.variants()[weights] for f, fit in fits.items()}
-        table = bench.errors(variants, imus)
-        errors.append(table.assign(weights=weights))
-        scores.append(bench.scores(table, weights))
-    table = pd.concat(scores, ignore_index=True)
-    metrics = _metrics(table)
+    errors, tables = [], []
+    for epoch in first.variants():
+        variants: Mapping[str, Estimator] = {f: fit.variants()[epoch] for f, fit in fits.items()}
+        of_epoch = bench.errors(variants, imus)
+        errors.append(of_epoch.assign(weights=epoch))
+        tables.append(bench.scores(of_epoch, epoch))
+    table = pd.concat(tables, ignore_index=True)
+    scores = read_scores(table)
+    metrics = _metrics(scores)
     # the store cannot remove metrics of an earlier evaluation that are missing now
     metrics |= {name: np.nan for name in METRICS if name in run.metrics and name not in metrics}
     artifacts = {ERRORS: pd.concat(errors, ignore_index=True), SCORES: table}
@@ -142,53 +144,45 @@ def _evaluate_run(run: StoredRun, spec: RunSpec, bench: Bench, evaluated_with: s
     tags |= {"recommended": str(first.recommended)} | _off_the_curve(metrics)
     tags |= below_the_ceiling(table)
     if first.uses_prior:
-        tags |= {"uses_prior": ORIENTATION_NOTE} | _conflict(table, run)
+        tags |= {"uses_prior": ORIENTATION_NOTE} | _conflict(scores, metrics, run)
     logger.info(
         "%s %s: RMSE %.4f mdps in all windows, %.4f in the first",
         *(run.study, run.tags["mlflow.runName"], metrics["rmse_mdps"]),
-        _value(table, "test_rmse_dps", FIRST) / MDPS,
+        scores["test_rmse_dps", FIRST].value / MDPS,
     )
     return EvaluatedRun(run.run_id, metrics, tags, artifacts)
 
 
-def _metrics(scores: pd.DataFrame) -> dict[str, float]:
-    """The finite metrics of a run."""
+def _metrics(scores: Scores) -> dict[str, float]:
+    """The metrics of a run for which a score exists."""
     values = {
-        name: _value(scores, score, windows, column) / (MDPS if name.endswith("_mdps") else 1)
-        for name, (score, column, windows) in METRICS.items()
+        name: getattr(scores.get((score, windows)), end, None)
+        for name, (score, end, windows) in METRICS.items()
     }
-    return {name: value for name, value in values.items() if np.isfinite(value)}
+    return {
+        name: value / (MDPS if name.endswith("_mdps") else 1)
+        for name, value in values.items()
+        if value is not None
+    }
 
 
-def _value(scores: pd.DataFrame, score: str, windows: str, column: str = "value") -> float:
-    """A score at the last epoch against the mean of the recording; NaN if it is missing."""
-    chosen = scores[
-        (scores.score == score)
-        & (scores.windows == windows)
-        & (scores.truth == PAPER)
-        & (scores.weights == LAST)
-    ]
-    return float(chosen[column].iloc[0]) if chosen[column].notna().any() else np.nan
-
-
-def below_the_ceiling(scores: pd.DataFrame) -> dict[str, str]:
-    """A warning where the interval of a result lies wholly beyond that of the ceiling.
+def below_the_ceiling(table: pd.DataFrame) -> dict[str, str]:
+    """A warning where the interval of a result lies entirely beyond that of the ceiling.
 
     Args:
-        scores: Scores from :meth:`gyro_pipeline.pipelines.evaluation.bench.Bench.scores`.
+        table: Scores from :meth:`gyro_pipeline.pipelines.evaluation.bench.Bench.scores`.
 
     Returns:
         The tag ``below_ceiling``; empty without such a result.
     """
-    gains = scores[scores.weights == LAST].set_index(["truth", "windows", "score"])
     below = []
     for truth, windows in product((PAPER, TRUE), (FIRST, ALL)):
-        gain = (truth, windows, "accuracy_gain_pct")
-        limit = (truth, windows, "ceiling_accuracy_gain_pct")
-        if {gain, limit} <= set(gains.index):
-            highest = gains.hi[limit] if pd.notna(gains.hi[limit]) else gains.value[limit]
-            if gains.lo[gain] > highest:
-                below.append(f"{windows} windows, truth {truth}")
+        scores = read_scores(table, truth)
+        gain, ceiling = (
+            scores.get((f"{kind}accuracy_gain_pct", windows), MISSING) for kind in ("", "ceiling_")
+        )
+        if gain.lies_above(ceiling):
+            below.append(f"{windows} windows, truth {truth}")
     if not below:
         return {}
     return {
@@ -197,18 +191,17 @@ def below_the_ceiling(scores: pd.DataFrame) -> dict[str, str]:
     }
 
 
-def _conflict(scores: pd.DataFrame, run: StoredRun) -> dict[str, str]:
-    """A warning where tested recordings contradict the prior, with the error of the mean."""
-    chances = scores[scores.score.str.startswith("prior_p_") & (scores.weights == LAST)]
-    names = chances.score.str[-1].tolist()
-    axes = {axis: p for axis, p in zip(names, chances.value, strict=True) if p < _CONFLICT}
+def _conflict(scores: Scores, metrics: Mapping[str, float], run: StoredRun) -> dict[str, str]:
+    """A warning where test recordings contradict the prior, with the error of the mean."""
+    chances = {axis: scores.get((f"prior_p_{axis}", ALL), MISSING).value for axis in AXES}
+    axes = {axis: p for axis, p in chances.items() if p < _CONFLICT}
     if not axes:
         return {}
     listed = ", ".join(f"{axis} (p = {p:.1g})" for axis, p in axes.items())
-    rmse, mean = (_value(scores, f"{name}_rmse_dps", ALL) / MDPS for name in ("test", "mean"))
     text = (
-        f"test recordings contradict the prior on {listed}: turned, or a bias that moved on. RMSE "
-        f"{rmse:.3g} mdps; the running mean gives {mean:.3g}"
+        f"test recordings contradict the prior on {listed}: the sensor was turned, or its bias has "
+        f"drifted. RMSE {metrics['rmse_mdps']:.3g} mdps; the running mean gives "
+        f"{metrics['mean_rmse_mdps']:.3g}"
     )
     logger.warning("%s %s: %s", run.study, run.tags["mlflow.runName"], text)
     return {"prior_conflict": text}

@@ -9,24 +9,34 @@ import numpy as np
 import pandas as pd
 
 from gyro_pipeline.conventions import ALL, AXES, FIRST, LEAVE_ONE_DEVICE_OUT, MDPS
-from gyro_pipeline.parameters import Published, PublishedResult
+from gyro_pipeline.parameters import Published, PublishedResult, PublishedSpecification
 from gyro_pipeline.physics.ceiling import best_gain
 from gyro_pipeline.physics.warm_up import amplitude_needed
 from gyro_pipeline.pipelines.reporting.recordings import WARM_UPS_S
-from gyro_pipeline.pipelines.reporting.results import column
+from gyro_pipeline.pipelines.reporting.results import CNN_BEST, column
+from gyro_pipeline.scoring.scores import Estimate
 from gyro_pipeline.studies import CNN, CONSTANT, MEAN
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-PREMISE = "white noise without drift"
-"""Premise of the ceiling, named wherever the ceiling is shown."""
+LEAK_VARIANTS = {
+    ("k_fold", "cnn"): "Honest split",
+    ("k_fold", "cnn_shuffled"): "Honest, labels shuffled",
+    ("window_split", "cnn"): "Windows split at random",
+    ("test_in_training", "cnn"): "Test windows in training",
+    ("best_epoch_on_test", "cnn"): "Honest split, epoch chosen on test",
+}
+"""Names of the ways of training in the leak study, by protocol and estimator, in their order."""
+
+BEATS_ORACLE_P = 0.001
+"""A p value against the oracle below this, after Holm's correction, is a leak or a defect."""
 
 _LABELS = {
     MEAN: "running mean",
     CNN: "network",
     CONSTANT: "constant",
-    "cnn_best": "network at its best epoch",
+    CNN_BEST: "network at its best epoch",
 }
 STUDIES_OF = {
     "three_gyroscopes": "augmentation",
@@ -85,29 +95,34 @@ class Material:
         return self.source if kind in self.source else f"{self.source} ({kind})"
 
     def of(self, study: str, **columns: Any) -> pd.DataFrame:
-        """Rows of a study with the given values of columns."""
-        rows = self.results[self.results.study == study]
-        for name, value in columns.items():
-            rows = rows[rows[name] == value]
-        return rows
+        """Results of a study with the given values of columns."""
+        return _where(self.results, study=study, **columns)
+
+    def finished_of(self, study: str, **columns: Any) -> pd.DataFrame:
+        """Finished results of a study with the given values of columns."""
+        return _where(self.finished, study=study, **columns)
+
+    @cached_property
+    def sheets(self) -> dict[str, PublishedSpecification]:
+        """What the paper states of each sensor."""
+        return {sheet.sensor: sheet for sheet in self.published.specifications}
+
+    @cached_property
+    def described(self) -> dict[str, pd.Series]:
+        """The description of each sensor by its recordings."""
+        return {row.sensor: row for _, row in self.sensors.iterrows()}
 
     def sensor_name(self, sensor: str) -> str:
         """Name of a sensor as the paper writes it, if it does."""
-        names = {sheet.sensor: sheet.name for sheet in self.published.specifications}
-        return names.get(sensor, sensor)
-
-    def paper_recording_s(self, sensor: str) -> float:
-        """Length of the paper's recordings of a sensor, seconds."""
-        lengths = {sheet.sensor: sheet.recording_s for sheet in self.published.specifications}
-        return lengths[sensor]
+        return self.sheets[sensor].name if sensor in self.sheets else sensor
 
     def beyond_white_noise(self, claim: PublishedResult) -> bool:
         """Whether a published gain exceeds A = 1 - sqrt(T0/T), with the paper's T."""
-        r = claim.window_s / self.paper_recording_s(claim.sensor)
+        r = claim.window_s / self.sheets[claim.sensor].recording_s
         return bool(claim.accuracy_gain_pct > 100 * best_gain(np.sqrt(r)))
 
     def warm_up_needed_mdps(self, claim: PublishedResult) -> list[float]:
-        """Amplitudes of a warm-up that would make a published gain the ceiling in first windows.
+        """Amplitudes of a warm-up with which the ceiling in first windows is a published gain.
 
         Args:
             claim: The published result, with T from the paper, N and the turn-on spread from the
@@ -116,14 +131,14 @@ class Material:
         Returns:
             An amplitude for each of :data:`TIME_CONSTANTS_S`; empty without recordings.
         """
-        rows = self.sensors[self.sensors.sensor == claim.sensor]
-        if rows.empty:
+        row = self.described.get(claim.sensor)
+        if row is None:
             return []
         noise, spread = (
-            rows.iloc[-1].reindex([f"{name}_{axis}" for axis in AXES]).to_numpy(float)
+            row.reindex([f"{name}_{axis}" for axis in AXES]).to_numpy(float)
             for name in ("white_dps_rts", "spread_dps")
         )
-        times = claim.window_s, self.paper_recording_s(claim.sensor), TIME_CONSTANTS_S
+        times = claim.window_s, self.sheets[claim.sensor].recording_s, TIME_CONSTANTS_S
         needed = amplitude_needed(claim.accuracy_gain_pct / 100, noise, spread, *times) / MDPS
         return [] if np.isnan(needed).any() else needed.tolist()
 
@@ -132,7 +147,7 @@ class Material:
 
         The bounds are those of the worst axis, from 95 % intervals; empty if they are unknown.
         """
-        row = self.sensors[self.sensors.sensor == sensor].iloc[-1]
+        row = self.described[sensor]
         bounds = row.reindex([f"warm_up_bound_dps_{time_s:g}" for time_s in WARM_UPS_S]) / MDPS
         return [] if bounds.isna().any() else bounds.astype(float).tolist()
 
@@ -155,18 +170,24 @@ class Material:
             estimator: Name of the estimator.
             study: Study to take it from instead of the one that makes the paper's table.
         """
-        rows = self.of(study or STUDIES_OF[claim.table], estimator=estimator)
-        for key in ("sensor", "virtual_gyros", "window_s"):
-            rows = rows[rows[key] == getattr(claim, key)]
+        same = {name: getattr(claim, name) for name in ("sensor", "virtual_gyros", "window_s")}
+        rows = self.of(study or STUDIES_OF[claim.table], estimator=estimator, **same)
         rows = rows[rows.real_gyros <= claim.real_gyros].sort_values("real_gyros")
         row = rows.iloc[-1] if len(rows) else None
         return None if row is None or pd.notna(row.status) else row
 
     def status(self, claim: PublishedResult) -> str:
         """Why there is no result of ours for a published one."""
-        rows = self.of(STUDIES_OF[claim.table], estimator=CNN)
-        match = np.all([rows[key] == getattr(claim, key) for key in _KEYS], axis=0)
-        return str(rows.status[match].iloc[0]) if match.any() else "not part of this run"
+        same = {name: getattr(claim, name) for name in _KEYS}
+        rows = self.of(STUDIES_OF[claim.table], estimator=CNN, **same)
+        return str(rows.status.iloc[0]) if len(rows) else "not part of this run"
+
+
+def _where(rows: pd.DataFrame, **columns: Any) -> pd.DataFrame:
+    """The rows with the given values of columns."""
+    for name, value in columns.items():
+        rows = rows[rows[name] == value]
+    return rows
 
 
 def label(estimator: str) -> str:
@@ -174,7 +195,9 @@ def label(estimator: str) -> str:
     return _LABELS.get(estimator, estimator.replace("_", " "))
 
 
-def ends(row: Mapping[str, Any] | pd.Series | None, name: str, windows: str) -> tuple[float, ...]:
+def ends(
+    row: Mapping[str, Any] | pd.Series | None, name: str, windows: str = ALL
+) -> tuple[float, ...]:
     """A score over first or all windows and the ends of its interval; NaN if missing."""
     key = column(name, windows)
     values = [None if row is None else row.get(key + end) for end in ("", "_lo", "_hi")]
@@ -201,17 +224,24 @@ def percent(value: float) -> str:
     return f"{round(value)}"
 
 
-def from_to(values: Sequence[float]) -> str:
-    """The range of some values, with two digits."""
-    low, high = (f"{v:.0f}" if v >= 9.95 else f"{v:.1f}" for v in (min(values), max(values)))  # noqa: PLR2004
+def two_digits(value: float) -> str:
+    """A positive number with two digits, or all those before the decimal point."""
+    return f"{value:.0f}" if value >= 9.95 else f"{value:.1f}"  # noqa: PLR2004
+
+
+def from_to(values: Iterable[float], text: Callable[[float], str] = two_digits) -> str:
+    """The range of some values."""
+    numbers = pd.Series(list(values), dtype=float)
+    low, high = text(numbers.min()), text(numbers.max())
     return low if low == high else f"{low} to {high}"
 
 
 def beyond_ceiling(row: Any, windows: str = ALL) -> bool:
-    """Whether the interval of an accuracy gain lies wholly beyond the ceiling's."""
-    _, low, _ = ends(row, "accuracy_gain_pct", windows)
-    limit, _, high = ends(row, "ceiling_accuracy_gain_pct", windows)
-    return bool(low > (limit if np.isnan(high) else high))
+    """Whether the entire interval of an accuracy gain lies above the ceiling's."""
+    gain, ceiling = (
+        Estimate(*ends(row, f"{kind}accuracy_gain_pct", windows)) for kind in ("", "ceiling_")
+    )
+    return gain.lies_above(ceiling)
 
 
 def remark(row: Any) -> str | None:
@@ -241,8 +271,3 @@ def split(row: Any) -> str:
     if row.get("protocol") == LEAVE_ONE_DEVICE_OUT:
         return f"leave-one-device-out, {row.folds:.0f} devices"
     return "hold-out" if row.folds == 1 else f"k-fold, {row.folds:.0f} folds"
-
-
-def window_words(windows: str) -> str:
-    """Name of first or all windows in figures."""
-    return {ALL: "all windows (main result)", FIRST: "first window (the paper's way)"}[windows]

@@ -15,27 +15,28 @@ from gyro_pipeline.estimators import DEFAULT, ORIENTATION_NOTE
 from gyro_pipeline.parameters import PublishedResult
 from gyro_pipeline.physics.ceiling import best_saving, ceiling_rmse, running_mean_rmse
 from gyro_pipeline.pipelines.reporting.exhibits import (
+    LEAK_VARIANTS,
     Exhibit,
     Material,
     ends,
     gyroscopes,
     label,
-    window_words,
 )
 from gyro_pipeline.pipelines.reporting.results import column
 from gyro_pipeline.pipelines.reporting.style import (
     CEILING,
     COLOURS,
-    LOOK,
     MARKERS,
     estimator_look,
+    grid_shape,
+    panels,
     plain_ticks,
     reach,
-    share_legend,
 )
-from gyro_pipeline.pipelines.reporting.tables import WAYS, in_full, published_claim
+from gyro_pipeline.pipelines.reporting.tables import in_full, published_claim
 from gyro_pipeline.studies import CNN, CONSTANT, MEAN
 
+_WINDOWS = {ALL: "all windows (main result)", FIRST: "first window (the paper's way)"}
 _TICKS_S = (1, 2, 5, 10, 20, 30, 60, 100)
 _SHIFT = 0.11  # relative distance between the points of a window, which stand side by side
 _MIN_SPAN = 2.5  # ratio of the ends of an axis of errors
@@ -86,14 +87,10 @@ def _two_panels(
     draw: Callable[[Axes, str], None], title: str, size: tuple[float, float], columns: int
 ) -> Figure:
     """A figure with a panel for all windows and one for first windows."""
-    with LOOK():
-        figure = Figure(figsize=size, layout="constrained")
-        axes = figure.subplots(1, 2, sharey=True)
+    with panels(title, size, (1, 2), columns, sharey=True) as (figure, axes):
         for ax, windows in zip(axes, (ALL, FIRST), strict=True):
             draw(ax, windows)
-            ax.set_title(window_words(windows))
-        share_legend(figure, axes, columns)
-        figure.suptitle(title)
+            ax.set_title(_WINDOWS[windows])
     return figure
 
 
@@ -117,16 +114,17 @@ def _draw_claim(
             fmt="<" if outside else marker, color=colour, ms=4.5, capsize=2, lw=1.2,
             label=label(name),
         )  # fmt: skip
-    if material.result(claim, CNN) is None:
+    network = material.result(claim, CNN)
+    if network is None:
         ax.text(2, row, material.status(claim), color="grey", va="center", fontsize=8)
-    limit, lo, hi = ends(material.result(claim, CNN), f"ceiling_{gain}", windows)
+    limit, lo, hi = ends(network, f"ceiling_{gain}", windows)
     if not np.isnan(limit):
         span = (lo, hi) if not np.isnan(lo) else (limit - 0.4, limit + 0.4)
         ax.fill_betweenx([row - 0.42, row + 0.42], *span, color=CEILING, alpha=0.35, lw=0)
         ax.plot([limit] * 2, [row - 0.42, row + 0.42], color=CEILING, lw=1.8, label="ceiling")
-    realised, _, _ = ends(material.result(claim, CNN), f"oracle_{gain}", windows)
-    if not np.isnan(realised):
-        ax.plot(realised, row + 0.3, "x", color=CEILING, ms=6, mew=1.6, label="oracle")
+    oracle, _, _ = ends(network, f"oracle_{gain}", windows)
+    if not np.isnan(oracle):
+        ax.plot(oracle, row + 0.3, "x", color=CEILING, ms=6, mew=1.6, label="oracle")
     ax.plot(claim.accuracy_gain_pct, row, "D", mfc="none", mec="black", ms=7, label="published")
 
 
@@ -243,8 +241,7 @@ def _time_axis(ax: Axes, recording_s: float) -> None:
 def gyroscopes_10s(material: Material) -> Exhibit | None:
     """RMSE at 10 s against the number of gyroscopes (paper, section IV-D, second figure)."""
     claims = material.published.of_networks("sparkfun", virtual_gyros=0)
-    rows = material.finished[material.finished.study == "real2real"]
-    rows = rows[(rows.sensor == "sparkfun") & (rows.estimator == CNN)]
+    rows = material.finished_of("real2real", sensor="sparkfun", estimator=CNN)
     rows = rows[rows.window_s == claims[0].window_s] if claims else rows[:0]
     if rows.empty:
         return None
@@ -289,26 +286,21 @@ def saving_against_turn_on_spread(material: Material) -> Exhibit | None:
     The curve of a sensor is the ceiling with its N and T and the same spread on all axes. A network
     stands at the spread that gives its ceiling: that of the sensor, if its axes share one.
     """
-    rows = material.finished[
-        (material.finished.study == "real2real") & (material.finished.estimator == CNN)
-    ]
+    rows = material.finished_of("real2real", estimator=CNN)
     claims = material.published.of_table("generalization")
     rows = rows[rows.window_s.isin([claim.window_s for claim in claims])]
     claims = [claim for claim in claims if (rows.sensor == claim.sensor).any()]
     if not claims:
         return None
-    with LOOK():
-        high = -(-len(claims) // 2)
-        figure = Figure(figsize=(9.5, 1.2 + 3 * high), layout="constrained")
-        axes = figure.subplots(high, min(2, len(claims)), sharex=True, sharey=True, squeeze=False)
-        for ax, claim in zip(axes.ravel(), claims, strict=False):
+    title, (high, wide) = f"What 10 s can save; {material.source_name}", grid_shape(len(claims))
+    size = (9.5, 1.2 + 3 * high)
+    with panels(title, size, (high, wide), sharex=True, sharey=True) as (figure, axes):
+        for ax, claim in zip(axes, claims, strict=False):
             _draw_savings(ax, rows[rows.sensor == claim.sensor].sort_values("real_gyros"), claim)
-        for ax in axes[:, 0]:
+        for ax in axes[::wide]:
             ax.set_ylabel("time saving S, all windows [%]")
-        for ax in axes[-1]:
+        for ax in axes[-wide:]:
             ax.set_xlabel("turn-on spread τ [mdps], points of a sensor side by side")
-        share_legend(figure, axes.ravel(), columns=3)
-        figure.suptitle(f"What 10 s can save; {material.source_name}")
     caption = (
         "The turn-on spread τ is the change of the bias from one power-on to the next; it decides "
         "how much can be gained. The line is the ceiling of a sensor with that spread under white "
@@ -330,7 +322,7 @@ def equal_spread(row: pd.Series, bound: str = "") -> float:
     Returns:
         The spread, deg/s; 0 where the ceiling is that of a known bias.
     """
-    rho = 1 - row[f"ceiling_accuracy_gain_pct{bound}"] / 100
+    rho = 1 - row[column("ceiling_accuracy_gain_pct", FIRST) + bound] / 100
     r = row.window_s / row.recording_s
     beta = np.clip((rho**2 - r) / (1 - r), 0, 1 - 1e-9)
     return float(_pooled_noise(row) * np.sqrt(beta / (1 - beta) / row.window_s))
@@ -338,7 +330,8 @@ def equal_spread(row: pd.Series, bound: str = "") -> float:
 
 def _pooled_noise(row: pd.Series) -> float:
     """N over all axes, deg/s sqrt(s), from the running mean that the ceiling is compared with."""
-    mean = row.ceiling_rmse_dps / (1 - row.ceiling_accuracy_gain_pct / 100)
+    rmse, gain_pct = (row[column(f"ceiling_{n}", FIRST)] for n in ("rmse_dps", "accuracy_gain_pct"))
+    mean = rmse / (1 - gain_pct / 100)
     return float(mean / np.sqrt(1 / row.window_s - 1 / row.recording_s))
 
 
@@ -382,18 +375,13 @@ def _draw_saving(ax: Axes, row: pd.Series, shift: float, colour: str, marker: st
 
 def estimators(material: Material, study: str, sensor: str) -> Exhibit | None:
     """RMSE of all estimators of a study against the window length, with the ceiling."""
-    rows = material.finished[
-        (material.finished.study == study) & (material.finished.sensor == sensor)
-    ]
+    rows = material.finished_of(study, sensor=sensor)
     if rows.empty:
         return None
-    with LOOK():
-        figure = Figure(figsize=(10, 5.6), layout="constrained")
-        left, right = figure.subplots(1, 2)
+    title = f"{material.sensor_name(sensor)}, {study.replace('_', ' ')}: error against window"
+    heading = f"{title}, all windows; {material.source_name}"
+    with panels(heading, (10, 5.6), (1, 2), columns=4) as (figure, (left, right)):
         _draw_estimators(left, right, rows)
-        share_legend(figure, (left, right), columns=4)
-        title = f"{material.sensor_name(sensor)}, {study.replace('_', ' ')}: error against window"
-        figure.suptitle(f"{title}, all windows; {material.source_name}")
     caption = (
         "Left: error over all windows. Right: the same relative to the running mean. Related "
         "estimators share a colour, filled markers are the recommended estimators. The dashed line "
@@ -409,14 +397,14 @@ def _draw_estimators(left: Axes, right: Axes, rows: pd.DataFrame) -> None:
     estimators_by_name = dict(zip(names, rows.estimator, strict=True))
     for number, (name, estimator) in enumerate(estimators_by_name.items()):
         results = rows[[other == name for other in names]].drop_duplicates("window_s")
-        rmse = results.set_index("window_s").test_rmse_dps_all.sort_index()
+        rmse = results.set_index("window_s").test_rmse_dps.sort_index()
         look = estimator_look(estimator, bool(results.recommended.any()))
         shift = 1 + 0.015 * (number - len(estimators_by_name) / 2)
-        ratio = rmse / means.test_rmse_dps_all.reindex(rmse.index)
+        ratio = rmse / means.test_rmse_dps.reindex(rmse.index)
         for ax, values in ((left, rmse / MDPS), (right, ratio)):
             ax.plot(values.index * shift, values, label=name, **look)
-    limit = means.ceiling_rmse_dps_all.astype(float)
-    for ax, values in ((left, limit / MDPS), (right, limit / means.test_rmse_dps_all)):
+    limit = means.ceiling_rmse_dps.astype(float)
+    for ax, values in ((left, limit / MDPS), (right, limit / means.test_rmse_dps)):
         dash = "--" if len(values) > 1 else "_"
         ax.plot(values.index, values, dash, color=CEILING, lw=2, ms=30, mew=2, label="ceiling")
         ax.set(xscale="log", yscale="log", xlabel="window length [s], points side by side")
@@ -438,12 +426,9 @@ def leakage_against_stride(material: Material) -> Exhibit | None:
     if material.leaks.empty:
         return None
     sensors = list(dict.fromkeys(material.leaks.sensor))
-    with LOOK():
-        figure = Figure(figsize=(9.5, 1.2 + 4.4 * len(sensors)), layout="constrained")
-        axes = figure.subplots(len(sensors), 1, squeeze=False)[:, 0]
+    with panels(None, (9.5, 1.2 + 4.4 * len(sensors)), (len(sensors), 1)) as (figure, axes):
         for ax, sensor in zip(axes, sensors, strict=True):
             _draw_leaks(ax, material, material.leaks[material.leaks.sensor == sensor])
-        share_legend(figure, axes, columns=3)
     caption = (
         "Windows whose starts differ by a whole number of hops of the network look almost the same "
         "to it. Split at random, they are near-duplicates that can be learned by heart."
@@ -455,12 +440,12 @@ def leakage_against_stride(material: Material) -> Exhibit | None:
 def _draw_leaks(ax: Axes, material: Material, results: pd.DataFrame) -> None:
     first, strides = results.iloc[0], np.sort(results.window_stride_s.unique())
     styles = [*zip(COLOURS, MARKERS, strict=True)]
-    for i, ((leak, estimator), name) in enumerate(WAYS.items()):
+    for i, ((leak, estimator), name) in enumerate(LEAK_VARIANTS.items()):
         rows = results[(results.leak == leak) & (results.estimator == estimator)]
         rows = rows.sort_values("window_stride_s")
         gain, lo, hi = (rows[f"accuracy_gain_pct{end}"] for end in ("", "_lo", "_hi"))
         ax.errorbar(
-            np.searchsorted(strides, rows.window_stride_s) + 0.09 * (i - len(WAYS) // 2),
+            np.searchsorted(strides, rows.window_stride_s) + 0.09 * (i - len(LEAK_VARIANTS) // 2),
             gain, yerr=reach(gain, lo, hi), color=styles[i][0], marker=styles[i][1],
             ls=":" if estimator != CNN else "-", lw=1, ms=5, capsize=2.5, label=name,
         )  # fmt: skip

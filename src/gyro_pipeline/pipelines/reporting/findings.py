@@ -6,21 +6,22 @@ import pandas as pd
 
 from gyro_pipeline.conventions import ALL, FIRST
 from gyro_pipeline.estimators import DEFAULT
-from gyro_pipeline.pipelines.reporting.exhibits import Material, beyond_ceiling, from_to, label
-from gyro_pipeline.pipelines.reporting.results import column
+from gyro_pipeline.parameters import PublishedResult
+from gyro_pipeline.pipelines.reporting.exhibits import (
+    BEATS_ORACLE_P,
+    Material,
+    beyond_ceiling,
+    from_to,
+    label,
+)
+from gyro_pipeline.pipelines.reporting.results import CNN_BEST
 from gyro_pipeline.scoring.scores import holm
 from gyro_pipeline.studies import CNN, CONSTANT, MEAN
 
-_GAIN = column("accuracy_gain_pct", ALL)
-_RMSE = column("test_rmse_dps", ALL)
-_CEILING = column("ceiling_rmse_dps", ALL)
-_ORACLE, _ORACLE_GAIN = (
-    column(name, ALL) for name in ("oracle_rmse_dps", "oracle_accuracy_gain_pct")
+_RMSE, _CEILING, _ORACLE = "test_rmse_dps", "ceiling_rmse_dps", "oracle_rmse_dps"
+_GAIN, _CEILING_GAIN, _ORACLE_GAIN = (
+    f"{kind}accuracy_gain_pct" for kind in ("", "ceiling_", "oracle_")
 )
-_CEILING_GAIN = column("ceiling_accuracy_gain_pct", ALL)
-
-_SIGNIFICANT = 0.001
-"""Significance level of the oracle check after Holm's correction, as in tests/test_ceiling.py."""
 
 
 def distinct(material: Material) -> pd.DataFrame:
@@ -31,7 +32,9 @@ def distinct(material: Material) -> pd.DataFrame:
 def answer(material: Material) -> list[str]:
     """The answer in at most three sentences."""
     rows = distinct(material)
-    sentences = _networks(rows) or _estimators(rows), _published(material), _explanations(material)
+    beyond = [claim for claim in material.claims if material.beyond_white_noise(claim)]
+    sentences = [_networks(rows) or _estimators(rows)]
+    sentences += [_published(material, beyond), _explanations(material, beyond)]
     return [sentence for sentence in sentences if sentence]
 
 
@@ -98,10 +101,10 @@ def _estimators(rows: pd.DataFrame) -> str:
     )
 
 
-def _published(material: Material) -> str:
+def _published(material: Material, beyond: Sequence[PublishedResult]) -> str:
+    """The number of published gains that white noise without drift does not allow."""
     if not material.claims:
         return ""
-    beyond = [claim for claim in material.claims if material.beyond_white_noise(claim)]
     return (
         f"{len(beyond)} of {len(material.claims)} published gains on these sensors "
         f"{'is' if len(beyond) == 1 else 'are'} beyond "
@@ -109,9 +112,8 @@ def _published(material: Material) -> str:
     )
 
 
-def _explanations(material: Material) -> str:
+def _explanations(material: Material, beyond: Sequence[PublishedResult]) -> str:
     """Explanations of published gains beyond the ceiling, the harmless one first."""
-    beyond = [claim for claim in material.claims if material.beyond_white_noise(claim)]
     if not beyond:
         return ""
     needed: dict[str, list[float]] = {}
@@ -144,13 +146,13 @@ def _test_of_warm_up(material: Material, names: Sequence[str]) -> str:
 
 def _ranked(window_s: float, networks: pd.DataFrame) -> str:
     better, worse = (networks[f"{_GAIN}_lo"] > 0).sum(), (networks[f"{_GAIN}_hi"] < 0).sum()
-    realised = _ORACLE in networks and networks[_ORACLE].notna().all()
-    best = networks[_ORACLE if realised else _CEILING]
+    has_oracle = _ORACLE in networks and networks[_ORACLE].notna().all()
+    best = networks[_ORACLE if has_oracle else _CEILING]
     sentences = (
         f"At {window_s:g} s, {better} of {len(networks)} networks are better than the running mean "
         f"with their whole interval and {worse} are worse; A is {_range(networks[_GAIN])} "
         f"%. Their RMSE is {_range(networks[_RMSE] / best, '.2f')} times "
-        f"{'that of the oracle on the same windows' if realised else 'the expected ceiling'}."
+        f"{'that of the oracle on the same windows' if has_oracle else 'the expected ceiling'}."
     )
     key = f"less_{CONSTANT}_dps"
     if key in networks and networks[key].notna().any():
@@ -204,7 +206,7 @@ def _below_ceiling(rows: pd.DataFrame) -> str:
         for _, row in rows[flagged].iterrows()
     )
     return (
-        f"Beyond their ceiling with the whole interval: {names}. The ceiling is the linear "
+        f"Entire 95 % interval above the ceiling: {names}. The ceiling is the linear "
         "optimum, axis by axis, for exchangeable power-ons; correlated axes, biases that follow "
         "one another or other noise leave more to gain."
     )
@@ -221,12 +223,12 @@ def _prior_conflicts(rows: pd.DataFrame) -> str:
 
 
 def _oracle_check(rows: pd.DataFrame) -> str:
-    checked = rows[rows.beats_oracle_p.notna() & ~rows.estimator.isin([MEAN, "cnn_best"])]
+    checked = rows[rows.beats_oracle_p.notna() & ~rows.estimator.isin([MEAN, CNN_BEST])]
     checked = checked.drop_duplicates("fingerprints")
     if checked.empty:
         return ""
     corrected = holm(checked.beats_oracle_p.tolist())
-    beaten = int((corrected < _SIGNIFICANT).sum())
+    beaten = int((corrected < BEATS_ORACLE_P).sum())
     verdict = "No estimator beats" if not beaten else f"DEFECT OF THE EVALUATION: {beaten} beat"
     return (
         f"{verdict} the oracle, which knows the drawn values, on the same windows significantly: "
@@ -237,6 +239,4 @@ def _oracle_check(rows: pd.DataFrame) -> str:
 
 
 def _range(values: pd.Series | Sequence[float], form: str = ".0f") -> str:
-    series = pd.Series(values, dtype=float)
-    lowest, highest = (f"{v:{form}}".replace("-", "−") for v in (series.min(), series.max()))
-    return lowest if lowest == highest else f"{lowest} to {highest}"
+    return from_to(values, lambda value: f"{value:{form}}".replace("-", "−"))

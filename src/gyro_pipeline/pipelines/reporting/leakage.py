@@ -8,16 +8,10 @@ import pandas as pd
 
 from gyro_pipeline.conventions import ALL, BEST, BEST_EPOCH_ON_TEST, LAST, PAPER
 from gyro_pipeline.parameters import Sensor, Study, Training
-from gyro_pipeline.pipelines.reporting.results import errors_of, scores_of, with_ends
-from gyro_pipeline.pipelines.reporting.tables import WAYS
-from gyro_pipeline.scoring.scores import (
-    curve_errors,
-    holm,
-    leave_one_out,
-    paired_difference,
-    score,
-    squared_errors,
-)
+from gyro_pipeline.pipelines.reporting.exhibits import LEAK_VARIANTS
+from gyro_pipeline.pipelines.reporting.results import errors_of, with_ends
+from gyro_pipeline.scoring.scorer import MISSING, Scorer, read_scores
+from gyro_pipeline.scoring.scores import holm, paired_difference, squared_errors
 from gyro_pipeline.studies import CONSTANT, MEAN, RunSpec, possible_runs
 from gyro_pipeline.tracking import CURVE, SCORES, StoredRun
 
@@ -65,8 +59,10 @@ def pool_leakage(
 def _rows_of_stride(stored: Sequence[tuple[RunSpec, StoredRun]]) -> list[dict[str, Any]]:
     """A row for each way of training, with its seeds pooled."""
     by_name = {spec.estimator: run for spec, run in stored}
+    mean, constant = by_name[MEAN], by_name[CONSTANT]
+    scorer = Scorer(errors_of([mean]), mean.load(CURVE), stored[0][0].window_s)
     rows = []
-    for protocol, estimator in WAYS:
+    for protocol, estimator in LEAK_VARIANTS:
         matches = [
             (spec, run)
             for spec, run in stored
@@ -77,50 +73,36 @@ def _rows_of_stride(stored: Sequence[tuple[RunSpec, StoredRun]]) -> list[dict[st
         spec, runs = matches[0][0], [run for _, run in matches]
         names = ("sensor", "source", "window_s", "window_stride_s", "estimator")
         row = {name: getattr(spec, name) for name in names} | {"leak": protocol}
-        weights = BEST if protocol == BEST_EPOCH_ON_TEST else LAST
-        rows.append(row | _pooled(runs, weights, by_name[MEAN], by_name[CONSTANT]))
+        epoch = BEST if protocol == BEST_EPOCH_ON_TEST else LAST
+        rows.append(row | _pooled(runs, epoch, scorer, constant))
     return rows
 
 
 def _pooled(
-    runs: Sequence[StoredRun], weights_of: str, mean: StoredRun, constant: StoredRun
+    runs: Sequence[StoredRun], epoch: str, scorer: Scorer, constant: StoredRun
 ) -> dict[str, Any]:
     """Scores of a way of training at a stride, with its seeds pooled."""
-    errors, first = _ordered(runs, weights_of), runs[0]
-    recordings = errors.recording.nunique()
-    weights = leave_one_out(recordings)
+    errors, first, view = errors_of(runs, epoch), runs[0], (PAPER, ALL)
     row: dict[str, Any] = {
         "simulated": first.tags["simulated"] == "1",
-        "windows": len(errors.groupby(["recording", "start"])),
-        "recordings": recordings,
+        "windows": len(errors[["recording", "start"]].drop_duplicates()),
+        "recordings": errors.recording.nunique(),
         "seeds": len(runs),
     }
-    tables = errors, _ordered([mean]), _ordered([constant])
-    ours, of_mean, of_constant = (squared_errors(table, PAPER, ALL) for table in tables)
-    curve = curve_errors(mean.load(CURVE), PAPER, ALL).of(weights)
-    window_s = float(first.params["window_s"])
-    for name, estimate in score(ours, of_mean, curve, window_s, weights).items():
+    for name, estimate in scorer.scores(errors, view).items():
         row |= with_ends(name, estimate)
-    plain = weights[:1]
-    ratio = np.sqrt(of_constant.mean(plain) / of_mean.mean(plain))[0]
-    row["constant_accuracy_gain_pct"] = 100 * (1 - ratio)
-    difference = paired_difference(ours, of_constant, weights, DETECTOR_PCT)
-    row |= {"over_constant_dps2": difference.value, "over_constant_dps2_hi": difference.hi}
-    row["beats_oracle_p"] = _oracle_p(first, weights_of)
-    scores = scores_of(first)
+    ours, of_constant = (squared_errors(table, *view) for table in (errors, errors_of([constant])))
+    gain = scorer.rmse_and_gain(of_constant, view)["accuracy_gain_pct"]
+    difference = paired_difference(ours, of_constant, scorer.weights, DETECTOR_PCT)
+    row |= {
+        "constant_accuracy_gain_pct": gain.value,
+        "over_constant_dps2": difference.value,
+        "over_constant_dps2_hi": difference.hi,
+    }
+    table = first.load(SCORES)
+    row["beats_oracle_p"] = (
+        read_scores(table, epoch=epoch).get(("beats_oracle_p", ALL), MISSING).value
+    )
     for name in _CEILINGS:
-        for end, bound in (("value", ""), ("lo", "_lo"), ("hi", "_hi")):
-            row[name + bound] = scores.get((name, ALL, end))
+        row |= with_ends(name, read_scores(table).get((name, ALL), MISSING))
     return row | {"run_ids": " ".join(run.run_id for run in runs)}
-
-
-def _ordered(runs: Sequence[StoredRun], weights: str = LAST) -> pd.DataFrame:
-    """Errors against the mean of the recording, in the same order for every run."""
-    tables = [errors_of([run], weights).query("truth == @PAPER") for run in runs]
-    return pd.concat([table.sort_values(["recording", "start", "axis"]) for table in tables])
-
-
-def _oracle_p(run: StoredRun, weights: str) -> float | None:
-    scores = run.load(SCORES).set_index(["score", "windows", "truth", "weights"]).value
-    value = scores.get(("beats_oracle_p", ALL, PAPER, weights))
-    return None if value is None else float(value)

@@ -15,19 +15,19 @@ from gyro_pipeline.estimators import DEFAULT, ESTIMATORS, estimator_class
 from gyro_pipeline.markup import escape, pipe_table
 from gyro_pipeline.parameters import GroundTruth, Only, Published, Study
 from gyro_pipeline.pipelines.reporting import tables
-from gyro_pipeline.pipelines.reporting.exhibits import PREMISE, Exhibit, Material, label
+from gyro_pipeline.pipelines.reporting.exhibits import Exhibit, Material, label
 from gyro_pipeline.pipelines.reporting.findings import answer, findings
 from gyro_pipeline.pipelines.reporting.results import CNN_BEST, NOT_RUN, ROW, WARNINGS
 from gyro_pipeline.studies import CNN, CONSTANT, LEAKAGE, MEAN
 
 Tables = Mapping[str, Callable[[], pd.DataFrame]]
-_OF_THE_PAPER = ("augmentation", "real2real", "input_channels", tables.FIRST_WINDOWS)
+PAPER_STUDIES = ("augmentation", "real2real", "input_channels", tables.FIRST_WINDOWS)
 """Studies that repeat the paper's; any other one has a figure and a table for each sensor."""
 
 _BASE = ("base", "local")
 _COLUMNS = [*ROW, "study", "status", "run_ids", "fingerprints", "env", "simulated"]
 _COLUMNS += ["recommended", "beats_oracle_p", *WARNINGS]
-"""Columns of results, which are also there if no result is."""
+"""Columns that the table of results has even without a row."""
 
 
 def write_report(
@@ -60,19 +60,19 @@ def write_report(
     for name, loaders in fresh.items():
         stored |= {f"{name}/{table}": load for table, load in loaders.items()}
     material = _material(source, published, stored)
-    exhibits = {
+    possible = {
         **_figures(material, ground_truth),
-        "start_up": _existing([tables.start_up(material)]),
+        "start_up": [tables.start_up(material)],
         "tables": _tables(material),
         "files": _files(material),
     }
+    exhibits = {part: [one for one in some if one is not None] for part, some in possible.items()}
     shown = [exhibit for part in exhibits.values() for exhibit in part]
     page = _page().render(
         exhibits,
         material=material,
         source=material.source_name,
         smoke="smoke" in source,
-        premise=PREMISE,
         answer=answer(material),
         findings=findings(material),
         explained=_explained(material.finished.estimator),
@@ -91,10 +91,11 @@ def _material(source: str, published: Published, stored: Tables) -> Material:
     def gathered(table: str, columns: Sequence[str]) -> pd.DataFrame:
         parts = [
             load()
-            for address, load in stored.items()
-            if address.endswith(f"/{table}") and not address.startswith(f"{LEAKAGE}/")
+            for address, load in stored.items()  # deeper ones are of commands with --params
+            if address.partition("/")[2] == table and not address.startswith(f"{LEAKAGE}/")
         ]
-        parts = [part for part in parts if len(part)]
+        # tables of earlier versions, whose plain names meant first windows, have to be made again
+        parts = [part for part in parts if len(part) and "test_rmse_dps_all" not in part]
         return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=[*columns])
 
     results = gathered("results", _COLUMNS)
@@ -111,8 +112,8 @@ def _material(source: str, published: Published, stored: Tables) -> Material:
     )
 
 
-def _tables(material: Material) -> list[Exhibit]:
-    return _existing([
+def _tables(material: Material) -> list[Exhibit | None]:
+    return [
         *(tables.paper_results(material, table) for table in tables.PAPER_TABLES),
         tables.trained_on_first_windows(material),
         *(tables.ratios(material, study, sensor) for study, sensor in _comparisons(material)),
@@ -120,10 +121,10 @@ def _tables(material: Material) -> list[Exhibit]:
         tables.recording_quality(material),
         tables.dataset_hours(material),
         tables.leakage_results(material),
-    ])  # fmt: skip
+    ]
 
 
-def _figures(material: Material, ground_truth: GroundTruth) -> dict[str, list[Exhibit]]:
+def _figures(material: Material, ground_truth: GroundTruth) -> dict[str, list[Exhibit | None]]:
     """The figures by their part of the page."""
     from gyro_pipeline.pipelines.reporting import figures, signals  # noqa: PLC0415
 
@@ -141,29 +142,25 @@ def _figures(material: Material, ground_truth: GroundTruth) -> dict[str, list[Ex
         figures.leakage_against_stride(material),
     ]
     return {
-        "drift": _existing([signals.drift(material)]),
-        "forest": _existing([figures.forest(material)]),
-        "figures": _existing(others),
+        "drift": [signals.drift(material)],
+        "forest": [figures.forest(material)],
+        "figures": others,
     }
 
 
-def _files(material: Material) -> list[Exhibit]:
+def _files(material: Material) -> list[Exhibit | None]:
     """Tables that are too long for the page."""
     studies = material.results.study.unique().tolist()
     compared = dict.fromkeys(study for study, _ in _comparisons(material))
-    return _existing([
+    return [
         *(tables.results_table(material, study) for study in studies),
         *(tables.comparison(material, study) for study in compared),
-    ])  # fmt: skip
-
-
-def _existing(exhibits: Iterable[Exhibit | None]) -> list[Exhibit]:
-    return [exhibit for exhibit in exhibits if exhibit is not None]
+    ]
 
 
 def _comparisons(material: Material) -> list[tuple[str, str]]:
     """Each study that compares estimators, with each of its sensors."""
-    rows = material.results[~material.results.study.isin(_OF_THE_PAPER)]
+    rows = material.results[~material.results.study.isin(PAPER_STUDIES)]
     return list(dict.fromkeys(zip(rows.study, rows.sensor, strict=True)))
 
 

@@ -134,25 +134,11 @@ def start_up(recordings: xr.Dataset, bias: pd.DataFrame, noise: pd.DataFrame) ->
         methods mean, history and ceiling: 0 if the history alone suffices, infinite if it takes
         longer than a recording, NaN if the noise is unknown.
     """
-    imu, rate_hz = tested_imu(recordings), recordings.attrs["rate_hz"]
-    white, flicker, walk = (
-        noise[noise.imu == imu].set_index("axis").loc[list(AXES), FIGURES].T.to_numpy()
-    )
-    training = bias[bias.imu == imu]
-    if "split" in recordings.coords:
-        held_out = recordings.recording[recordings.split == TEST].to_numpy()
-        training = training[~training.recording.isin(held_out)]
-    means = training.pivot(index="recording", columns="axis", values="bias_dps")[
-        list(AXES)
-    ].to_numpy()
+    rate_hz, own = recordings.attrs["rate_hz"], noise[noise.imu == tested_imu(recordings)]
+    white, flicker, walk = own.set_index("axis").loc[list(AXES), FIGURES].T.to_numpy()
     recording_s = float(recordings["samples"].max()) / rate_hz
-    averaging, count = white**2 / recording_s, len(means)
-    try:
-        spread = turn_on_spread(means, averaging)
-    except InputError:  # a single recording
-        spread = np.full(len(AXES), np.nan)
-    if "true_turn_on_spread" in recordings:
-        spread = recordings.true_turn_on_spread.to_numpy()
+    averaging = white**2 / recording_s
+    spread, count = _turn_on_spread(recordings, bias, averaging)
     times_s = np.geomspace(1 / rate_hz, recording_s, 4000)[:, None]
     mean = white**2 / times_s + FLICKER_FLOOR * flicker**2 + walk**2 * times_s / 3
     priors = {
@@ -172,6 +158,23 @@ def start_up(recordings: xr.Dataset, bias: pd.DataFrame, noise: pd.DataFrame) ->
             time_s = 0.0 if prior.mean() <= (sigma * MDPS) ** 2 else float(time_s)
             row[f"{method}_s_at_{sigma:g}"] = np.nan if np.isnan(variance).any() else time_s
     return row
+
+
+def _turn_on_spread(
+    recordings: xr.Dataset, bias: pd.DataFrame, averaging: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], int]:
+    """Spread of the tested IMU, (axes,), deg/s, and the number of recordings that it is from."""
+    training = bias[bias.imu == tested_imu(recordings)]
+    if "split" in recordings.coords:
+        held_out = recordings.recording[recordings.split == TEST].to_numpy()
+        training = training[~training.recording.isin(held_out)]
+    means = training.pivot(index="recording", columns="axis", values="bias_dps")[list(AXES)]
+    if "true_turn_on_spread" in recordings:
+        return recordings.true_turn_on_spread.to_numpy(), len(means)
+    try:
+        return turn_on_spread(means.to_numpy(), averaging), len(means)
+    except InputError:  # a single recording
+        return np.full(len(AXES), np.nan), len(means)
 
 
 def recording_quality(table: pd.DataFrame) -> pd.DataFrame:

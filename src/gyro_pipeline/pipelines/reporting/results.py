@@ -1,11 +1,11 @@
 """Results from tracked runs: a row for each, with seeds pooled and intervals."""
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache, cached_property
-from itertools import groupby
+from itertools import groupby, product
 from typing import Any
 
 import numpy as np
@@ -14,20 +14,12 @@ import pandas as pd
 from gyro_pipeline.conventions import ALL, AXES, BEST, FIRST, LAST, PAPER
 from gyro_pipeline.estimators import DEFAULT
 from gyro_pipeline.parameters import Only, Study
+from gyro_pipeline.scoring.scorer import MISSING, Scorer, read_scores
 from gyro_pipeline.scoring.scores import (
     Estimate,
-    SquaredErrors,
-    WeightedCurve,
-    clusters,
-    curve_errors,
     gain_difference,
-    gain_pct,
-    leave_one_out,
     paired_difference,
-    rmse_difference,
-    score,
     squared_errors,
-    with_interval,
 )
 from gyro_pipeline.studies import CNN, CONSTANT, LEFT_OUT, MEAN, RunSpec, possible_runs, run_spec
 from gyro_pipeline.studies import study_rows as rows_of_study
@@ -46,12 +38,8 @@ CNN_BEST = "cnn_best"
 
 CEILINGS = ["ceiling_rmse_dps", "ceiling_time_saving_pct", "ceiling_accuracy_gain_pct"]
 CEILINGS += [f"ceiling_{name}_accuracy_gain_pct" for name in ("joint", "history")]
-REALISED = [
-    f"{name}_{score}"
-    for name in ("oracle", "constant")
-    for score in ("rmse_dps", "accuracy_gain_pct")
-]
-"""Scores of the constant and, on simulated data, of the oracle on the same windows."""
+REFERENCE_GAINS = ["oracle_accuracy_gain_pct", "constant_accuracy_gain_pct"]
+"""A of the constant and, on simulated data, of the oracle on the same windows."""
 
 OTHERS = ["coverage_1sigma_pct", "coverage_2sigma_pct", "beats_oracle_p"]
 OTHERS += [f"prior_p_{axis}" for axis in AXES]
@@ -62,21 +50,22 @@ WARNINGS = ["below_ceiling", "prior_conflict"]
 REFERENCES = (MEAN, DEFAULT, CONSTANT)
 """Estimators that every other one is compared with, in pairs over recordings."""
 
-ADDED = ("virtual_gyros", "real_gyros")
+PAIRED_COUNTS = ("virtual_gyros", "real_gyros")
 """Counts of training gyroscopes whose effect on A is compared in pairs."""
 
+_OF_THE_MEAN = ["test_rmse_dps", "oracle_rmse_dps", "constant_rmse_dps"]
+_OF_THE_MEAN += [*REFERENCE_GAINS, *CEILINGS]
 _CURVES = ["study", "sensor", "windows", "time_s", "rmse_dps"]
-_ENDS = {"": "value", "_lo": "lo", "_hi": "hi"}
 
 
-def column(name: str, windows: str = FIRST) -> str:
-    """Name of a column of results: the plain name of the score for first windows."""
-    return f"{name}_{ALL}" if windows == ALL else name
+def column(name: str, windows: str) -> str:
+    """Name of a column of results, as of metrics: the plain name of the score for all windows."""
+    return f"{name}_{FIRST}" if windows == FIRST else name
 
 
 def with_ends(name: str, estimate: Estimate) -> dict[str, float | None]:
     """Columns with an estimate, under its name, and with the ends of its interval."""
-    return {name + end: getattr(estimate, key) for end, key in _ENDS.items()}
+    return {name: estimate.value, f"{name}_lo": estimate.lo, f"{name}_hi": estimate.hi}
 
 
 def pool_results(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
@@ -105,10 +94,12 @@ def pool_results(  # noqa: PLR0913, PLR0917 - a node's arguments are its dataset
     curves = [pd.DataFrame(columns=_CURVES)]
     for sensor in sensors:
         specs = rows_of_study(study, sensor, source, windows_s, seeds, only)
-        for window_s in dict.fromkeys(spec.window_s for spec in specs):
-            cell = Cell([spec for spec in specs if spec.window_s == window_s], finder)
-            results += cell.results()
-        curves += [] if cell.mean is None else [pooled_curve(cell.mean)]
+        cells = [
+            Cell([spec for spec in specs if spec.window_s == window_s], finder)
+            for window_s in dict.fromkeys(spec.window_s for spec in specs)
+        ]
+        results += [row for cell in cells for row in cell.results()]
+        curves += [cell.curves() for cell in cells if cell.mean is not None][-1:]
     unused = len({run.fingerprint for run in runs} - finder.planned)
     if unused:
         logger.info(
@@ -179,23 +170,10 @@ class Cell:
         }
 
     @cached_property
-    def _weights(self) -> np.ndarray:
-        """Weights of recordings, or devices, with each left out in turn."""
-        return leave_one_out(clusters(self._references[MEAN]).nunique())
-
-    @cached_property
-    def _squares(self) -> dict[str, SquaredErrors]:
-        """Squared errors of the running mean, for all and for first windows."""
-        errors = self._references[MEAN]
-        return {windows: squared_errors(errors, PAPER, windows) for windows in (ALL, FIRST)}
-
-    @cached_property
-    def _curves(self) -> dict[str, WeightedCurve]:
-        """RMSE of the running mean against its length, for all and for first windows."""
+    def _scorer(self) -> Scorer:
         assert self.mean is not None
-        table = self.mean.load(CURVE)
-        curves = {windows: curve_errors(table, PAPER, windows) for windows in (ALL, FIRST)}
-        return {windows: curve.of(self._weights) for windows, curve in curves.items()}
+        errors, curve = self._references[MEAN], self.mean.load(CURVE)
+        return Scorer(errors, curve, self.specs[0].window_s)
 
     def results(self) -> list[dict[str, Any]]:
         """A result for each row; all need the running mean, which they are compared with."""
@@ -208,21 +186,28 @@ class Cell:
             results.append(name | self._result(specs[0], runs) | self._added(specs[0], runs))
             best = [best_epoch(run) for run in runs if specs[0].estimator == CNN]
             if best and all(len(run.load(ERRORS)) for run in best):
-                results.append(
-                    results[-1] | self._figures(best, specs[0].window_s) | {"estimator": CNN_BEST}
-                )
+                results.append(results[-1] | self._pooled(best) | {"estimator": CNN_BEST})
         return results
+
+    def curves(self) -> pd.DataFrame:
+        """RMSE of the running mean against its length, for first and for all windows."""
+        parts, spec = [], self.specs[0]
+        for windows in (FIRST, ALL):
+            curve = self._scorer.curves[PAPER, windows]
+            points = {"windows": windows, "time_s": curve.times_s, "rmse_dps": curve.rmse[0]}
+            parts.append(pd.DataFrame(points))
+        return pd.concat(parts).assign(study=spec.study, sensor=spec.sensor)[_CURVES]
 
     def _result(self, spec: RunSpec, runs: Sequence[StoredRun]) -> dict[str, Any]:
         assert self.mean is not None
-        tags, scores = runs[0].tags, scores_of(runs[0])
+        tags, scores = runs[0].tags, read_scores(runs[0].load(SCORES))
         row = mean_row(self.mean)
         if spec.estimator != MEAN:
-            row |= self._figures(runs, spec.window_s)
+            row |= self._pooled(runs)
         elif DEFAULT in self._references:
             row |= self._differences(runs)
         return row | {
-            **{name: scores.get((name, ALL, "value")) for name in OTHERS},
+            **{name: scores.get((name, ALL), MISSING).value for name in OTHERS},
             **{
                 name: next(filter(None, (r.tags.get(name) for r in runs)), None)
                 for name in WARNINGS
@@ -237,18 +222,18 @@ class Cell:
             **_provenance(runs),
         }
 
-    def _figures(self, runs: Sequence[StoredRun], window_s: float) -> dict[str, Any]:
+    def _pooled(self, runs: Sequence[StoredRun]) -> dict[str, Any]:
         """Scores of all seeds pooled, with intervals over recordings.
 
         Squared errors are averaged over seeds; ``_seed_sd`` is the standard deviation of the scores
         of single seeds, None for one seed.
         """
         errors = [errors_of([run]) for run in runs]
-        tested = self._references[MEAN].reindex(columns=["imu", "recording"], fill_value=0)
-        row: dict[str, Any] = {"seeds": len(errors), "recordings": len(tested.drop_duplicates())}
+        places = self._references[MEAN].reindex(columns=["imu", "recording"], fill_value=0)
+        row: dict[str, Any] = {"seeds": len(errors), "recordings": len(places.drop_duplicates())}
         for windows in (ALL, FIRST):
-            pooled = self._scores(pd.concat(errors), windows, window_s)
-            single = [self._scores(table, windows, window_s) for table in errors[1:] and errors]
+            pooled = self._scores(pd.concat(errors), windows)
+            single = [self._scores(table, windows) for table in errors[1:] and errors]
             for base, estimate in pooled.items():
                 name = column(base, windows)
                 row |= with_ends(name, estimate)
@@ -257,20 +242,9 @@ class Cell:
                 row[f"{name}_seed_sd"] = spread
         return row | self._differences(runs)
 
-    def _scores(self, errors: pd.DataFrame, windows: str, window_s: float) -> dict[str, Estimate]:
-        squares, of_mean = squared_errors(errors, PAPER, windows), self._squares[windows]
-        scores = score(squares, of_mean, self._curves[windows], window_s, self._weights)
-        return scores | {
-            f"accuracy_gain_pct_{axis}": self._gain(errors, windows, axis) for axis in AXES
-        }
-
-    def _gain(self, errors: pd.DataFrame, windows: str, axis: str) -> Estimate:
-        """A on an axis."""
-        square, of_mean = (
-            squared_errors(table[table.axis == axis], PAPER, windows).mean(self._weights)
-            for table in (errors, self._references[MEAN])
-        )
-        return gain_pct(with_interval(np.sqrt(square / of_mean), positive=True))
+    def _scores(self, errors: pd.DataFrame, windows: str) -> dict[str, Estimate]:
+        view = PAPER, windows
+        return self._scorer.scores(errors, view) | self._scorer.gains_by_axis(errors, view)
 
     def _added(self, spec: RunSpec, runs: Sequence[StoredRun]) -> dict[str, Any]:
         """A less the A with the fewest gyroscopes, all else equal: ``added_<count>_pct``.
@@ -278,7 +252,7 @@ class Cell:
         Differences are over all windows, paired over recordings, with all seeds together.
         """
         row: dict[str, Any] = {}
-        for count in ADDED if spec.estimator == CNN else ():
+        for count in PAIRED_COUNTS if spec.estimator == CNN else ():
             without: dict[str, Any] = {count: 0}
             similar = [
                 (getattr(specs[0], count), others)
@@ -288,7 +262,8 @@ class Cell:
             fewest, base_runs = min(similar, key=lambda pair: pair[0])
             if getattr(spec, count) > fewest:
                 more, base = (squared_errors(errors_of(r), PAPER, ALL) for r in (runs, base_runs))
-                change = gain_difference(more, base, self._squares[ALL], self._weights)
+                mean = self._scorer.mean_squares[PAPER, ALL]
+                change = gain_difference(more, base, mean, self._scorer.weights)
                 row |= with_ends(f"added_{count}_pct", change)
         return row
 
@@ -304,8 +279,8 @@ class Cell:
         for truth in table.truth.unique():
             squares = squared_errors(table, truth, ALL)
             for name, errors in self._references.items():
-                compare = rmse_difference if truth == PAPER else paired_difference
-                difference = compare(squares, squared_errors(errors, truth, ALL), self._weights)
+                pair = squares, squared_errors(errors, truth, ALL)
+                difference = paired_difference(*pair, self._scorer.weights, root=truth == PAPER)
                 key = f"less_{name}_dps" + ("" if truth == PAPER else f"2_{truth}")
                 row |= with_ends(key, difference)
         return row
@@ -326,30 +301,12 @@ def _provenance(runs: Sequence[StoredRun]) -> dict[str, Any]:
     }
 
 
-def scores_of(run: StoredRun) -> Mapping[tuple[str, str, str], float]:
-    """Scores of a run at the last epoch against the paper's truth.
-
-    Returns:
-        Existing values by score, windows, and ``value``, ``lo`` or ``hi``.
-    """
-    table = run.load(SCORES)
-    table = table[(table.truth == PAPER) & (table.weights == LAST)]
-    return {
-        (row.score, row.windows, end): float(getattr(row, end))
-        for row in table.itertuples()
-        for end in _ENDS.values()
-        if pd.notna(getattr(row, end))
-    }
-
-
 def mean_row(mean: StoredRun) -> dict[str, Any]:
     """Errors and ceilings of a window length, from the run of its running mean."""
     row: dict[str, Any] = {"recording_s": float(mean.load(CURVE).time_s.max())}
-    scores = scores_of(mean)
-    for windows in (ALL, FIRST):
-        for name in ["test_rmse_dps", *CEILINGS, *REALISED]:
-            for end, key in _ENDS.items():
-                row[column(name, windows) + end] = scores.get((name, windows, key))
+    scores = read_scores(mean.load(SCORES))
+    for windows, name in product((ALL, FIRST), _OF_THE_MEAN):
+        row |= with_ends(column(name, windows), scores.get((name, windows), MISSING))
     return row
 
 
@@ -360,25 +317,7 @@ def best_epoch(run: StoredRun) -> StoredRun:
     return replace(run, load={ERRORS: errors}.__getitem__)
 
 
-def errors_of(runs: Iterable[StoredRun], weights: str = LAST) -> pd.DataFrame:
-    """Errors of runs, one after the other, with the weights of the last or best epoch."""
+def errors_of(runs: Iterable[StoredRun], epoch: str = LAST) -> pd.DataFrame:
+    """Errors of runs, one after the other, at the last or best epoch."""
     table = pd.concat([run.load(ERRORS) for run in runs])
-    return table[table.weights == weights]
-
-
-def pooled_curve(mean: StoredRun) -> pd.DataFrame:
-    """RMSE of the running mean against its length, for first and for all windows.
-
-    Args:
-        mean: The run of the running mean.
-
-    Returns:
-        Columns ``study, sensor, windows, time_s, rmse_dps``.
-    """
-    parts, table = [], mean.load(CURVE)
-    for windows in (FIRST, ALL):
-        curve = curve_errors(table, PAPER, windows)
-        rmse = curve.of(np.ones((1, len(curve.squares.sums)))).rmse[0]
-        parts.append(pd.DataFrame({"windows": windows, "time_s": curve.times_s, "rmse_dps": rmse}))
-    keys = {name: mean.params[name] for name in ("study", "sensor")}
-    return pd.concat(parts).assign(**keys)[_CURVES]
+    return table[table.weights == epoch]

@@ -1,5 +1,7 @@
 """The figures of recordings: a function for each, drawn from the tables of ``describe``."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -15,9 +17,9 @@ from gyro_pipeline.pipelines.reporting.recordings import GYROSCOPES, WARM_UPS_S
 from gyro_pipeline.pipelines.reporting.style import (
     CEILING,
     COLOURS,
-    LOOK,
+    grid_shape,
+    panels,
     plain_ticks,
-    share_legend,
 )
 
 _FROM_S = 1.0  # a shorter running mean is mostly off the figure
@@ -30,9 +32,9 @@ def drift(material: Material) -> Exhibit | None:
     lines = material.signals[material.signals.figure == "drift"]
     if lines.empty:
         return None
-    figure, panels = _panels(material, sharey=False)
-    with LOOK():
-        for ax, sensor in panels:
+    title = f"Mean rate against time after power-on; {material.source_name}"
+    with _sensor_panels(material, title, columns=4, sharey=False) as (figure, axes):
+        for ax, sensor in axes:
             rows = lines[lines.sensor == sensor]
             for axis, colour in zip(AXES, COLOURS, strict=False):
                 line = rows[rows.line == axis]
@@ -45,8 +47,6 @@ def drift(material: Material) -> Exhibit | None:
             ax.axhline(0, color="black", lw=0.8)
             ax.set(title=material.sensor_name(sensor), xlabel="time after power-on [s]")
             ax.set_ylabel("mean rate less its end [mdps]")
-        share_legend(figure, [ax for ax, _ in panels], columns=4)
-        figure.suptitle(f"Mean rate against time after power-on; {material.source_name}")
     caption = (
         "The mean over all recordings, each centred by its last quarter, with its 95 % interval. A "
         "line at 0 is a bias that does not move; a line that starts off 0 is a warm-up, which any "
@@ -74,21 +74,18 @@ def allan_deviation(material: Material) -> Exhibit | None:
     lines = material.signals[material.signals.figure == "allan"]
     if lines.empty:
         return None
-    sheets = {sheet.sensor: sheet for sheet in material.published.specifications}
-    figure, panels = _panels(material, sharey=True)
-    with LOOK():
-        for ax, sensor in panels:
+    title = f"Overlapping Allan deviation; {material.source_name}"
+    with _sensor_panels(material, title, columns=3, sharey=True) as (figure, axes):
+        for ax, sensor in axes:
             row = material.sensors[material.sensors.sensor == sensor].iloc[0]
             _draw_allan(ax, lines[lines.sensor == sensor], row)
-            sheet = sheets.get(sensor)
+            sheet = material.sheets.get(sensor)
             if sheet is not None and sheet.noise_density_mdps_rthz is not None:
                 times_s = np.sort(lines[lines.sensor == sensor].x.unique())
                 stated = sheet.noise_density_mdps_rthz / np.sqrt(2) / np.sqrt(times_s)
                 ax.plot(times_s, stated, "k:", label="white noise of the datasheet")
             ax.set(title=material.sensor_name(sensor), xlabel="averaging time [s]")
             ax.set_ylabel("Allan deviation [mdps]")
-        share_legend(figure, [ax for ax, _ in panels], columns=3)
-        figure.suptitle(f"Overlapping Allan deviation; {material.source_name}")
     caption = (
         "The scatter of averages against their length. White noise falls as 1/√t; flicker (B) and "
         "random walk (K) bend the curve upwards. The dashed line is the fit over all gyroscopes."
@@ -120,9 +117,9 @@ def running_average(material: Material, ground_truth: GroundTruth) -> Exhibit | 
     mean, settled = (lines[lines.figure == name] for name in ("running average", "bias"))
     settled_s, bias = float(settled.x.iloc[0]), float(settled.y.iloc[0]) / MDPS
     tolerance = ground_truth.tolerance_mdps
-    with LOOK():
-        figure = Figure(figsize=(8.5, 4.2), layout="constrained")
-        ax = figure.subplots()
+    title = "Running average of one gyroscope"
+    heading = f"{title}: {_gyroscope(material, mean)}"
+    with panels(heading, (8.5, 4.2), columns=2) as (figure, (ax,)):
         ax.plot(mean.x, mean.y / MDPS, color=COLOURS[0], label="running average")
         ax.axhline(bias, color="black", lw=1, label="ground truth: mean of the recording")
         _band(ax, bias, tolerance, f"± {tolerance:g} mdps")
@@ -130,10 +127,8 @@ def running_average(material: Material, ground_truth: GroundTruth) -> Exhibit | 
         ax.axvline(settled_s, color=CEILING, ls="--", label=label)
         _set_limits(ax, (mean.y[mean.x >= _FROM_S] / MDPS - bias).to_numpy(), tolerance, bias)
         ax.set(xlim=(0, mean.x.max()), xlabel="time [s]", ylabel="angular rate [mdps]")
-        share_legend(figure, [ax], columns=2)
-        figure.suptitle(f"Running average of one gyroscope: {_gyroscope(material, mean)}")
     caption = f"{_TOLERANCE} Paper, section II."
-    return Exhibit("running_average", "Running average of one gyroscope", caption, figure)
+    return Exhibit("running_average", title, caption, figure)
 
 
 def calibrated_signal(material: Material) -> Exhibit | None:
@@ -142,9 +137,9 @@ def calibrated_signal(material: Material) -> Exhibit | None:
     if lines is None:
         return None
     raw, bias = lines[lines.figure == "signal"], float(lines[lines.figure == "bias"].y.iloc[0])
-    with LOOK():
-        figure = Figure(figsize=(8.5, 4.2), layout="constrained")
-        ax = figure.subplots()
+    mean = lines[lines.figure == "running average"]
+    title = f"Raw and calibrated signal: {_gyroscope(material, mean)}"
+    with panels(title, (8.5, 4.2)) as (figure, (ax,)):
         # as pixels also in the SVG, which would hold every sample otherwise
         style: dict[str, Any] = {"lw": 0.4, "rasterized": True}
         ax.plot(raw.x, raw.y, color=COLOURS[0], label="raw", **style)
@@ -152,11 +147,8 @@ def calibrated_signal(material: Material) -> Exhibit | None:
         ax.axhline(bias, color=COLOURS[1], lw=2, label="bias")
         ax.axhline(0, color="black", lw=1)
         ax.set(xlim=(0, raw.x.max()), xlabel="time [s]", ylabel="angular rate [deg/s]")
-        share_legend(figure, [ax], columns=3)
-        for line in figure.legends[0].get_lines():
-            line.set_linewidth(2)
-        mean = lines[lines.figure == "running average"]
-        figure.suptitle(f"Raw and calibrated signal: {_gyroscope(material, mean)}")
+    for handle in figure.legends[0].get_lines():
+        handle.set_linewidth(2)
     caption = "Calibrated is the raw signal less the bias. Paper, section II."
     title = "Raw and calibrated signal of the same gyroscope"
     return Exhibit("calibrated_signal", title, caption, figure)
@@ -172,9 +164,10 @@ def mg_convergence(material: Material, ground_truth: GroundTruth) -> Exhibit | N
     counts = [count for count, line in zip(GYROSCOPES, together, strict=True) if len(line)]
     each = lines[lines.figure == "convergence"]
     alone = np.reshape(each.y / MDPS, (-1, len(together[0])))
-    with LOOK():
-        figure = Figure(figsize=(9.5, 3.6), layout="constrained")
-        axes = figure.subplots(1, len(counts), sharex=True, sharey=True, squeeze=False)[0]
+    title, sensor = "Running average of several gyroscopes", lines.sensor.iloc[0]
+    heading = f"{title}: {material.sensor_name(sensor)}; {material.source_name}"
+    shape = (1, len(counts))
+    with panels(heading, (9.5, 3.6), shape, sharex=True, sharey=True) as (figure, axes):
         for ax, count, line in zip(axes, counts, together, strict=False):
             for single in alone[:count]:
                 ax.plot(line.x, single, color="grey", lw=0.5, alpha=0.6, label="each alone")
@@ -185,14 +178,11 @@ def mg_convergence(material: Material, ground_truth: GroundTruth) -> Exhibit | N
             ax.set_xlim(0, line.x.max())
         _set_limits(axes[0], alone[:, together[0].x >= 2 * _FROM_S], tolerance)
         axes[0].set_ylabel("running average less ground truth [mdps]")
-        share_legend(figure, axes, columns=3)
-        sensor = material.sensor_name(lines.sensor.iloc[0])
-        figure.suptitle(f"Running average of several gyroscopes: {sensor}; {material.source_name}")
     caption = (
         "Each gyroscope is centred by its bias before averaging: biases of several deg/s would "
         f"hide everything else. {_TOLERANCE} Paper, section III-A."
     )
-    return Exhibit("mg_convergence", "Running average of several gyroscopes", caption, figure)
+    return Exhibit("mg_convergence", title, caption, figure)
 
 
 def _shown_lines(material: Material) -> pd.DataFrame | None:
@@ -204,16 +194,17 @@ def _shown_lines(material: Material) -> pd.DataFrame | None:
     return material.signals[material.signals.sensor == shown]
 
 
-def _panels(material: Material, sharey: bool) -> tuple[Figure, list[tuple[Axes, str]]]:
+@contextmanager
+def _sensor_panels(
+    material: Material, title: str, columns: int, sharey: bool
+) -> Iterator[tuple[Figure, list[tuple[Axes, str]]]]:
     """A figure with a panel for every sensor."""
     sensors = material.signals.sensor.unique().tolist()
-    high, wide = -(-len(sensors) // 2), min(2, len(sensors))
-    with LOOK():
-        figure = Figure(figsize=(9.5, 1.2 + 3 * high), layout="constrained")
-        axes = figure.subplots(high, wide, sharey=sharey, squeeze=False).ravel()
-    for ax in axes[len(sensors) :]:
-        ax.remove()
-    return figure, list(zip(axes, sensors, strict=False))
+    shape = grid_shape(len(sensors))
+    with panels(title, (9.5, 1.2 + 3 * shape[0]), shape, columns, sharey=sharey) as (figure, axes):
+        for ax in axes[len(sensors) :]:
+            ax.remove()
+        yield figure, list(zip(axes, sensors, strict=False))
 
 
 def _gyroscope(material: Material, line: pd.DataFrame) -> str:

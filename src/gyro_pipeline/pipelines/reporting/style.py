@@ -1,7 +1,7 @@
 """The style of figures."""
 
-from collections.abc import Iterable
-from functools import partial
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import matplotlib as mpl
@@ -16,8 +16,7 @@ COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D3B300")
 CEILING = "#D55E00"
 MARKERS = ("o", "s", "^", "D", "v", "P")
 
-LOOK = partial(mpl.rc_context, {"font.size": 9, "axes.grid": True, "grid.alpha": 0.3})
-"""Context in which figures are drawn."""
+PLOT_STYLE: Any = {"font.size": 9, "axes.grid": True, "grid.alpha": 0.3}
 
 _FAMILIES = {
     "black": ("mean", "median", "trimmed_mean"),
@@ -49,14 +48,44 @@ def estimator_look(name: str, recommended: bool) -> dict[str, Any]:
     }
 
 
-def share_legend(figure: Figure, axes: Iterable[Axes], columns: int) -> None:
-    """Add a legend below all panels, with each label once."""
-    handles: dict[str, Artist] = {}
-    for ax in axes:
-        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
-            handles.setdefault(str(label), handle)
-    layout: Any = {"loc": "outside lower center", "ncols": columns, "frameon": False}
-    figure.legend(list(handles.values()), list(handles), **layout)
+@contextmanager
+def panels(
+    title: str | None,
+    size: tuple[float, float],
+    shape: tuple[int, int] = (1, 1),
+    columns: int = 3,
+    *,
+    sharex: bool = False,
+    sharey: bool = False,
+) -> Iterator[tuple[Figure, list[Axes]]]:
+    """A figure whose panels are drawn in this context, and share the legend below them.
+
+    Args:
+        title: Title of the figure.
+        size: Width and height, inches.
+        shape: Rows and columns of panels.
+        columns: Columns of the legend, which has each label once.
+        sharex: Whether panels share their x axis.
+        sharey: Whether panels share their y axis.
+    """
+    with mpl.rc_context(PLOT_STYLE):
+        figure = Figure(figsize=size, layout="constrained")
+        grid = figure.subplots(*shape, sharex=sharex, sharey=sharey, squeeze=False)
+        axes = grid.ravel().tolist()
+        yield figure, axes
+        handles: dict[str, Artist] = {}
+        for ax in axes:
+            for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+                handles.setdefault(str(label), handle)
+        layout: Any = {"loc": "outside lower center", "ncols": columns, "frameon": False}
+        figure.legend(list(handles.values()), list(handles), **layout)
+        if title:
+            figure.suptitle(title)
+
+
+def grid_shape(count: int) -> tuple[int, int]:
+    """Rows and columns of panels, at most two side by side."""
+    return -(-count // 2), min(2, count)
 
 
 def reach(values: ArrayLike, lo: ArrayLike, hi: ArrayLike) -> NDArray[np.float64]:

@@ -10,6 +10,8 @@ from gyro_pipeline.conventions import ALL, AXES, DISJOINT, FIRST, MDPS, PAPER, T
 from gyro_pipeline.estimators import DEFAULT, ESTIMATORS, ORIENTATION_NOTE
 from gyro_pipeline.parameters import PublishedHours, PublishedResult
 from gyro_pipeline.pipelines.reporting.exhibits import (
+    BEATS_ORACLE_P,
+    LEAK_VARIANTS,
     STUDIES_OF,
     Exhibit,
     Material,
@@ -25,10 +27,11 @@ from gyro_pipeline.pipelines.reporting.exhibits import (
 )
 from gyro_pipeline.pipelines.reporting.recordings import SIGMAS_MDPS
 from gyro_pipeline.pipelines.reporting.results import (
-    ADDED,
     CEILINGS,
     OTHERS,
-    REALISED,
+    PAIRED_COUNTS,
+    REFERENCE_GAINS,
+    ROW,
     WARNINGS,
     column,
 )
@@ -54,8 +57,9 @@ _SUMMARY = (
     "those of white noise without drift or, if fitted, of the noise of the recordings. They are "
     "expected values: an A above the ceiling whose interval contains it is there by chance. The "
     "oracle, which knows the drawn values, is judged on the same windows as the network. "
-    "The warm-up needed is the amplitude that would make the published A the ceiling of first "
-    "windows, for time constants of 5 to 60 s and recordings as long as those of the paper. S of "
+    "The warm-up needed is the amplitude that would raise the ceiling of first "
+    "windows to the published A, for time constants of 5 to 60 s and the paper's lengths of "
+    "recordings. S of "
     "the ceiling, A of each axis, seeds and runs are in the CSV files. Paper, section IV-G."
 )
 
@@ -167,7 +171,7 @@ def _warm_up(material: Material, claim: PublishedResult) -> str:
 
 
 def _spread(row: Any, base: str) -> str:
-    spread = row.get(f"{column(base, ALL)}_seed_sd")
+    spread = row.get(f"{base}_seed_sd")
     return "–" if spread is None or pd.isna(spread) else f"{spread:.1f}"
 
 
@@ -185,8 +189,7 @@ def results_table(material: Material, study: str) -> Exhibit:
     # the same runs, where an estimator uses the same part of several training sets
     copies = rows.duplicated(["sensor", "estimator", "window_s", "run_ids"]) & rows.run_ids.notna()
     rows = rows[~copies]
-    columns = ["sensor", "estimator", "method", "real_gyros", "virtual_gyros", "window_s"]
-    table = rows[columns].assign(source=material.source_name)
+    table = rows[ROW].drop(columns="source").assign(source=material.source_name)
     for windows in (ALL, FIRST):
         table[f"RMSE {windows} mdps"] = _scaled(rows, column("test_rmse_dps", windows), 3, MDPS)
         for short, base in (("S", "time_saving_pct"), ("A", "accuracy_gain_pct")):
@@ -194,11 +197,11 @@ def results_table(material: Material, study: str) -> Exhibit:
         ceiling = _scaled(rows, column("ceiling_rmse_dps", windows), 3, MDPS)
         table[f"ceiling {windows} mdps"] = ceiling
     logger.info("results\n%s", table.to_string(index=False, na_rep="–"))
-    more = [f"accuracy_gain_pct_{axis}" for axis in AXES] + CEILINGS[-2:] + REALISED[1::2]
+    more = [f"accuracy_gain_pct_{axis}" for axis in AXES] + CEILINGS[-2:] + REFERENCE_GAINS
     for base in more:
         short = base.replace("accuracy_gain_pct", "A").replace("_", " ")
-        table[f"{short} {ALL} %"] = _scaled(rows, column(base, ALL), 0)
-    added = [f"added_{count}_pct{end}" for count in ADDED for end in ("", "_lo", "_hi")]
+        table[f"{short} {ALL} %"] = _scaled(rows, base, 0)
+    added = [f"added_{count}_pct{end}" for count in PAIRED_COUNTS for end in ("", "_lo", "_hi")]
     for name in [name for name in (*added, *OTHERS, *WARNINGS) if name in rows]:
         table[name.replace("_", " ")] = rows[name]
     table["split"] = [split(row) for _, row in rows.iterrows()]
@@ -218,7 +221,7 @@ def comparison(material: Material, study: str) -> Exhibit | None:
     negative one favours the estimator of the row. Against the samples outside the window, truth
     (b), and the drawn bias, truth (c), they are differences of mean squares.
     """
-    results = material.finished[material.finished.study == study].copy()
+    results = material.finished_of(study).copy()
     if results.empty:
         return None
     results["rank"] = results.estimator.map({name: i for i, name in enumerate(ESTIMATORS)})
@@ -233,7 +236,7 @@ def comparison(material: Material, study: str) -> Exhibit | None:
 
 
 def _comparison_row(material: Material, row: pd.Series, group: pd.DataFrame) -> dict[str, Any]:
-    mean = group[group.estimator == MEAN].test_rmse_dps_all.iloc[0]
+    mean = group[group.estimator == MEAN].test_rmse_dps.iloc[0]
     return {
         "Sensor": row.sensor,
         "Source": material.source_name,
@@ -242,8 +245,8 @@ def _comparison_row(material: Material, row: pd.Series, group: pd.DataFrame) -> 
         "Training set": gyroscopes(row),
         "Recommended": "yes" if row.recommended else "no",
         "Stored prior": "yes" if row.uses_prior else "no",
-        "RMSE mdps": round(row.test_rmse_dps_all / MDPS, 3),
-        "RMSE / running mean's": round(row.test_rmse_dps_all / mean, 3),
+        "RMSE mdps": round(row.test_rmse_dps / MDPS, 3),
+        "RMSE / running mean's": round(row.test_rmse_dps / mean, 3),
         "Less running mean mdps": _difference(row, MEAN),
         f"Less {DEFAULT} mdps": _difference(row, DEFAULT),
         **{
@@ -251,7 +254,7 @@ def _comparison_row(material: Material, row: pd.Series, group: pd.DataFrame) -> 
             for truth, text in ((DISJOINT, "outside"), (TRUE, "true bias"))
             for name in (MEAN, DEFAULT)
         },
-        "Ceiling mdps": round(row.ceiling_rmse_dps_all / MDPS, 3),
+        "Ceiling mdps": round(row.ceiling_rmse_dps / MDPS, 3),
         "Oracle mdps": round(ends(row, "oracle_rmse_dps", ALL)[0] / MDPS, 3),
         "Within ±1σ %": row.coverage_1sigma_pct,
         "Within ±2σ %": row.coverage_2sigma_pct,
@@ -266,30 +269,26 @@ def _difference(row: pd.Series, name: str, truth: str = PAPER) -> str:
     key, unit = f"less_{name}_dps", MDPS
     if truth != PAPER:
         key, unit = f"less_{name}_dps2_{truth}", MDPS**2
-    values = [row.get(key + end) for end in ("", "_lo", "_hi")]
     if name == row.estimator:
         return "–"
-    scaled = (np.nan if value is None else value / unit for value in values)
-    return bracketed(scaled, "{:+.3f}".format)
+    return bracketed((end / unit for end in ends(row, key)), "{:+.3f}".format)
 
 
 def ratios(material: Material, study: str, sensor: str) -> Exhibit | None:
     """Errors of a sensor's estimators relative to the running mean, by window length."""
-    rows = material.finished[
-        (material.finished.study == study) & (material.finished.sensor == sensor)
-    ]
+    rows = material.finished_of(study, sensor=sensor)
     if rows.empty:
         return None
     table: dict[str, dict[str, str]] = {}
     for window_s, group in rows.sort_values("window_s").groupby("window_s"):
         means = group[group.estimator == MEAN]
         mean = means.iloc[0]
-        shown = {"running mean, RMSE in mdps": f"{mean.test_rmse_dps_all / MDPS:.3f}"}
+        shown = {"running mean, RMSE in mdps": f"{mean.test_rmse_dps / MDPS:.3f}"}
         for _, row in group[group.estimator != MEAN].iterrows():
-            shown[in_full(row, rows)] = _ratio(row, "accuracy_gain_pct_all")
-        shown["ceiling"] = _ratio(mean, "ceiling_accuracy_gain_pct_all")
-        if pd.notna(mean.get("oracle_accuracy_gain_pct_all")):
-            shown[_ORACLE] = _ratio(mean, "oracle_accuracy_gain_pct_all")
+            shown[in_full(row, rows)] = _ratio(row, "accuracy_gain_pct")
+        shown["ceiling"] = _ratio(mean, "ceiling_accuracy_gain_pct")
+        if pd.notna(mean.get("oracle_accuracy_gain_pct")):
+            shown[_ORACLE] = _ratio(mean, "oracle_accuracy_gain_pct")
         table[f"{float(str(window_s)):g} s"] = shown
     errors = pd.DataFrame(table)
     last = [name for name in ("ceiling", _ORACLE) if name in errors.index]
@@ -319,8 +318,7 @@ def in_full(row: pd.Series, rows: pd.DataFrame) -> str:
 
 def _ratio(row: pd.Series, gain: str) -> str:
     """The error relative to the running mean, 1 - A, with its interval."""
-    gains = [row.get(f"{gain}{end}") for end in ("", "_lo", "_hi")]
-    value, hi, lo = (1 - np.array(gains, np.float64) / 100).tolist()
+    value, hi, lo = (1 - np.array(ends(row, gain)) / 100).tolist()
     return bracketed((value, lo, hi), "{:.3f}".format)
 
 
@@ -373,44 +371,41 @@ def sensor_specifications(material: Material) -> Exhibit | None:
     """Datasheet values beside measured ones (section IV-A, table of specifications)."""
     if material.sensors.empty:
         return None
-    described = {row.sensor: row for _, row in material.sensors.iterrows()}
-    sheets = {sheet.sensor: sheet for sheet in material.published.specifications}
-    rows = []
-    for sensor in dict.fromkeys([*sheets, *described]):
-        sheet, row = sheets.get(sensor), described.get(sensor)
-        density = sheet.noise_density_mdps_rthz if sheet else None
-        rate = "–".join(f"{rate:g}" for rate in dict.fromkeys(sheet.rate_hz)) if sheet else None
-        stated = density is not None
-        rows.append(
-            {
-                "Sensor": material.sensor_name(sensor),
-                "Source": material.source_name,
-                "Gyroscopes": None if row is None else len(AXES) * int(row.imus),
-                "Datasheet rate Hz": rate,
-                "Rate Hz": None if row is None else round(row.rate_hz, 1),
-                "Datasheet noise density mdps/√Hz": density,
-                # a one-sided density ND: N = ND / sqrt(2), sigma = ND sqrt(rate / 2)
-                "Datasheet N mdps√s": density / np.sqrt(2) if stated else None,
-                "N mdps√s": _rms(row, "white_dps_rts", 1 / MDPS),
-                "Datasheet σ mdps": density * np.sqrt(row.rate_hz / 2)
-                if stated and row is not None
-                else None,
-                "σ mdps": _rms(row, "sample_sigma_dps", 1 / MDPS),
-                "Datasheet B deg/h": sheet.bias_stability_dph if sheet else None,
-                "B deg/h": _rms(row, "instability_dps", _HOUR_S),
-                "Section": sheet.section if sheet else None,
-            }
-        )
+    sensors = dict.fromkeys([*material.sheets, *material.described])
     caption = (
         "Datasheet values beside those measured in the recordings: the root mean square over "
         "gyroscopes, with the smallest and the largest value. N is the white noise: the mean of t "
         "seconds scatters by N/√t. B is the bias instability. Paper, section IV-A."
     )
-    table = pd.DataFrame(rows)
+    table = pd.DataFrame(_specifications(material, sensor) for sensor in sensors)
     hidden = ("Source", "Datasheet noise density mdps/√Hz", "Section")
     shown = [name for name in table.columns.astype(str) if name not in hidden]
     name, title = "sensor_specifications", "Sensors: datasheets and recordings"
     return Exhibit(name, title, caption, table, shown)
+
+
+def _specifications(material: Material, sensor: str) -> dict[str, Any]:
+    sheet, row = material.sheets.get(sensor), material.described.get(sensor)
+    density = sheet.noise_density_mdps_rthz if sheet else None
+    # a one-sided density ND: N = ND / sqrt(2), sigma = ND sqrt(rate / 2)
+    sigma = None if density is None or row is None else density * np.sqrt(row.rate_hz / 2)
+    return {
+        "Sensor": material.sensor_name(sensor),
+        "Source": material.source_name,
+        "Gyroscopes": None if row is None else len(AXES) * int(row.imus),
+        "Datasheet rate Hz": "–".join(f"{rate:g}" for rate in dict.fromkeys(sheet.rate_hz))
+        if sheet
+        else None,
+        "Rate Hz": None if row is None else round(row.rate_hz, 1),
+        "Datasheet noise density mdps/√Hz": density,
+        "Datasheet N mdps√s": None if density is None else density / np.sqrt(2),
+        "N mdps√s": _rms(row, "white_dps_rts", 1 / MDPS),
+        "Datasheet σ mdps": sigma,
+        "σ mdps": _rms(row, "sample_sigma_dps", 1 / MDPS),
+        "Datasheet B deg/h": sheet.bias_stability_dph if sheet else None,
+        "B deg/h": _rms(row, "instability_dps", _HOUR_S),
+        "Section": sheet.section if sheet else None,
+    }
 
 
 def _rms(row: pd.Series | None, name: str, factor: float) -> str:
@@ -423,15 +418,14 @@ def _rms(row: pd.Series | None, name: str, factor: float) -> str:
 
 def dataset_hours(material: Material) -> Exhibit | None:
     """Hours of all datasets, from counts of samples (section IV-A, table of hours)."""
-    described = {row.sensor: row for _, row in material.sensors.iterrows()}
-    if not {row.sensor for row in material.published.hours} & set(described):
+    if not {row.sensor for row in material.published.hours} & set(material.described):
         return None
-    table = pd.DataFrame(_hours(material, row, described) for row in material.published.hours)
+    table = pd.DataFrame(_hours(material, row) for row in material.published.hours)
     virtual = np.array([row.virtual for row in material.published.hours])
     sums = [
         _sum("real", table[~virtual], ""),
         _sum("virtual", table[virtual], ""),
-        _sum("all", table, "the paper calls all of it recorded; the virtual part is not"),
+        _sum("all", table, "the paper's total includes the virtual recordings"),
     ]
     table = pd.concat([table, pd.DataFrame(sums)], ignore_index=True)
     table = table.drop(columns=["_lo", "_hi"])
@@ -444,9 +438,8 @@ def dataset_hours(material: Material) -> Exhibit | None:
     return Exhibit("dataset_hours", "Hours of the datasets", caption, table, shown)
 
 
-def _hours(material: Material, claim: PublishedHours, described: dict[str, Any]) -> dict[str, Any]:
-    row = described.get(claim.sensor)
-    rates = {sheet.sensor: sheet.rate_hz for sheet in material.published.specifications}
+def _hours(material: Material, claim: PublishedHours) -> dict[str, Any]:
+    row = material.described.get(claim.sensor)
     head = {"Dataset": str(claim.dataset), "Sensor": claim.sensor}
     tail = {
         "Paper's train h": claim.train_h,
@@ -461,7 +454,9 @@ def _hours(material: Material, claim: PublishedHours, described: dict[str, Any])
     samples = [0 if kind is None else row[f"{kind}_samples"] for kind in kinds]
     counts = [0 if kind is None else int(row[f"{kind}_recordings"]) for kind in kinds]
     hours = [round(total / row.rate_hz / _HOUR_S, 2) for total in samples]
-    fast, slow = (samples[2] / rate / _HOUR_S for rate in reversed(rates[claim.sensor]))
+    fast, slow = (
+        samples[2] / rate / _HOUR_S for rate in reversed(material.sheets[claim.sensor].rate_hz)
+    )
     prefix = "virtual_" if claim.virtual else ""
     return {
         **head,
@@ -471,7 +466,7 @@ def _hours(material: Material, claim: PublishedHours, described: dict[str, Any])
         "Test recordings": counts[1],
         "T s": round(row[f"{prefix}median_samples"] / row.rate_hz, 2),
         **dict(zip(("Train h", "Test h", "Total h"), hours, strict=True)),
-        _AT_DATASHEET: _from_to(fast, slow),
+        _AT_DATASHEET: from_to((fast, slow), "{:.2f}".format),
         **tail,
         "_lo": fast,
         "_hi": slow,
@@ -484,12 +479,8 @@ def _sum(name: str, rows: pd.DataFrame, note: str) -> dict[str, Any]:
         for column in rows.select_dtypes("number").columns.astype(str)
         if column != "T s"
     }
-    total[_AT_DATASHEET] = _from_to(total["_lo"], total["_hi"])
+    total[_AT_DATASHEET] = from_to((total["_lo"], total["_hi"]), "{:.2f}".format)
     return {"Dataset": name, "Note": note or None} | total
-
-
-def _from_to(low: float, high: float) -> str:
-    return f"{low:.2f}" if np.isclose(low, high) else f"{low:.2f} to {high:.2f}"
 
 
 def recording_quality(material: Material) -> Exhibit | None:
@@ -508,19 +499,6 @@ def recording_quality(material: Material) -> Exhibit | None:
 # the leak study
 
 
-WAYS = {
-    ("k_fold", "cnn"): "Honest split",
-    ("k_fold", "cnn_shuffled"): "Honest, labels shuffled",
-    ("window_split", "cnn"): "Windows split at random",
-    ("test_in_training", "cnn"): "Test windows in training",
-    ("best_epoch_on_test", "cnn"): "Honest split, epoch chosen on test",
-}
-"""Names of the ways of training (protocol, estimator), in the order of tables and figures."""
-
-_ONE_SIDED = 0.001
-"""A smaller p value against the oracle, corrected for the number of checks, is a leak."""
-
-
 def leakage_results(material: Material) -> Exhibit | None:
     """S and A of each way of training in the leak study, a row for each stride."""
     if material.leaks.empty:
@@ -535,7 +513,7 @@ def leakage_results(material: Material) -> Exhibit | None:
         "suffices to pass the ceiling, not that anybody had one. S and A are over the test windows "
         "of each way of training, in percent, with 95 % intervals of A over recordings."
     )
-    shown = ["Sensor", "Window stride s", *(f"{name} S/A %" for name in WAYS.values())]
+    shown = ["Sensor", "Window stride s", *(f"{name} S/A %" for name in LEAK_VARIANTS.values())]
     shown += ["Constant A %", "Ceiling S/A %", "Published S/A %"]
     title = "Trained with leaks on purpose: S and A"
     return Exhibit("leakage_results", title, caption, table, shown)
@@ -546,7 +524,7 @@ def _leak_row(material: Material, ways: pd.DataFrame) -> dict[str, Any]:
     claim = published_claim(material, first)
     shuffled = ways[ways.index.get_level_values("estimator") == "cnn_shuffled"]
     p_values = ways.beats_oracle_p.dropna()
-    leaking = [WAYS[way] for way in p_values.index[p_values < _ONE_SIDED]]
+    leaking = [LEAK_VARIANTS[way] for way in p_values.index[p_values < BEATS_ORACLE_P]]
     return {
         "Sensor": first.sensor,
         "Source": material.source_name,
@@ -557,7 +535,7 @@ def _leak_row(material: Material, ways: pd.DataFrame) -> dict[str, Any]:
             f"{name} S/A %": _saving_and_gain(ways.loc[[way]].iloc[0], "")
             if way in ways.index
             else None
-            for way, name in WAYS.items()
+            for way, name in LEAK_VARIANTS.items()
         },
         "Constant A %": percent(first.constant_accuracy_gain_pct),
         "Ceiling S/A %": _saving_and_gain(first, "ceiling_"),
@@ -572,7 +550,7 @@ def _leak_row(material: Material, ways: pd.DataFrame) -> dict[str, Any]:
 def _saving_and_gain(row: pd.Series, kind: str) -> str:
     """S/A, with the interval of A if there is one."""
     gain = f"{kind}accuracy_gain_pct"
-    return f"{percent(row[f'{kind}time_saving_pct'])}/{interval(row, gain, FIRST)}"
+    return f"{percent(row[f'{kind}time_saving_pct'])}/{interval(row, gain)}"
 
 
 def published_claim(material: Material, row: pd.Series) -> PublishedResult | None:
