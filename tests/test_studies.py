@@ -149,8 +149,8 @@ def test_the_leak_study_has_every_way_of_training_at_every_stride(base):
     rows = rows_of(base, "leakage")
     ways = {(row.protocol, row.estimator) for row in rows}
     leaks = ("window_split", "test_in_training", "best_epoch_on_test")
-    honest = {("k_fold", name) for name in (MEAN, "training_mean", CNN, "cnn_shuffled")}
-    assert ways == honest | {(leak, CNN) for leak in leaks}
+    by_recording = {("k_fold", name) for name in (MEAN, "training_mean", CNN, "cnn_shuffled")}
+    assert ways == by_recording | {(leak, CNN) for leak in leaks}
     strides = base.studies["leakage"].strides_s
     found = {(row.protocol, row.estimator, row.window_stride_s) for row in rows}
     assert found == {(*way, stride) for way, stride in product(ways, strides)}

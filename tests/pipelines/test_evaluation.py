@@ -136,8 +136,8 @@ def test_the_running_means_scores_are_those_computed_by_hand(world, bench):
     ]
     white = bench.device.noise**2 / (RECORDING_S - WINDOW_S)
     assert np.mean(noise) == pytest.approx(white.mean(), rel=0.1)
-    honest = ((windows - rest) ** 2).mean() - np.mean(noise)
-    assert scores[DISJOINT, ALL, "test_mse_dps2"] == pytest.approx(honest)
+    expected = ((windows - rest) ** 2).mean() - np.mean(noise)
+    assert scores[DISJOINT, ALL, "test_mse_dps2"] == pytest.approx(expected)
     # the curve of four recordings is not monotonic: its first crossing would be too early
     assert scores[PAPER, FIRST, "equivalent_time_s"] == pytest.approx(WINDOW_S)
     assert scores[PAPER, FIRST, "time_saving_pct"] == pytest.approx(0)

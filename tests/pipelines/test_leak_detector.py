@@ -75,7 +75,9 @@ def test_shuffled_labels_are_no_better_than_the_constant_and_a_networks_own_are(
     assert simulated.over_constant_dps2[K_FOLD, CNN] < -0.5 * SPREAD**2
 
 
-def test_a_leak_looks_better_than_the_honest_split_and_the_oracle_finds_the_largest(simulated):
+def test_leaks_look_better_than_a_split_by_recording_and_the_oracle_finds_the_largest(
+    simulated,
+):
     assert set(simulated.index) == set(LEAK_VARIANTS)
     assert set(simulated.windows) == {30 * 5}
     gains = simulated.accuracy_gain_pct

@@ -150,7 +150,7 @@ def test_the_warm_up_that_a_published_gain_would_need_is_in_the_answer(
     assert re.search(r"allow a warm-up of at most .*SparkFun \d\.\d", page)
     simulated = own.assign(simulated=True)
     page = write_report("test", Only(), *given, {"sparkfun/description": lambda: simulated})[2]
-    assert "on measured data, tells the first from the others" in page
+    assert "on measured data, bounds a warm-up" in page
     assert "a warm-up (SparkFun " in report[2] and "; NG " in report[2]
 
 

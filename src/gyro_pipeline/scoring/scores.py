@@ -370,7 +370,7 @@ def beats_oracle(errors: SquaredErrors, oracle: SquaredErrors) -> float:
     """One-sided p value of a t test that an estimator beats the oracle, paired over recordings.
 
     Returns:
-        Small values cast doubt on the evaluation, since no honest estimator can beat the oracle.
+        Small values cast doubt on the evaluation: without a leak, no estimator beats the oracle.
     """
     difference = errors.sums / errors.counts - oracle.sums / oracle.counts
     if np.ptp(difference) == 0:

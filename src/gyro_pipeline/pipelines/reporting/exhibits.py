@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LEAK_VARIANTS = {
-    ("k_fold", "cnn"): "Honest split",
-    ("k_fold", "cnn_shuffled"): "Honest, labels shuffled",
+    ("k_fold", "cnn"): "Split by recording",
+    ("k_fold", "cnn_shuffled"): "By recording, labels shuffled",
     ("window_split", "cnn"): "Windows split at random",
     ("test_in_training", "cnn"): "Test windows in training",
-    ("best_epoch_on_test", "cnn"): "Honest split, epoch chosen on test",
+    ("best_epoch_on_test", "cnn"): "By recording, epoch chosen on test",
 }
 """Names of the ways of training in the leak study, by protocol and estimator, in their order."""
 

@@ -422,7 +422,7 @@ def _draw_estimators(left: Axes, right: Axes, rows: pd.DataFrame) -> None:
 
 
 def leakage_against_stride(material: Material) -> Exhibit | None:
-    """A against the window stride, for the honest split and for each leak."""
+    """A against the window stride, for the split by recording and for each leak."""
     if material.leaks.empty:
         return None
     sensors = list(dict.fromkeys(material.leaks.sensor))

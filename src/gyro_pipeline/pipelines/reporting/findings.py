@@ -107,13 +107,13 @@ def _published(material: Material, beyond: Sequence[PublishedResult]) -> str:
         return ""
     return (
         f"{len(beyond)} of {len(material.claims)} published gains on these sensors "
-        f"{'is' if len(beyond) == 1 else 'are'} beyond "
-        "what white noise without drift allows, A = 1 − √(T0/T), even if the bias is known exactly."
+        f"{'exceeds' if len(beyond) == 1 else 'exceed'} the gain that is expected at most in white "
+        "noise without drift, A = 1 − √(T0/T), even if the bias is known exactly."
     )
 
 
 def _explanations(material: Material, beyond: Sequence[PublishedResult]) -> str:
-    """Explanations of published gains beyond the ceiling, the harmless one first."""
+    """Explanations of published gains beyond the ceiling, the simplest first."""
     if not beyond:
         return ""
     needed: dict[str, list[float]] = {}
@@ -123,9 +123,9 @@ def _explanations(material: Material, beyond: Sequence[PublishedResult]) -> str:
     sizes = "; ".join(f"{name} {from_to(a)}" for name, a in needed.items() if a)
     amount = f" ({sizes} mdps at power-on, for time constants of 5 to 60 s)" if sizes else ""
     return (
-        f"Three things would put them within reach: a warm-up{amount}, which a constant could also "
-        "correct; another truth than the mean of the recording; or a leak between training and "
-        f"test. {_test_of_warm_up(material, list(needed))}"
+        f"Possible explanations are a warm-up{amount}, which a constant could also correct; "
+        "another truth than the mean of the recording; coloured noise; chance; or a leak between training "
+        f"and test. {_test_of_warm_up(material, list(needed))}"
     )
 
 
@@ -138,8 +138,8 @@ def _test_of_warm_up(material: Material, names: Sequence[str]) -> str:
     sizes = "; ".join(f"{name} {from_to(a)}" for name, a in allowed.items() if a and name in names)
     if material.simulated or not sizes:
         return (
-            "The mean rate against time after power-on, on measured data, tells the first from the "
-            "others."
+            "The mean rate against time after power-on, on measured data, bounds a warm-up, and so "
+            "can exclude the first."
         )
     return f"These recordings allow a warm-up of at most {sizes} mdps (95 % intervals)."
 

@@ -509,7 +509,7 @@ def leakage_results(material: Material) -> Exhibit | None:
     logger.info("leak study, S/A %%\n%s", table.to_string(index=False, na_rep="–"))
     caption = (
         "None of these is a result: test information was let into the training, each time in a "
-        "different way, beside the honest split of the same windows. This shows that a leak "
+        "different way, beside the split by recording of the same windows. This shows that a leak "
         "suffices to pass the ceiling, not that anybody had one. S and A are over the test windows "
         "of each way of training, in percent, with 95 % intervals of A over recordings."
     )
