@@ -16,6 +16,7 @@ from typing import Any, Protocol, TypeVar
 
 import psutil
 from joblib import Parallel, delayed, parallel_config
+from joblib.externals.loky.backend.resource_tracker import ensure_running
 from joblib.externals.loky.process_executor import BrokenProcessPool
 from tqdm import tqdm
 
@@ -122,6 +123,7 @@ def _in_processes(
     jobs: Sequence[J], function: Callable[[J], R], workers: int, at_once: int
 ) -> Numbered[R]:
     calls = (delayed(_call)(function, number, job) for number, job in enumerate(jobs))
+    ensure_running()  # unblocks Ctrl-C, which is blocked below
     start = {"initializer": _start_worker, "initargs": (os.getpid(),)} if workers > 1 else {}
     with parallel_config("loky" if workers > 1 else "sequential", **start), _no_interrupts():
         parallel = Parallel(

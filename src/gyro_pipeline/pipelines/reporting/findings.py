@@ -124,8 +124,8 @@ def _explanations(material: Material, beyond: Sequence[PublishedResult]) -> str:
     amount = f" ({sizes} mdps at power-on, for time constants of 5 to 60 s)" if sizes else ""
     return (
         f"Possible explanations are a warm-up{amount}, which a constant could also correct; "
-        "another truth than the mean of the recording; coloured noise; chance; or a leak between training "
-        f"and test. {_test_of_warm_up(material, list(needed))}"
+        "another truth than the mean of the recording; coloured noise; chance; or a leak between "
+        f"training and test. {_test_of_warm_up(material, list(needed))}"
     )
 
 
