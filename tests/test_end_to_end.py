@@ -142,7 +142,7 @@ def test_the_report_says_what_was_run_links_its_runs_and_compares_with_the_paper
     (experiment,) = {run.info.experiment_id for run in smoke.runs}
     for page in (html, text):
         assert "This is a smoke run, not a result." in page
-        assert "7 of 8 published gains on these sensors are beyond" in page
+        assert "7 of 8 published gains on these sensors exceed" in page
         assert f"127.0.0.1:5000/#/experiments/{experiment}/runs" in page
     assert html.count("data:image/png") == len(AUGMENTATION["figures"])
     every = (project.folder / "data/08_reporting/report.html").read_text()
