@@ -16,7 +16,8 @@ Recordings are :class:`xarray.Dataset` objects with
 * attributes ``sensor``, ``source``, ``simulated`` (0 or 1), ``rate_hz`` and ``data_hash``.
 
 The recordings of a study (``windowed_splits.recordings``) and virtual recordings all have the same
-length, and ``recording_mean`` (imu, recording, axis), deg/s, the truth of the paper.
+length, and ``recording_mean`` (imu, recording, axis), deg/s, the label in
+training; evaluation computes the paper's truth from the samples in the same way.
 
 A windows table has a row per window: ``protocol, window_s, window_stride_s``; ``fold``, ``role``;
 ``origin``, real or virtual; ``imu``, ``recording`` and ``start``, the window's first sample.

@@ -56,10 +56,10 @@ class Preflight:
         from gyro_pipeline.datasets.atomic import check_writable, remove_leftovers  # noqa: PLC0415
         from gyro_pipeline.datasets.stored import StoredFile  # noqa: PLC0415
         from gyro_pipeline.datasets.tracked_runs import TrackedRuns  # noqa: PLC0415
-        from gyro_pipeline.studies import DEFAULT, check_possible  # noqa: PLC0415
+        from gyro_pipeline.studies import DEFAULT_PIPELINE, check_possible  # noqa: PLC0415
 
         assert self._parameters is not None
-        check_possible(self._parameters, run_params["pipeline_names"] or [DEFAULT])
+        check_possible(self._parameters, run_params["pipeline_names"] or [DEFAULT_PIPELINE])
         _check_logs_are_read(self._parameters, self._project, pipeline, catalog)
         for name in sorted(pipeline.datasets()):
             if isinstance(dataset := catalog.get(name), TrackedRuns):

@@ -17,7 +17,7 @@ CNN, CNN_SHUFFLED, MEAN, CONSTANT = "cnn", "cnn_shuffled", "mean", "training_mea
 RESIDUAL_NETWORK = "residual_network"
 """The recommended estimator, which the report compares with the paper's network."""
 
-DEFAULT = "__default__"
+DEFAULT_PIPELINE = "__default__"
 """The pipeline that runs when no name is given."""
 
 LEAKAGE = "leakage"
@@ -185,7 +185,7 @@ def used_sensors(parameters: Parameters) -> dict[str, list[str]]:
 
 def studies_to_run(parameters: Parameters, pipelines: Sequence[str]) -> dict[str, list[str]]:
     """The studies that pipelines run, with the sensors that ``only`` leaves of each."""
-    all_defaults = bool({DEFAULT, "reporting"} & set(pipelines))
+    all_defaults = bool({DEFAULT_PIPELINE, "reporting"} & set(pipelines))
     return {
         study: sensors
         for study, sensors in used_sensors(parameters).items()

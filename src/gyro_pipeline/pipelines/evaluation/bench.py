@@ -45,7 +45,7 @@ from gyro_pipeline.scoring.truths import (
 )
 from gyro_pipeline.windows import cut_windows, window_size
 
-SCORES = ["weights", "truth", "windows", "score", "value", "lo", "hi"]
+SCORE_COLUMNS = ["weights", "truth", "windows", "score", "value", "lo", "hi"]
 """Columns of a table of scores."""
 
 SIGMAS = {"coverage_1sigma_pct": 1.0, "coverage_2sigma_pct": 2.0, "coverage_95_pct": 1.959964}
@@ -176,7 +176,7 @@ class Bench:
         return self.errors(dict.fromkeys(folds, RunningMean()))
 
     @cached_property
-    def _references(self) -> dict[str, dict[View, SquaredErrors]]:
+    def _bounds(self) -> dict[str, dict[View, SquaredErrors]]:
         """Squared errors of the oracle and the constant, if they exist."""
         tables = {"oracle": self.oracle_errors, "constant": self.constant_errors}
         return {n: squares_by_view(errors) for n, errors in tables.items() if errors is not None}
@@ -324,13 +324,14 @@ class Bench:
         for truth, windows in product(errors.truth.unique(), (FIRST, ALL)):
             scores = self._scores(errors, (truth, windows))
             if epoch == LAST:
-                scores |= self.ceilings.of(truth, windows) | self._of_references((truth, windows))
+                scores |= self.ceilings.of(truth, windows)
+                scores |= self._scores_of_bounds((truth, windows))
             rows += [
                 (epoch, truth, windows, name, *_finite(estimate))
                 for name, estimate in scores.items()
                 if np.isfinite(estimate.value)
             ]
-        return pd.DataFrame(rows, columns=SCORES)
+        return pd.DataFrame(rows, columns=SCORE_COLUMNS)
 
     def _scores(self, errors: pd.DataFrame, view: View) -> dict[str, Estimate]:
         """Scores over some windows, against one truth."""
@@ -340,8 +341,8 @@ class Bench:
         if windows == ALL and truth != DISJOINT and errors.sigma_dps.notna().any():
             for name, sigmas in SIGMAS.items():
                 scores[name] = Estimate(100 * coverage(errors, truth, sigmas))
-        if "oracle" in self._references and len(self._scorer.weights) > 1:
-            oracle_squares = self._references["oracle"][view]
+        if "oracle" in self._bounds and len(self._scorer.weights) > 1:
+            oracle_squares = self._bounds["oracle"][view]
             p = beats_oracle(squared_errors(errors, *view), oracle_squares)
             scores["beats_oracle_p"] = Estimate(p)
         if view == (PAPER, ALL):
@@ -349,11 +350,11 @@ class Bench:
             scores |= self._turn_on_correlations()
         return scores
 
-    def _of_references(self, view: View) -> dict[str, Estimate]:
+    def _scores_of_bounds(self, view: View) -> dict[str, Estimate]:
         """Scores of the oracle and the constant on the same windows."""
         return {
             f"{name}_{score}": estimate
-            for name, squares in self._references.items()
+            for name, squares in self._bounds.items()
             if view[0] != DISJOINT
             for score, estimate in self._scorer.rmse_and_gain(squares[view], view).items()
         }

@@ -38,7 +38,10 @@ METRICS = {
     "accuracy_gain_pct_first": ("accuracy_gain_pct", "value", FIRST),
     "time_saving_pct_first": ("time_saving_pct", "value", FIRST),
 }
-"""Score, column and windows of each metric of a run, at the last epoch for the paper's truth."""
+"""Score, column and windows of each metric of a run, at the last epoch for the paper's truth.
+
+They are for MLflow only; the report pools the errors of all seeds.
+"""
 
 
 def evaluate(

@@ -38,7 +38,7 @@ CNN_BEST = "cnn_best"
 
 CEILINGS = ["ceiling_rmse_dps", "ceiling_time_saving_pct", "ceiling_accuracy_gain_pct"]
 CEILINGS += [f"ceiling_{name}_accuracy_gain_pct" for name in ("joint", "history")]
-REFERENCE_GAINS = ["oracle_accuracy_gain_pct", "constant_accuracy_gain_pct"]
+BOUND_GAINS = ["oracle_accuracy_gain_pct", "constant_accuracy_gain_pct"]
 """A of the constant and, on simulated data, of the oracle on the same windows."""
 
 OTHERS = ["coverage_1sigma_pct", "coverage_2sigma_pct", "beats_oracle_p"]
@@ -47,14 +47,14 @@ OTHERS += [f"turn_on_correlation_{axes}" for axes in ("xy", "xz", "yz")]
 WARNINGS = ["below_ceiling", "prior_conflict"]
 """Tags of a run with a warning in words."""
 
-REFERENCES = (MEAN, DEFAULT, CONSTANT)
+COMPARED_WITH = (MEAN, DEFAULT, CONSTANT)
 """Estimators that every other one is compared with, in pairs over recordings."""
 
 PAIRED_COUNTS = ("virtual_gyros", "real_gyros")
 """Counts of training gyroscopes whose effect on A is compared in pairs."""
 
 _OF_THE_MEAN = ["test_rmse_dps", "oracle_rmse_dps", "constant_rmse_dps"]
-_OF_THE_MEAN += [*REFERENCE_GAINS, *CEILINGS]
+_OF_THE_MEAN += [*BOUND_GAINS, *CEILINGS]
 _CURVES = ["study", "sensor", "windows", "time_s", "rmse_dps"]
 
 
@@ -161,10 +161,10 @@ class Cell:
         return means[0] if means else None
 
     @cached_property
-    def _references(self) -> dict[str, pd.DataFrame]:
+    def _errors_compared(self) -> dict[str, pd.DataFrame]:
         return {
             name: errors_of(runs)
-            for name in REFERENCES
+            for name in COMPARED_WITH
             for specs, runs, _ in self._rows
             if runs and specs[0].estimator == name
         }
@@ -172,7 +172,7 @@ class Cell:
     @cached_property
     def _scorer(self) -> Scorer:
         assert self.mean is not None
-        errors, curve = self._references[MEAN], self.mean.load(CURVE)
+        errors, curve = self._errors_compared[MEAN], self.mean.load(CURVE)
         return Scorer(errors, curve, self.specs[0].window_s)
 
     def results(self) -> list[dict[str, Any]]:
@@ -199,12 +199,13 @@ class Cell:
         return pd.concat(parts).assign(study=spec.study, sensor=spec.sensor)[_CURVES]
 
     def _result(self, spec: RunSpec, runs: Sequence[StoredRun]) -> dict[str, Any]:
+        """A row of results; ceilings, oracle and constant are those of the running mean."""
         assert self.mean is not None
         tags, scores = runs[0].tags, read_scores(runs[0].load(SCORES))
         row = mean_row(self.mean)
         if spec.estimator != MEAN:
             row |= self._pooled(runs)
-        elif DEFAULT in self._references:
+        elif DEFAULT in self._errors_compared:
             row |= self._differences(runs)
         return row | {
             **{name: scores.get((name, ALL), MISSING).value for name in OTHERS},
@@ -229,7 +230,7 @@ class Cell:
         of single seeds, None for one seed.
         """
         errors = [errors_of([run]) for run in runs]
-        places = self._references[MEAN].reindex(columns=["imu", "recording"], fill_value=0)
+        places = self._errors_compared[MEAN].reindex(columns=["imu", "recording"], fill_value=0)
         row: dict[str, Any] = {"seeds": len(errors), "recordings": len(places.drop_duplicates())}
         for windows in (ALL, FIRST):
             pooled = self._scores(pd.concat(errors), windows)
@@ -278,7 +279,7 @@ class Cell:
         row: dict[str, Any] = {}
         for truth in table.truth.unique():
             squares = squared_errors(table, truth, ALL)
-            for name, errors in self._references.items():
+            for name, errors in self._errors_compared.items():
                 pair = squares, squared_errors(errors, truth, ALL)
                 difference = paired_difference(*pair, self._scorer.weights, root=truth == PAPER)
                 key = f"less_{name}_dps" + ("" if truth == PAPER else f"2_{truth}")

@@ -27,10 +27,10 @@ from gyro_pipeline.pipelines.reporting.exhibits import (
 )
 from gyro_pipeline.pipelines.reporting.recordings import SIGMAS_MDPS
 from gyro_pipeline.pipelines.reporting.results import (
+    BOUND_GAINS,
     CEILINGS,
     OTHERS,
     PAIRED_COUNTS,
-    REFERENCE_GAINS,
     ROW,
     WARNINGS,
     column,
@@ -197,7 +197,7 @@ def results_table(material: Material, study: str) -> Exhibit:
         ceiling = _scaled(rows, column("ceiling_rmse_dps", windows), 3, MDPS)
         table[f"ceiling {windows} mdps"] = ceiling
     logger.info("results\n%s", table.to_string(index=False, na_rep="–"))
-    more = [f"accuracy_gain_pct_{axis}" for axis in AXES] + CEILINGS[-2:] + REFERENCE_GAINS
+    more = [f"accuracy_gain_pct_{axis}" for axis in AXES] + CEILINGS[-2:] + BOUND_GAINS
     for base in more:
         short = base.replace("accuracy_gain_pct", "A").replace("_", " ")
         table[f"{short} {ALL} %"] = _scaled(rows, base, 0)

@@ -75,7 +75,7 @@ class TrainingSets:
         return self._cache[key, counts]
 
     @cached_property
-    def _without_truths(self) -> xr.Dataset:
+    def _without_drawn_values(self) -> xr.Dataset:
         """Real recordings without the drawn values of simulated data."""
         return self.recordings[["angular_rate", "samples", "recording_mean"]]
 
@@ -110,7 +110,7 @@ class TrainingSets:
         used = [(learned.origin == origin) & learned.imu.isin(i) for origin, i in imus.items()]
         attributes, samples = self.recordings.attrs, self.recordings.sizes["sample"]
         return TrainingSet(
-            self._without_truths,
+            self._without_drawn_values,
             self.virtual if spec.virtual_imus else None,
             learned[used[0] | used[1]],
             window_size(spec.window_s, attributes["rate_hz"], samples, spec.sensor),

@@ -9,9 +9,6 @@ import pandas as pd
 import xarray as xr
 
 from gyro_pipeline.conventions import (
-    BY_RECORDING,
-    K_FOLD,
-    LEAVE_ONE_DEVICE_OUT,
     ORIGIN_REAL,
     ORIGIN_VIRTUAL,
     TEST,
@@ -22,7 +19,12 @@ from gyro_pipeline.conventions import (
 from gyro_pipeline.parameters import Only, Splits, Study
 from gyro_pipeline.pipelines.windowed_splits.copies import SAMPLES as COMPARED
 from gyro_pipeline.pipelines.windowed_splits.copies import near_copies
-from gyro_pipeline.pipelines.windowed_splits.protocols import PROTOCOLS, Candidates, check_table
+from gyro_pipeline.pipelines.windowed_splits.protocols import (
+    APART,
+    PROTOCOLS,
+    Candidates,
+    check_table,
+)
 from gyro_pipeline.recordings import (
     bias_rows,
     common_length,
@@ -34,9 +36,6 @@ from gyro_pipeline.studies import study_rows
 from gyro_pipeline.windows import describe_losses, usable_windows, window_size
 
 logger = logging.getLogger(__name__)
-
-APART = {BY_RECORDING: "recording", K_FOLD: "recording", LEAVE_ONE_DEVICE_OUT: "imu"}
-"""Column whose values have only one role in a fold of a protocol without leaks; leaks have none."""
 
 _KEYS = ["imu", "recording"]
 
@@ -70,8 +69,8 @@ def cut_to_common_length(
         quality: The quality table, for the file names of the recordings.
 
     Returns:
-        Recordings of the length that keeps most samples, with their means, which are the truth of a
-        study. Their ground truth, measured again if they were cut. And a row for each recording:
+        Recordings of the length that keeps most samples, with their means, the labels in training.
+        Their ground truth, measured again if they were cut. And a row for each recording:
         ``imu, recording``; ``masked``, the numbers of its masked samples; and ``copies``, the rows
         of its copies among the recordings before it, with their correlation.
     """
@@ -153,8 +152,8 @@ def split_windows(  # noqa: PLR0917 - a node's arguments are its datasets
             folds = table[["fold"]].drop_duplicates()
             virtual_table = _virtual_windows(virtual, size, splits).merge(folds, how="cross")
             table = pd.concat([table, virtual_table])
-        if protocol in APART:
-            check_table(table, APART[protocol], contents, drawn_from)
+        if apart := APART[protocol]:
+            check_table(table, apart, contents, drawn_from)
         tables.append(table.assign(protocol=protocol, window_s=window_s, window_stride_s=stride_s))
     return pd.concat(tables, ignore_index=True)[WINDOWS_TABLE].astype(_COMPACT)
 

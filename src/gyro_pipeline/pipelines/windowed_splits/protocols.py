@@ -146,6 +146,16 @@ PROTOCOLS: Mapping[str, Callable[[Candidates], Folds]] = {
 }
 """Protocols by their name in the setting ``protocol`` of a study."""
 
+APART: Mapping[str, str | None] = {
+    BY_RECORDING: "recording",
+    LEAVE_ONE_DEVICE_OUT: "imu",
+    K_FOLD: "recording",
+    WINDOW_SPLIT: None,
+    TEST_IN_TRAINING: None,
+    BEST_EPOCH_ON_TEST: None,
+}
+"""Column whose values have only one role in a fold, by protocol; None for leaks."""
+
 
 def check_table(
     table: pd.DataFrame, apart: str, contents: pd.DataFrame, drawn_from: Sequence[int]
