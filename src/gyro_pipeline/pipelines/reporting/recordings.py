@@ -28,7 +28,9 @@ GYROSCOPES = (1, 4, 10)
 
 _DRIFT_POINTS = 24  # per recording; with many more, noise would hide the drift
 WARM_UPS_S = (5.0, 20.0, 60.0)
-"""Time constants of the warm-ups that are fitted to recordings."""
+"""Time constants of the warm-ups whose amplitudes recordings bound."""
+_FITTED_S = (*WARM_UPS_S, 7.0, 10.0, 14.0, 30.0, 40.0)
+"""Time constants of which the most significant one is drawn."""
 
 _WORST_FIRST = (REJECTED, REPAIRED, KEPT)
 _MAX_ROWS = 20  # recordings of a sensor with a row in the quality table
@@ -102,8 +104,8 @@ def drift(recordings: xr.Dataset) -> tuple[pd.DataFrame, dict[str, float]]:
     blocks_hz = means.shape[-1] * rate_hz / length
     coarse = block_means(means, block_edges(means.shape[-1], means.shape[-1] // _DRIFT_POINTS))
     drifts = settling(coarse, coarse.shape[-1] * rate_hz / length)
-    fits = {time_s: fit_common_warm_up(means, blocks_hz, time_s) for time_s in WARM_UPS_S}
-    bounds = {f"warm_up_bound_dps_{t:g}": float(fit.bound.max()) for t, fit in fits.items()}
+    fits = {time_s: fit_common_warm_up(means, blocks_hz, time_s) for time_s in _FITTED_S}
+    bounds = {f"warm_up_bound_dps_{t:g}": float(fits[t].bound.max()) for t in WARM_UPS_S}
     time_s = max(fits, key=lambda t: np.nansum((fits[t].amplitude / fits[t].half) ** 2))
     decay = np.exp(-drifts.time_s / time_s)
     decay -= decay[drifts.time_s >= drifts.time_s[-1] * (1 - LAST)].mean()
