@@ -373,6 +373,6 @@ def test_the_real_file_has_known_errors_and_stands_beside_the_simulated_one(smok
     assert 88 <= estimated["best_linear"].data.metrics["coverage_95_pct"] <= 99
     # in the report of its source
     (path,) = (project.folder / "data/08_reporting").glob("published/*/tables/real2real_gen*.csv")
-    measured = pd.read_csv(path).iloc[-1]
+    measured = pd.read_csv(path, dtype={"Runs": str}).iloc[-1]  # an id may have digits only
     assert (measured["Sensor"], measured["Published S/A %"]) == ("memsense", "75/75 (6 real)")
     assert measured["Runs"] == runs["cnn"].info.run_id[:8]
