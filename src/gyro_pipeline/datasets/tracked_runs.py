@@ -155,7 +155,6 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
         self.changed: frozenset[str] = frozenset()
         """Names of settings that differ from ``conf/base``; names of runs state their values."""
         self._kept = self._path.parent / "data" / "06_models"
-        self._is_silent = False
         self._unfinished: dict[tuple[str, str], tuple[str, set[str]]] = {}
         """Id and completed folds, by study and fingerprint, of runs to which fits are added."""
 
@@ -214,14 +213,12 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
             if self._is_own_file or is_refusal:
                 raise
             self._unfinished.clear()
-            keep_fit(self._kept, data)
-            if not self._is_silent:
+            if keep_fit(self._kept, data):
                 logger.warning(
                     "the run store does not answer; fits are kept in %s until it does, by the next "
                     "run at the latest (%s)",
                     *(self._kept, " ".join(str(error).split())),
                 )
-            self._is_silent = True
 
     def _save_kept(self, study: str | None) -> None:
         """Save the fits that were kept while the server did not answer."""
@@ -230,7 +227,6 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
             if not any(fitted.fold in _fits(run) for run in same):  # an answer may have been lost
                 self._save_fitted(fitted)
             path.unlink()
-        self._is_silent = False
 
     @cached_property
     def _uri(self) -> str:

@@ -14,11 +14,12 @@ logger = logging.getLogger(__name__)
 _FOLDER = "unsaved_fits"
 
 
-def keep_fit(folder: Path, fitted: FittedRun) -> None:
-    """Write a fit to a file of its study, named by the digest of its content."""
-    content = pickle.dumps(fitted)
+def keep_fit(folder: Path, fitted: FittedRun) -> bool:
+    """Write a fit to a file of its study, named by its digest; return whether it is the first."""
+    content, first = pickle.dumps(fitted), not any((folder / _FOLDER).glob("*/*.pkl"))
     with replacing(folder / _FOLDER / fitted.run.study / f"{_digest(content)}.pkl") as path:
         path.write_bytes(content)
+    return first
 
 
 def kept_fits(folder: Path, study: str | None) -> Iterator[tuple[Path, FittedRun]]:

@@ -1,8 +1,7 @@
 """A training as a pure function: all inputs are arguments, all results are returned."""
 
 import time
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +21,14 @@ from gyro_pipeline.learning.examples import (
 from gyro_pipeline.learning.fused import FusedEngine
 from gyro_pipeline.learning.network import CalibrationNetwork
 from gyro_pipeline.learning.packing import aligned_zeros
-from gyro_pipeline.learning.trainer import TorchEngine, Trained, nothing, predict, train
+from gyro_pipeline.learning.trainer import (
+    TorchEngine,
+    Trained,
+    nothing,
+    one_thread,
+    predict,
+    train,
+)
 from gyro_pipeline.parameters import Training
 
 # Measured costs, in training samples of three gyroscopes (0.8 ns).
@@ -183,17 +189,6 @@ class StoredNetwork:
         scaled = (windows - centre[:, None].astype(np.float32)) / self._scaling["input_scale"]
         inputs = aligned_zeros((len(windows), *self._layout.shape))
         self._layout.write(scaled.transpose(1, 0, 2), inputs)
-        with _one_thread():
+        with one_thread():
             outputs = predict(self._network, torch.from_numpy(inputs)).double().numpy()
         return np.asarray(centre + self._scaling["target_scale"] * outputs)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Use one thread: PyTorch's results for a few windows depend on the number of threads."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

@@ -1,13 +1,13 @@
 """Small networks trained together, each on its part of the same examples."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+
+from gyro_pipeline.learning.trainer import one_thread
 
 _HIDDEN, _BATCH, _LEARNING_RATE, _WEIGHT_DECAY = 32, 256, 6e-3, 1e-2
 
@@ -36,18 +36,7 @@ class Perceptrons:
         return torch.baddbmm(offsets, values, weights)
 
 
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Use one thread: with more, networks of this size only wait."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
-@_one_thread()
+@one_thread()  # with more threads, networks of this size only wait
 def train_perceptrons(
     inputs: NDArray[np.float64],
     targets: NDArray[np.float64],

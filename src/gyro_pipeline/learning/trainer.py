@@ -1,6 +1,7 @@
 """The training loop: mean squared error, Adam, a stepped learning rate (paper, section III-D)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -162,6 +163,17 @@ def predict(network: nn.Module, inputs: Tensor) -> Tensor:
     """Outputs of a network for inputs in its layout, (n, gyroscopes)."""
     forward = forward_of(network.eval())
     return torch.cat([forward(part) for part in inputs.split(_VALIDATION_BATCH)])
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Use one thread, as results of PyTorch for a few windows depend on the number of threads."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def forward_of(network: nn.Module) -> Callable[[Tensor], Tensor]:
