@@ -13,12 +13,13 @@ how often it finds a leak. Results: benchmarks/README.md.
 
 import argparse
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import PAPER
+from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.ceiling import (
     ceiling_rmse,
     oracle,
@@ -27,7 +28,10 @@ from gyro_pipeline.physics.ceiling import (
     spread_draws,
     turn_on_spread,
 )
+from gyro_pipeline.physics.history import BiasHistory
+from gyro_pipeline.physics.recording_model import constant_bias
 from gyro_pipeline.physics.reml import guarded_spread
+from gyro_pipeline.pipelines.evaluation.ceilings import with_draws
 from gyro_pipeline.scoring.scores import (
     Curve,
     Estimate,
@@ -201,6 +205,37 @@ def ceilings(kind: Kind, worlds: int) -> str:
     return f"{truth:.1f} | {' | '.join(covered(one, truth) for one in found.values())} |"
 
 
+def history_ceiling(kind: Kind, step: float, worlds: int) -> str:
+    """A row of the table of ceilings with history: biases walk by `step` a recording, mdps.
+
+    The ceiling of a world is that of the recordings that test, given all earlier ones; its truth is
+    that of the drawn walk and spread. Axes are alike, so one stands for all.
+    """
+    count, noise, spread = kind.training + kind.tested, kind.noise[0], kind.spread[0]
+    model = constant_bias(kind.recording_s * RATE_HZ, RATE_HZ, NoiseFigures(noise, 0, 0), 0, spread)
+    numbers, trained = np.arange(1, 1 + count), slice(kind.training)
+
+    def gain(history: BiasHistory) -> Array:
+        followed = history.extended(numbers, labels)
+        variances = [followed.next_bias(number)[1] for number in numbers[kind.training :].tolist()]
+        times = WINDOW_S, kind.recording_s, PAPER
+        best = ceiling_rmse(noise, np.sqrt(np.mean(variances, axis=0)), *times)
+        return np.asarray(100 * (1 - best / running_mean_rmse(noise, *times)))
+
+    limits = []
+    for seed in range(worlds):
+        generator = np.random.default_rng([seed, 11])
+        labels = np.cumsum(step * generator.standard_normal(count))
+        labels += np.hypot(spread, noise / np.sqrt(kind.recording_s)) * generator.standard_normal(
+            count
+        )
+        history = BiasHistory.fit(numbers[trained], labels[trained], model)
+        drawn = history.draws(RESAMPLES, seed)
+        limits.append(with_draws(np.append(gain(history), gain(drawn))))
+    truth = float(gain(replace(history, step=step, deviation=spread)))
+    return f"{truth:.1f} | {covered(limits, truth)} |"
+
+
 def power(worlds: int, checks: int) -> str:
     """How often a leak in a share of the test recordings is found, that halves their errors."""
     kind, found = KINDS["SparkFun, 80 train, 20 test"], []
@@ -233,6 +268,10 @@ def main() -> None:
     for name, kind in KINDS.items():
         learned = f"{name.split(',')[0]}, {kind.training} recordings"
         print(f"| {learned} | {ceilings(kind, worlds)}", flush=True)
+    print("\n| ceiling with history from 80 recordings, step | A, % | now |\n|---|---|---|")
+    for step in (0.0, 0.1, 0.3, 1.0):
+        limit = history_ceiling(KINDS["SparkFun, 80 train, 20 test"], step, worlds)
+        print(f"| {step:g} mdps | {limit}", flush=True)
     print(f"\nThe oracle check, 48 comparisons, leak that halves errors: {power(worlds, 48)}")
 
 

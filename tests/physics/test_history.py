@@ -20,25 +20,37 @@ def walked(count, step, deviation, seed=0):
     return np.arange(1, count + 1), bias + generator.normal(0, np.sqrt(AVERAGING), count)
 
 
-def kalman(history, last_step=1):
-    """Mean and variance of the next bias, by a local-level filter with a diffuse start."""
-    own = history.deviation**2 + history.averaging
-    mean, variance = history.labels[0], own
-    for gap, label in zip(np.diff(history.numbers), history.labels[1:], strict=True):
-        variance += gap * history.step**2
-        gain = variance / (variance + own)
-        mean, variance = mean + gain * (label - mean), (1 - gain) * variance
-    return mean, variance + last_step * history.step**2 + history.deviation**2
+def kriged(history, number):
+    """Mean and variance of a bias given all labels: generalised least squares, unknown level."""
+    times = np.append(history.numbers, number) - history.numbers[0]
+    covariance = history.step**2 * np.minimum.outer(times, times)
+    covariance += np.diag(np.append(np.full(times.size - 1, AVERAGING), 0) + history.deviation**2)
+    weights = np.linalg.inv(covariance[:-1, :-1])
+    level = weights.sum(axis=0) @ history.labels / weights.sum()
+    gain = covariance[-1, :-1] @ weights
+    variance = covariance[-1, -1] - gain @ covariance[:-1, -1]
+    variance += (1 - gain.sum()) ** 2 / weights.sum()
+    return level + gain @ (history.labels - level), variance
 
 
 @pytest.mark.parametrize(("step", "deviation"), [(1.0, 0.5), (0.0, 1.0), (2.0, 0.0)])
-def test_the_prior_is_that_of_a_kalman_filter(step, deviation):
+def test_the_prior_is_the_best_prediction_from_all_earlier_labels(step, deviation):
     numbers, labels = walked(12, 1.0, 0.5)
     history = BiasHistory(np.delete(numbers, 4), np.delete(labels, 4), AVERAGING, step, deviation)
-    prior = history.prior(MODEL, None)
-    assert (prior.mean[0], prior.covariance[0, 0]) == pytest.approx(kalman(history))
-    later = history.prior(MODEL, 15)
-    assert (later.mean[0], later.covariance[0, 0]) == pytest.approx(kalman(history, 3))
+    for number in (None, 15):
+        prior = history.prior(MODEL, number)
+        expected = kriged(history, number or 13)
+        assert (prior.mean[0], prior.covariance[0, 0]) == pytest.approx(expected)
+
+
+def test_draws_scatter_about_the_parameters_that_were_drawn():
+    numbers, labels = walked(80, 1.0, 0.5, seed=4)
+    drawn = BiasHistory.fit(numbers, labels, MODEL).draws(400, seed=0)
+    for values, truth in ((drawn.step, 1.0), (drawn.deviation, 0.5)):
+        low, high = np.quantile(values, [0.025, 0.975])
+        assert low < truth < high < 3 * truth
+    mean, variance = drawn.next_bias(81)
+    assert mean.shape == variance.shape == (400,)
 
 
 def test_only_what_came_before_counts():

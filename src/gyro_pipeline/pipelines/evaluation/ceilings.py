@@ -92,7 +92,7 @@ class Ceilings:
             ]
             others["joint"] = np.mean(squares, axis=0), mean[0]
         if device.history is not None:
-            others["history"] = self._expected(truth, windows, self.size, device.history[None])
+            others["history"] = self._expected(truth, windows, self.size, device.history)
         for name, (square, mean_square) in others.items():
             limits[f"ceiling_{name}_rmse_dps"] = with_draws(np.sqrt(square))
             gain = 100 * best_gain(np.sqrt(square / mean_square))

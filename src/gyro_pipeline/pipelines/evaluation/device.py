@@ -42,7 +42,7 @@ class TestDevice:
     # recordings, and on simulated data, where axes are independent.
     joint: np.ndarray | None = None
     # Variance of the next bias given the calibrations before it, mean over the test recordings,
-    # (axes,), (deg/s)^2; None with few recordings, and on simulated data.
+    # (1 + draws, axes), (deg/s)^2; None with few recordings, and on simulated data.
     history: np.ndarray | None = None
 
     @property
@@ -188,14 +188,25 @@ def _describe_known(
 def _history(
     models: Sequence[RecordingModel], means: pd.DataFrame, tests: pd.DataFrame
 ) -> np.ndarray:
-    """Variance of a bias given the calibrations before it, mean over test recordings, (axes,)."""
-    variances = []
-    for model, axis in zip(models, AXES, strict=True):
-        fitted = BiasHistory.fit(means.index.to_numpy(), means[axis].to_numpy(), model)
-        history = fitted.extended(tests.index.to_numpy(), tests[axis].to_numpy())
-        priors = [history.prior(model, number) for number in tests.index.tolist()]
-        variances.append(np.mean([prior.covariance[0, 0] for prior in priors]))
-    return np.array(variances)
+    """Variance of a bias given the calibrations before it, mean over test recordings.
+
+    Returns:
+        The estimate, then draws of its uncertainty, (1 + draws, axes), (deg/s)^2.
+    """
+    by_axis = []
+    for seed, (model, axis) in enumerate(zip(models, AXES, strict=True)):
+        history = BiasHistory.fit(means.index.to_numpy(), means[axis].to_numpy(), model)
+        drawn = history.draws(_DRAWS, seed)
+        by_axis.append(np.hstack([_next_variance(h, model, tests[axis]) for h in (history, drawn)]))
+    return np.stack(by_axis, axis=1)
+
+
+def _next_variance(history: BiasHistory, model: RecordingModel, tests: pd.Series) -> np.ndarray:
+    """Variance of a test recording's bias given the calibrations before it, mean over tests."""
+    extended = history.extended(tests.index.to_numpy(), tests.to_numpy())
+    biases = [extended.next_bias(number) for number in tests.index.tolist()]
+    of_any = np.full_like(history.step, model.covariance[0, 0])
+    return np.asarray(np.mean([of_any if bias is None else bias[1] for bias in biases], axis=0))
 
 
 def _allan_fits(
