@@ -33,9 +33,9 @@ from gyro_pipeline.physics.recording_model import constant_bias
 from gyro_pipeline.physics.reml import guarded_spread
 from gyro_pipeline.pipelines.evaluation.ceilings import with_draws
 from gyro_pipeline.scoring.scores import (
-    Curve,
     Estimate,
     SquaredErrors,
+    WeightedCurve,
     beats_oracle,
     holm,
     leave_one_out,
@@ -113,7 +113,7 @@ def squares(errors: Array) -> SquaredErrors:
     return SquaredErrors(np.sum(flat**2, axis=1), np.full(len(flat), flat.shape[1]))
 
 
-def curve(rates: Array, truths: Array, first: bool) -> Curve:
+def curve(rates: Array, truths: Array, first: bool, weights: Array) -> WeightedCurve:
     """The running-mean curve, as the evaluation makes it."""
     running = np.concatenate([np.zeros((*truths.shape, 1)), np.cumsum(rates, axis=-1)], axis=-1)
     lengths = np.arange(1, rates.shape[-1] + 1)
@@ -124,7 +124,8 @@ def curve(rates: Array, truths: Array, first: bool) -> Curve:
         off = squares(means - truths[..., None])
         sums.append(off.sums)
         counts.append(off.counts)
-    return Curve(lengths / RATE_HZ, SquaredErrors(np.stack(sums, axis=1), np.stack(counts, axis=1)))
+    errors = SquaredErrors(np.stack(sums, axis=1), np.stack(counts, axis=1))
+    return WeightedCurve.of(lengths / RATE_HZ, errors, weights)
 
 
 def bootstrap(own: SquaredErrors, mean: SquaredErrors, generator: np.random.Generator) -> Estimate:
@@ -149,7 +150,8 @@ def results(kind: Kind, worlds: int) -> Iterator[str]:
             errors, of_mean, rates, truths = judged(kind, generator)
             own, mean = squares(errors[:, part]), squares(of_mean[:, part])
             weights = leave_one_out(own.sums.size)
-            scores = score(own, mean, curve(rates, truths, first).of(weights), WINDOW_S, weights)
+            falling = curve(rates, truths, first, weights)
+            scores = score(own, mean, falling, WINDOW_S, weights)
             found["A"].append(scores["accuracy_gain_pct"])
             found["S"].append(scores["time_saving_pct"])
             found["bootstrap"].append(bootstrap(own, mean, generator))

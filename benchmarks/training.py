@@ -37,6 +37,7 @@ import numpy as np
 import pandas as pd
 import torch
 import xarray as xr
+from joblib import cpu_count
 from kedro.config import OmegaConfigLoader
 from torch import Tensor
 from torch.nn import functional
@@ -46,7 +47,7 @@ from gyro_pipeline.conventions import AXES, DIMENSIONS, HOLD_OUT, TEST, TRAIN
 from gyro_pipeline.datasets.recordings import Recordings
 from gyro_pipeline.estimators import entry, make_estimator
 from gyro_pipeline.estimators.training import TrainingSet
-from gyro_pipeline.executors import available_cores, run_jobs
+from gyro_pipeline.executors import run_jobs
 from gyro_pipeline.learning import fused
 from gyro_pipeline.learning.design import Design, options_of
 from gyro_pipeline.learning.examples import Device, Examples
@@ -147,7 +148,7 @@ def machine() -> str:
     versions = [f"{name} {_version(name)}" for name in ("torch", "numpy", *PEERS)]
     return "\n".join(
         [
-            f"processor: {model}, {' '.join(widest)}, {available_cores()} cores",
+            f"processor: {model}, {' '.join(widest)}, {cpu_count()} cores",
             f"compiler:  {first}",
             f"versions:  Python {platform.python_version()}, {', '.join(versions)}",
             f"load:      {os.getloadavg()[0]:.1f} processes before the start",
@@ -700,7 +701,7 @@ def study(parameters: Parameters, folder: Path) -> None:
 
 
 def _total(what: str, table: pd.DataFrame, seeds: int, top: dict[str, float]) -> None:
-    cores, sums = available_cores(), seeds * table.sum(numeric_only=True)
+    cores, sums = cpu_count(), seeds * table.sum(numeric_only=True)
     minutes = sums.minutes / cores
     rate = sums.GFLOP / (60 * cores * minutes)
     parts = ", ".join(f"{100 * rate / peak:.0f} % of {name}" for name, peak in top.items())
@@ -745,7 +746,7 @@ def epochs_per_second(job: Watched) -> float:
 
 def scaling(parameters: Parameters, folder: Path, repetitions: int) -> None:
     """Trainings side by side, each on a thread of its own, against one alone."""
-    if available_cores() < 2:  # noqa: PLR2004
+    if cpu_count() < 2:  # noqa: PLR2004
         print("one core only: scaling is not measured")
         return
     jobs = study_jobs(parameters, folder)

@@ -65,7 +65,7 @@ TARGET_OF = {PAPER: RECORDING_MEAN, DISJOINT: BIAS, TRUE: BIAS}
 """The target of an estimator, by the truth that it is compared with."""
 
 FIRST, ALL = "first", "all"
-"""Test windows: the first of each recording (the paper's way), or all non-overlapping ones."""
+"""Windows that are scored: the first that tests in each recording (the paper's way), or all."""
 
 NOTHING, OWN, REAL = "nothing", "own", "real"
 """Parts of a training set that an estimator can use, besides ``ALL`` of it: none of it, the

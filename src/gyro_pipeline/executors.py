@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Protocol, TypeVar
 
 import psutil
-from joblib import Parallel, delayed, parallel_config
+from joblib import Parallel, cpu_count, delayed, parallel_config
 from joblib.externals.loky.backend.resource_tracker import ensure_running
 from joblib.externals.loky.process_executor import BrokenProcessPool
 from tqdm import tqdm
@@ -78,17 +78,12 @@ def run_jobs(
         results = _on_cluster(ordered, function, execution, label)
     else:
         serial = execution.executor == "serial"
-        workers = 1 if serial else min(execution.workers or available_cores(), len(ordered))
+        workers = 1 if serial else min(execution.workers or cpu_count(), len(ordered))
         logger.info("%s: %d %s on %d processes", label, len(ordered), noun, workers)
         results = _in_processes(ordered, function, workers, at_once)
     with closing(results):  # at once rather than by garbage collection, since it ends the workers
         for number, result in _with_progress(results, [job.work for job in ordered], label, noun):
             yield ordered[number], result
-
-
-def available_cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 Numbered = Generator[tuple[int, R], None, None]
@@ -251,7 +246,7 @@ def _connected(execution: Execution) -> Iterator[Any]:
         try:
             yield client
         except KilledWorker as error:
-            raise InputError(f"a job was lost with every worker that had it: {error}") from error
+            raise InputError(f"every worker that ran this job died: {error}") from error
         except (CancelledError, CommClosedError) as error:
             raise InputError(
                 "the scheduler of the cluster is gone; start it, then this run again: finished "

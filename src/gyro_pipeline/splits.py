@@ -69,6 +69,6 @@ def choose_validation(
     return sorted(generator.choice(recordings, count, replace=False).tolist())
 
 
-def deal(count: int, folds: int, seed: int) -> list[np.ndarray]:
+def split_at_random(count: int, folds: int, seed: int) -> list[np.ndarray]:
     """Split positions 0 to ``count`` - 1 at random into ``folds`` parts of nearly equal size."""
     return np.array_split(np.random.default_rng(seed).permutation(count), folds)

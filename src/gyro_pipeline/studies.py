@@ -39,7 +39,7 @@ class RunSpec:
     source: str
     protocol: str
     estimator: str
-    method: int
+    method: int  # 1: IMUs side by side are input channels; 2: they are more training data
     real_gyros: int
     virtual_gyros: int
     window_s: float

@@ -1,8 +1,8 @@
 """Tracked runs: the contract between the stages and the run store.
 
-Each row of a study is a run. The parameters of a run are the fields of its run spec and the
-hyper-parameters; its metrics are listed in :class:`EvaluatedRun`. Users query these names, so
-changing one breaks their notebooks.
+Each distinct training of a study is a run, which several rows may share. The parameters of a run
+are the fields of its run spec and the hyper-parameters; its metrics are listed in
+:class:`EvaluatedRun`. Users query these names, so changing one breaks their notebooks.
 """
 
 from collections.abc import Callable, Mapping

@@ -130,7 +130,9 @@ def describe_losses(contents: pd.DataFrame, samples: int, size: int) -> str:
         first = late.iloc[0] // size + 1
         parts.append(f"the first one used of {_in_words([*late.index])} is window {first}")
     if lost:
-        parts.append(f"none is left of {_in_words(lost)}, so it trains no network and tests none")
+        parts.append(
+            f"{_in_words(lost)} has no usable window, so it trains no network and does not test"
+        )
     return "; ".join(parts)
 
 

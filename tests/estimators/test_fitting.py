@@ -116,7 +116,7 @@ def test_networks_are_trained_in_a_batch_and_all_else_in_processes(recordings, t
     jobs = jobs_of(training_set(recordings), ["mean", "cnn", "cnn_shuffled"], seeds=(0, 1))
     batched = {job.key: fit for job, fit in run_fits(jobs, execution("batched"), "all")}
     alone = {job.key: fit for job, fit in run_fits(jobs, execution("serial"), "all")}
-    assert {name: fit.engine.split()[0] for name, fit in batched.items()} == {
+    assert {name: fit.estimator.engine.split()[0] for name, fit in batched.items()} == {
         job.key: "cpu" if job.estimator == "mean" else "batched" for job in jobs
     }
     windows = recordings.angular_rate.to_numpy()[0, :, :, :200]

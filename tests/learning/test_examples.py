@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from gyro_pipeline.learning.examples import (
-    Device,
+    NetworkInput,
     device_centres,
     scaled_examples,
     training_examples,
@@ -49,7 +49,7 @@ def device(rates, bias, imus=(1,), numbers=(1, 2, 3), starts=None, size=WINDOW):
     labels = labelled(bias).sel(imu=list(imus), recording=list(numbers))
     biases = labels.transpose("recording", "imu", "axis").to_numpy().reshape(len(numbers), -1)
     starts = starts or (np.arange(0, rates.shape[-1] - size + 1, size),) * len(numbers)
-    return Device(labelled(rates), imus, numbers, biases, starts)
+    return NetworkInput(labelled(rates), imus, numbers, biases, starts)
 
 
 def unpacked(examples, gyroscopes):

@@ -55,7 +55,7 @@ def test_fifty_steps_are_those_of_a_plain_pytorch_loop_with_rates_that_fall(sche
     tick = lambda: called.append(1)  # noqa: E731
     result = train(ours, examples, None, schedule(), shuffled(), tick, TorchEngine)
     assert len(called) == 5
-    np.testing.assert_allclose(result.history.learning_rate, [1e-3, 1e-3, 1e-4, 1e-4, 1e-5])
+    np.testing.assert_allclose(result.losses.learning_rate, [1e-3, 1e-3, 1e-4, 1e-4, 1e-5])
 
     inputs, targets = map(torch.from_numpy, (examples.inputs, examples.targets))
     generator, optimizer = shuffled(), torch.optim.Adam(theirs.parameters(), lr=1e-3)
@@ -76,17 +76,17 @@ def test_best_weights_are_those_of_the_lowest_validation_loss(schedule):
     examples, validation, one = drawn(24), drawn(200, seed=1), network()
     settings = schedule(epochs=40, learning_rate=1e-2, decay_every=40)
     result = train(one, examples, validation, settings, shuffled())
-    history = result.history.set_index("epoch")
-    assert result.best_epoch == history.val_loss.idxmin()
-    assert 1 < result.best_epoch < 40  # it over-fits, as so few examples make it
-    for weights, epoch in ((result.best, result.best_epoch), (result.last, 40)):
+    history = result.losses.set_index("epoch")
+    best_epoch = history.val_loss.idxmin()
+    assert 1 < best_epoch < 40  # it over-fits, as so few examples make it
+    for weights, epoch in ((result.best, best_epoch), (result.last, 40)):
         errors = outputs(one, weights, validation).numpy() - validation.targets
         assert np.mean(errors**2) == pytest.approx(history.val_loss[epoch], rel=1e-5)
 
 
 def test_a_training_ends_once_the_rates_to_come_sum_to_less_than_asked(schedule):
     whole, early, all_to_come = (
-        train(network(), drawn(24), None, schedule(epochs=6, **ends), shuffled()).history
+        train(network(), drawn(24), None, schedule(epochs=6, **ends), shuffled()).losses
         for ends in ({}, {"stop_below": 1.5e-4}, {"stop_below": 0.0})
     )  # rates 1e-3, 1e-3, 1e-4, 1e-4, 1e-5, 1e-5
     assert early.epoch.tolist() == [1, 2, 3]  # after it 1e-4 + 2e-5 are to come
@@ -115,7 +115,7 @@ def together(given, training, device=CPU):
 
 
 def assert_those_alone(given, training, tolerance=1e-5, device=CPU):
-    """Estimates of the last and the best weights, best epochs and losses are the same."""
+    """Estimates of the last and the best weights, and losses, are the same."""
     for one, got in zip(given, together(given, training, device), strict=True):
         data, shuffling = (one.training, one.validation), one.shuffling.clone_state()
         expected = train(copy.deepcopy(one.network), *data, training, shuffling)
@@ -126,7 +126,7 @@ def assert_those_alone(given, training, tolerance=1e-5, device=CPU):
                 pair = (outputs(one.network, weights, one.training) for weights in (ours, theirs))
                 torch.testing.assert_close(*pair, rtol=0, atol=tolerance * spread)
         losses = max(tolerance, 1e-6)  # the reference adds them in float32
-        pd.testing.assert_frame_equal(got.history, expected.history, rtol=losses)
+        pd.testing.assert_frame_equal(got.losses, expected.losses, rtol=losses)
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)

@@ -11,7 +11,7 @@ from torch import nn
 
 from gyro_pipeline.learning import trainings
 from gyro_pipeline.learning.design import Design, options_of
-from gyro_pipeline.learning.examples import Device, training_examples
+from gyro_pipeline.learning.examples import NetworkInput, training_examples
 from gyro_pipeline.learning.jobs import StoredNetwork, TrainingJob, run_training
 from gyro_pipeline.learning.trainings import batch_device, run_trainings
 from gyro_pipeline.physics.bias import windows_at
@@ -38,7 +38,7 @@ class Dropping(nn.Module):
 def device(rates, bias, imus, numbers):
     labels = bias.sel(imu=list(imus), recording=list(numbers))
     biases = labels.transpose("recording", "imu", "axis").to_numpy().reshape(len(numbers), -1)
-    return Device(rates, imus, tuple(numbers), biases, (STARTS,) * len(numbers))
+    return NetworkInput(rates, imus, tuple(numbers), biases, (STARTS,) * len(numbers))
 
 
 @pytest.fixture
@@ -75,7 +75,7 @@ def test_the_seed_alone_is_random_and_global_state_is_left_alone(make, path, mon
     torch.set_num_threads(2)
     again, other = run_training(make(path=path)), run_training(make(path=path, seed=1))
     assert not differing(first, again) | differing(first, again, "best")
-    assert first.history.equals(again.history)
+    assert first.losses.equals(again.losses)
     assert differing(first, other) == set(first.artifact["last"])
     reordered = replace(make(), seed=1)
     monkeypatch.setattr(Design, "build", lambda self, _, build=Design.build: build(self, 0))
@@ -90,7 +90,7 @@ def test_validation_and_test_recordings_do_not_reach_the_weights(make, recorded)
     other_bias[:, 8:] += 7
     changed = run_training(make((other_rates, other_bias)))
     assert not differing(untouched, changed)
-    assert not untouched.history.val_loss.equals(changed.history.val_loss)
+    assert not untouched.losses.val_loss.equals(changed.losses.val_loss)
     alone = run_training(make(validate=()))
     assert (alone.artifact["best"], alone.artifact["best_epoch"]) == (None, None)
     assert not differing(untouched, alone)
@@ -132,8 +132,10 @@ def grid(make, recorded, path=PAPER):
 
 
 def test_networks_trained_at_once_are_those_trained_one_by_one(make, recorded, monkeypatch):
-    asked, prepared = [], trainings.prepared
-    monkeypatch.setattr(trainings, "prepared", lambda job: asked.append(job.cell) or prepared(job))
+    asked, prepare = [], trainings.prepare_examples
+    monkeypatch.setattr(
+        trainings, "prepare_examples", lambda job: asked.append(job.cell) or prepare(job)
+    )
     jobs = grid(make, recorded)
     results = dict(run_trainings(jobs, DEVICE, "all"))
     assert sorted(results) == list(range(8))
@@ -142,8 +144,7 @@ def test_networks_trained_at_once_are_those_trained_one_by_one(make, recorded, m
     for number, job in enumerate(jobs):
         together, alone = results[number], run_training(job)
         assert together.engine == f"batched {DEVICE.type}"
-        assert together.artifact["best_epoch"] == alone.artifact["best_epoch"]
-        pd.testing.assert_frame_equal(together.history, alone.history, rtol=1e-5)
+        pd.testing.assert_frame_equal(together.losses, alone.losses, rtol=1e-5)
         pair = (StoredNetwork(one.artifact, "best").biases(windows) for one in (together, alone))
         np.testing.assert_allclose(*pair, rtol=0, atol=1e-5)
     assert not list(run_trainings([], DEVICE, "none"))

@@ -116,8 +116,8 @@ def stored_runs(fitted, **changes):
         identity = next(iter(fits.values())).run
         estimators = {fold: copy.copy(fit.estimator) for fold, fit in fits.items()}
         for estimator in estimators.values():
-            estimator.history = None  # which is an artifact of its own
-        history = [fit.estimator.history for fit in fits.values() if fit.is_model]
+            estimator.losses = None  # which is an artifact of its own
+        history = [fit.estimator.losses for fit in fits.values() if fit.is_model]
         run = StoredRun(
             run_id=f"run{number}",
             experiment_id="1",

@@ -19,8 +19,8 @@ from gyro_pipeline.physics.recording_model import (
     outside_noise,
 )
 from gyro_pipeline.pipelines.evaluation.bench import Bench
-from gyro_pipeline.pipelines.evaluation.device import describe_devices, training_labels
-from gyro_pipeline.pipelines.evaluation.nodes import below_the_ceiling, evaluate
+from gyro_pipeline.pipelines.evaluation.device import describe_devices
+from gyro_pipeline.pipelines.evaluation.nodes import ceiling_warning, evaluate
 from gyro_pipeline.pipelines.ground_truth.nodes import measure_allan_variance
 from gyro_pipeline.scoring.scores import squared_errors
 from gyro_pipeline.studies import CNN, MEAN
@@ -50,7 +50,7 @@ def bench_of(world):
     def made(recordings, table, bias=world.bias, allan=world.allan):
         device = describe_devices(recordings, bias, allan, table)
         tests = table[table.role == "test"]
-        return Bench(recordings, device, tests, WINDOW_S, training_labels(bias, table))
+        return Bench(recordings, device, tests, WINDOW_S)
 
     return made
 
@@ -438,8 +438,8 @@ def test_a_sensor_that_was_turned_is_told_from_others_and_history_follows_it(
 
 def test_an_interval_wholly_beyond_the_ceiling_is_flagged(bench):
     beyond = bench.scores(bench.errors({"hold-out": Off(bench, 1e-5)}), LAST)
-    assert "all windows, truth paper" in below_the_ceiling(beyond)["below_ceiling"]
-    assert not below_the_ceiling(bench.scores(bench.mean_errors, LAST))
+    assert "all windows, truth paper" in ceiling_warning(beyond)["beyond_ceiling"]
+    assert not ceiling_warning(bench.scores(bench.mean_errors, LAST))
     scores = by_name(beyond)[PAPER, ALL]
     for name in ("joint", "history"):
         limit = beyond[beyond.score == f"ceiling_{name}_accuracy_gain_pct"].iloc[0]

@@ -46,7 +46,7 @@ def test_its_rows_differ_have_curves_weights_and_intervals_and_its_code_counts(
     made = [fit for fit in fits.values() if fit.run.params["estimator"] == name]
     assert len({fit.estimator.estimate(fit.example)[0].tobytes() for fit in made}) == 4
     for fit in made:
-        assert list(fit.estimator.history) == ["epoch", "learning_rate", "train_loss", "val_loss"]
+        assert list(fit.estimator.losses) == ["epoch", "learning_rate", "train_loss", "val_loss"]
         params = fit.run.params
         assert (params["width"], params["heads"], params["epochs"]) == (16, 2, 3)
         assert "channels" not in params

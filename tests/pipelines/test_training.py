@@ -320,7 +320,7 @@ def test_what_a_study_has_is_skipped_and_what_another_has_is_shared(
         twin = by_key[fit.run.fingerprint]
         if fit.run.params["estimator"] == CNN:
             assert bits(fit) == bits(twin)
-            assert fit.estimator.history is twin.estimator.history
+            assert fit.estimator.losses is twin.estimator.losses
         assert fit.run.study == fit.run.params["study"] == "real2real"
         assert {**fit.run.params, "study": "augmentation"} == twin.run.params
         assert (fit.run.name, fit.run.folds, fit.is_model) == (twin.run.name, (HOLD_OUT,), True)

@@ -9,12 +9,10 @@ from scipy import stats
 
 from gyro_pipeline.conventions import ALL, DISJOINT, FIRST, PAPER, TRUE
 from gyro_pipeline.scoring.scores import (
-    Curve,
     SquaredErrors,
     WeightedCurve,
     beats_oracle,
     coverage,
-    curve_errors,
     gain_difference,
     holm,
     leave_one_out,
@@ -22,6 +20,7 @@ from gyro_pipeline.scoring.scores import (
     prior_conflict,
     score,
     squared_errors,
+    weighted_curve,
     with_interval,
 )
 
@@ -41,12 +40,9 @@ def squares(values):
 
 def curve_of(times_s, rmse, recordings=1):
     sums = np.tile(np.square(rmse), (recordings, 1))
-    return Curve(np.array(times_s, float), SquaredErrors(sums, np.ones_like(sums)))
-
-
-def scored(errors, mean_errors, curve, window_s, weights):
-    """The scores with the curve resampled alike."""
-    return score(errors, mean_errors, curve.of(weights), window_s, weights)
+    weights = leave_one_out(recordings)
+    squares = SquaredErrors(sums, np.ones_like(sums))
+    return WeightedCurve.of(np.array(times_s, float), squares, weights)
 
 
 def test_squared_errors_by_hand():
@@ -75,11 +71,14 @@ def test_of_several_devices_whole_devices_are_resampled_and_else_recordings():
     assert squared_errors(several, PAPER, ALL).sums.tolist() == [1 + 4, 9]
     curve = several.rename(columns={"error_dps": "sum_sq"})
     curve = curve.assign(time_s=1.0, windows=ALL, count=3)
-    assert curve_errors(curve, PAPER, ALL).squares.sums.tolist() == [[3], [3]]
-    assert curve_errors(curve.assign(imu=2), PAPER, ALL).squares.sums.tolist() == [[4], [2]]
+    weights = np.eye(2)
+    by_device = weighted_curve(curve, PAPER, ALL, weights)
+    np.testing.assert_allclose(by_device.rmse**2, [[3 / 6], [3 / 3]])
+    by_recording = weighted_curve(curve.assign(imu=2), PAPER, ALL, weights)
+    np.testing.assert_allclose(by_recording.rmse**2, [[4 / 6], [2 / 3]])
 
 
-def test_curve_errors_choose_truth_and_windows():
+def test_a_curve_is_of_one_truth_and_of_the_chosen_windows():
     rows = [
         (5, PAPER, ALL, 2.0, 1.0, 3),
         (5, PAPER, ALL, 1.0, 4.0, 6),
@@ -89,10 +88,11 @@ def test_curve_errors_choose_truth_and_windows():
         (3, TRUE, ALL, 1.0, 90.0, 3),
     ]
     columns = ["recording", "truth", "windows", "time_s", "sum_sq", "count"]
-    curve = curve_errors(pd.DataFrame(rows, columns=columns), PAPER, ALL)
+    curve = weighted_curve(pd.DataFrame(rows, columns=columns), PAPER, ALL, leave_one_out(2))
     assert curve.times_s.tolist() == [1, 2]
-    assert curve.squares.sums.tolist() == [[8, 5], [4, 1]]
-    assert curve.squares.counts.tolist() == [[6, 3], [6, 3]]
+    expected = [[12 / 12, 6 / 6], [4 / 6, 1 / 3], [8 / 6, 5 / 3]]
+    np.testing.assert_allclose(curve.rmse**2, expected)
+    assert curve.counts.tolist() == [12, 6]
 
 
 def test_an_interval_is_that_of_students_t_where_recordings_weigh_alike():
@@ -134,7 +134,7 @@ def test_equivalent_time_by_hand():
         (0.9, np.inf),  # never reached
         (8.0, -np.inf),  # as good from the start: the curve cannot tell since when
     ):
-        curve = curve_of([1, 2, 4], [8, 4, 1]).of(PLAIN)
+        curve = curve_of([1, 2, 4], [8, 4, 1])
         assert curve.equivalent_time(2.0, np.array([level])).value == pytest.approx(time_s)
 
 
@@ -149,7 +149,7 @@ def test_a_rough_curve_is_made_to_fall_so_that_the_mean_saves_no_time_on_itself(
 
 def test_one_recording_by_hand():
     curve = curve_of([1, 2, 5, 10, 20], [8, 5**0.5, 2, 1, 0.5])
-    scores = scored(squares([[0.6, 0.8, 0.5**0.5, 0.5**0.5]]), squares([[3, 1]]), curve, 2.0, PLAIN)
+    scores = score(squares([[0.6, 0.8, 0.5**0.5, 0.5**0.5]]), squares([[3, 1]]), curve, 2.0, PLAIN)
     # RMSE sqrt(2 / 4) against sqrt(10 / 2); the curve falls from 1 to 0.5 between 10 and 20 s
     rmse, mean = np.sqrt(0.5), np.sqrt(5)
     time_s = 10 + 10 * (1 - rmse) / 0.5
@@ -166,7 +166,7 @@ def test_one_recording_by_hand():
     )
     assert all(estimate.lo is None and estimate.hi is None for estimate in scores.values())
     for wrong, off in ((9.0, -np.inf), (0.1, np.inf)):  # off the curve
-        scores = scored(squares([wrong]), squares([2.0]), curve, 5.0, PLAIN)
+        scores = score(squares([wrong]), squares([2.0]), curve, 5.0, PLAIN)
         assert scores["equivalent_time_s"].value == scores["time_saving_pct"].value == off
         assert scores["accuracy_gain_pct"].value == pytest.approx(100 * (1 - wrong / 2))
 
@@ -175,7 +175,7 @@ def test_intervals_hold_the_value_and_pair_the_estimator_with_the_mean():
     generator = np.random.default_rng(1)
     mean = np.exp(generator.normal(size=(25, 1)))  # errors differ much by recording
     curve = curve_of([1, 2, 5, 10], [9, 3, 1, 0.1], recordings=25)
-    scores = scored(squares(0.5 * mean), squares(mean), curve, 2.0, leave_one_out(25))
+    scores = score(squares(0.5 * mean), squares(mean), curve, 2.0, leave_one_out(25))
     rmse = scores["test_rmse_dps"]
     assert rmse.lo < 0.8 * rmse.value < 1.2 * rmse.value < rmse.hi
     # Half the error in every recording is half of it whichever are left out.
@@ -191,14 +191,14 @@ def test_without_a_positive_square_there_is_no_root_and_nothing_is_clipped():
     negative, sure = squared_errors(table, DISJOINT, ALL), squares(np.ones((5, 1)))
     uncertain = SquaredErrors(np.array([1.0, -0.9, 1.0, -0.9, 0]), np.ones(5), exact=False)
     curve, weights = curve_of([1, 2], [2, 1], recordings=5), leave_one_out(5)
-    scores = scored(negative, replace(sure, exact=False), curve, 1.0, weights)
+    scores = score(negative, replace(sure, exact=False), curve, 1.0, weights)
     assert set(scores) == {"test_mse_dps2"}
     mse = scores["test_mse_dps2"]
     assert mse.value == pytest.approx(np.mean([0.01, 0.04, 0.09, 0.16, 0.25]) - 0.2)
     assert mse.lo < mse.value < mse.hi
     for pair in ((uncertain, sure), (replace(sure, exact=False), uncertain)):
-        assert set(scored(*pair, curve, 1.0, weights)) == {"test_mse_dps2"}
-    assert "test_rmse_dps" in scored(sure, sure, curve, 1.0, weights)
+        assert set(score(*pair, curve, 1.0, weights)) == {"test_mse_dps2"}
+    assert "test_rmse_dps" in score(sure, sure, curve, 1.0, weights)
 
 
 def test_the_check_is_one_sided_and_counts_every_recording_once():

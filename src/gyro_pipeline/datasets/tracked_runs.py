@@ -381,7 +381,7 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
             tags[_FIT + fitted.fold] = log_model(
                 self._client, run, fitted.estimator, fitted.example
             )
-            tags |= self._log_history(run_id, fitted)
+            tags |= self._log_losses(run_id, fitted)
             tags[_MODEL_FOLD] = fitted.fold
         else:
             with tempfile.TemporaryDirectory() as folder:
@@ -446,12 +446,12 @@ class TrackedRuns(AbstractDataset[FittedRun | EvaluatedRun, list[StoredRun]]):
             _PARAMS: _digest_of({key: str(value) for key, value in run.params.items()}),
         }
 
-    def _log_history(self, run_id: str, fitted: FittedRun) -> dict[str, str]:
-        history = fitted.estimator.history
-        if history is None:
+    def _log_losses(self, run_id: str, fitted: FittedRun) -> dict[str, str]:
+        losses = fitted.estimator.losses
+        if losses is None:
             return {}
-        self._client.log_batch(run_id, metrics=_thinned(history, fitted.ended_ms))
-        return self._log_artifacts(run_id, {HISTORY: history})
+        self._client.log_batch(run_id, metrics=_thinned(losses, fitted.ended_ms))
+        return self._log_artifacts(run_id, {HISTORY: losses})
 
     def _save_evaluated(self, evaluated: EvaluatedRun) -> None:
         run = self._client.get_run(evaluated.run_id)
@@ -609,10 +609,10 @@ def _is_dead(owner: str) -> bool:
         return True
 
 
-def _thinned(history: pd.DataFrame, ended_ms: int) -> list[Metric]:
-    """About 50 points of each curve; the full history is an artifact."""
-    step = -(-len(history) // _CURVE_POINTS)
-    rows = history.iloc[::-step].iloc[::-1]  # always including the last epoch
+def _thinned(losses: pd.DataFrame, ended_ms: int) -> list[Metric]:
+    """About 50 points of each curve; all of them are an artifact."""
+    step = -(-len(losses) // _CURVE_POINTS)
+    rows = losses.iloc[::-step].iloc[::-1]  # always including the last epoch
     return [
         Metric(name, float(value), ended_ms, int(epoch))
         for name in rows.columns.intersection(["train_loss", "val_loss"])

@@ -58,7 +58,7 @@ class Estimator:
         recommended: Whether it is recommended for use; others serve for comparison.
         uses_prior: Whether its estimates depend on biases that it has learned.
         engine: Where it was fitted: ``cpu``, ``fused`` or ``batched``.
-        history: Losses of a network by epoch.
+        losses: Losses of a network by epoch.
         settings: Arguments of a seeded estimator except the seed; stored with runs.
     """
 
@@ -69,8 +69,9 @@ class Estimator:
     recommended: bool = False
     uses_prior: bool = False
     engine: str = "cpu"
-    history: pd.DataFrame | None = None
+    losses: pd.DataFrame | None = None
     settings: Mapping[str, Any] = MappingProxyType({})
+    _size: Any = None  # samples of a window, if they must be as many as in training
     _rate_hz: float = np.nan
     _recording_s: float = np.nan
 
@@ -86,8 +87,8 @@ class Estimator:
         Raises:
             InputError: It cannot be fitted to this training set.
         """
-        training = training.part(self.uses)
         self.check(training)
+        training = training.part(self.uses)
         self._rate_hz, self._recording_s = training.rate_hz, training.recording_s
         self._fit(training)
         return self
@@ -96,9 +97,9 @@ class Estimator:
         """Refuse a training set that is too small, before anything is fitted.
 
         Raises:
-            InputError: It has too few recordings.
+            InputError: The part in ``uses`` has too few recordings.
         """
-        recordings = training.recordings()
+        recordings = training.part(self.uses).recordings()
         if recordings < self.fewest_recordings:
             raise InputError(
                 f"expected at least {self.fewest_recordings} training recordings, got {recordings}"
@@ -140,6 +141,11 @@ class Estimator:
         """
         if target not in (RECORDING_MEAN, BIAS):
             raise InputError(f"target: expected {RECORDING_MEAN!r} or {BIAS!r}, got {target!r}")
+        if self._size not in (None, windows.shape[-1]):
+            raise InputError(
+                f"windows: expected {self._size} samples, as it was fitted to, "
+                f"got {windows.shape[-1]}"
+            )
         starts = np.broadcast_to(np.asarray(start_s, np.float64), len(windows))
         biases, sigma = self._estimate(Windows(windows, target, starts, recording))
         shape = windows.shape[:2]
@@ -169,7 +175,7 @@ class Estimator:
     def save(self, folder: Path) -> None:
         """Write the estimator to a folder, without the losses by epoch."""
         stored = copy.copy(self)
-        stored.history = None
+        stored.losses = None
         folder.mkdir(parents=True, exist_ok=True)
         (folder / _FILE).write_bytes(pickle.dumps(stored))
 
@@ -186,12 +192,3 @@ class Estimator:
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
         """Biases and their sigma, in shapes that broadcast to (n, gyroscopes)."""
         raise NotImplementedError
-
-    @staticmethod
-    def _demand_size(windows: Windows, size: int) -> None:
-        """Refuse windows of another length than the training windows."""
-        if windows.samples.shape[-1] != size:
-            raise InputError(
-                f"windows: expected {size} samples, as it was fitted to, "
-                f"got {windows.samples.shape[-1]}"
-            )

@@ -29,7 +29,7 @@ class FitJob:
         estimator: Name, as for :func:`gyro_pipeline.estimators.entry`.
         settings: Sizes and schedule of a network.
         seed: Seed of a network.
-        training: The training set.
+        training_set: What it is fitted to.
     """
 
     key: str
@@ -38,7 +38,7 @@ class FitJob:
     estimator: str
     settings: Training
     seed: int
-    training: TrainingSet
+    training_set: TrainingSet
 
     def make(self) -> Estimator:
         """The estimator, not fitted yet."""
@@ -47,17 +47,16 @@ class FitJob:
     @cached_property
     def work(self) -> float:
         """Estimated cost, in training samples of three gyroscopes of a network."""
-        return self.make().work(self.training)
+        return self.make().work(self.training_set)
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A fitted estimator, with the start and end of its fit, seconds since 1970, and its engine."""
+    """A fitted estimator, with the start and end of its fit, seconds since 1970."""
 
     estimator: Estimator
     started: float
     ended: float
-    engine: str
 
 
 @dataclass(frozen=True)
@@ -124,13 +123,13 @@ def _train_in_batches(
     from gyro_pipeline.learning.trainings import run_trainings  # noqa: PLC0415 - takes PyTorch
 
     estimators: list[Any] = [job.make() for job in jobs]
-    trainings = [e.job(job.training) for e, job in zip(estimators, jobs, strict=True)]
+    trainings = [e.job(job.training_set) for e, job in zip(estimators, jobs, strict=True)]
     for number, trained in run_trainings(trainings, device, label):
         if isinstance(trained, Exception):
-            yield jobs[number], Failure(str(trained))
+            yield jobs[number], _failure(trained)
         else:
             estimator = estimators[number].trained(trained)
-            yield jobs[number], Fit(estimator, trained.started, time.time(), trained.engine)
+            yield jobs[number], Fit(estimator, trained.started, time.time())
 
 
 @dataclass(frozen=True)
@@ -148,9 +147,9 @@ def _groups(jobs: Sequence[FitJob]) -> list[_Group]:
     """A group for each seeded job, and one for all other jobs with the same recordings."""
     groups: dict[object, list[FitJob]] = {}
     for job in jobs:
-        recordings = job.training.recordings_key
+        recordings = job.training_set.recordings_key
         seeded = estimator_class(job.estimator).seeded
-        key = id(job) if seeded else (job.estimator, job.training.device, recordings)
+        key = id(job) if seeded else (job.estimator, job.training_set.device, recordings)
         groups.setdefault(key, []).append(job)
     return [_Group(group) for group in groups.values()]
 
@@ -163,12 +162,16 @@ def _fit(job: FitJob) -> Fit | Failure:
     """Fit an estimator; a failure must not stop the other fits."""
     started = time.time()
     try:
-        estimator = job.make().fit(job.training)
-    except (InputError, FloatingPointError) as error:
-        return Failure(str(error))
+        estimator = job.make().fit(job.training_set)
     except Exception as error:  # a user's estimator may raise any
-        return Failure(repr(error), f"\n{traceback.format_exc()}")
-    return Fit(estimator, started, time.time(), estimator.engine)
+        return _failure(error)
+    return Fit(estimator, started, time.time())
+
+
+def _failure(error: Exception) -> Failure:
+    if isinstance(error, (InputError, FloatingPointError)):
+        return Failure(str(error))
+    return Failure(repr(error), "\n" + "".join(traceback.format_exception(error)))
 
 
 def _is_network(job: FitJob) -> bool:

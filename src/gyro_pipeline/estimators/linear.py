@@ -112,7 +112,7 @@ class BestLinear(_Linear):
 
     uses_prior = True
     fewest_recordings = FEWEST_RECORDINGS
-    _caches = ("_lines", "_priors", "_windows", "_others")
+    _caches = ("_lines", "_priors", "_windows", "_widened_models")
 
     def __init__(
         self,
@@ -154,7 +154,7 @@ class BestLinear(_Linear):
         """Clear what was computed from the priors."""
         self._lines = {}
         self._priors: dict[tuple[int, int | None], RecordingModel] = {}
-        self._others: dict[float, BestLinear] = {}
+        self._widened_models: dict[float, BestLinear] = {}
 
     def with_calibrations(
         self, numbers: NDArray[np.integer], labels: NDArray[np.float64]
@@ -171,14 +171,14 @@ class BestLinear(_Linear):
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
         if not self._fallback:
             return super()._estimate(windows)
-        narrow, wide, alone = (
+        narrow, wide, without_prior = (
             tuple(map(np.asarray, self._widened(spread)._estimate(replace(windows, target=target))))
             for spread, target in ((0.0, windows.target), (WIDE, windows.target), (_FLAT, BIAS))
         )
         means = np.array([model.mean[0] for model in self.models])
         variances = np.array([model.covariance[0, 0] for model in self.models])
         posterior = mixture_posterior(
-            alone[0], alone[1] ** 2, means, variances, variances + WIDE**2
+            without_prior[0], without_prior[1] ** 2, means, variances, variances + WIDE**2
         )
         weight = posterior.wide
         biases = (1 - weight) * narrow[0] + weight * wide[0]
@@ -187,14 +187,14 @@ class BestLinear(_Linear):
 
     def _widened(self, spread: float) -> "BestLinear":
         """The estimator without fallback, whose prior has an additional spread, deg/s."""
-        if spread not in self._others:
+        if spread not in self._widened_models:
             other = copy.copy(self)
             other._fallback = False
             other.models = [_with_spread(model, spread) for model in self.models]
             other._windows = self._windows  # they do not depend on the prior
             other._forget()
-            self._others[spread] = other
-        return self._others[spread]
+            self._widened_models[spread] = other
+        return self._widened_models[spread]
 
     def _line(
         self, axis: int, start: int, size: int, target: str, recording: int | None
@@ -276,10 +276,6 @@ class Ridge(_Linear):
                 self._fitted[axis, target, start] = line
         if not self._fitted:
             raise InputError("expected two training recordings with windows at the same time")
-
-    def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
-        self._demand_size(windows, self._size)
-        return super()._estimate(windows)
 
     def _line(
         self, axis: int, start: int, size: int, target: str, recording: int | None

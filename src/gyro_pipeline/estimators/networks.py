@@ -48,7 +48,7 @@ class ResidualNetwork(Estimator):
     only where they fail: a drift of another form than the warm-up, or shocks. The inputs are the
     innovations of a window (:func:`gyro_pipeline.physics.recording_model.innovations`) and its
     start, the target is the error of the linear estimate in units of its sigma. If the model holds
-    these are independent, and a network can learn only chance. Therefore recordings are dealt into
+    these are independent, and a network can learn only chance. Therefore recordings are split into
     five folds, each network is trained on four of them, and the share of its output that helps on
     the fifth, less two standard errors over recordings, is added. If this share is not positive,
     with fewer than twenty recordings, and for an unseen device, the estimate is the linear one.
@@ -82,7 +82,6 @@ class ResidualNetwork(Estimator):
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
         rates, position = windows.samples, (windows.start_s, windows.recording)
-        self._demand_size(windows, self._size)
         bias, sigma = self._linear.estimate(rates, windows.target, *position)
         correction = self._correction
         if correction is None:
@@ -185,7 +184,6 @@ class WindowMeanNetwork(Estimator):
         self._networks = train_perceptrons(inputs / self._scale, targets / self._scale, used)
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
-        self._demand_size(windows, self._size)
         means = windows.samples.mean(axis=-1, dtype=np.float64) - self._centre
         outputs = np.split(self._networks(means / self._scale)[0], 2, axis=1)
         return self._centre + self._scale * outputs[windows.target == BIAS], np.nan

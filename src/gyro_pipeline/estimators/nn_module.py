@@ -12,7 +12,7 @@ from gyro_pipeline.conventions import ALL, BEST, LAST, ORIGIN_REAL, TRAIN, VALID
 from gyro_pipeline.estimators.base import Estimator, Windows
 from gyro_pipeline.estimators.training import TrainingSet
 from gyro_pipeline.learning.design import Design, network_class, options_of
-from gyro_pipeline.learning.examples import Device, with_shuffled_labels
+from gyro_pipeline.learning.examples import NetworkInput, with_shuffled_labels
 from gyro_pipeline.learning.jobs import StoredNetwork, TrainedNetwork, TrainingJob, run_training
 from gyro_pipeline.parameters import Training
 
@@ -60,12 +60,6 @@ class ModuleEstimator(Estimator):
         """The class of the network, whose source file is stored if it is a user's."""
         return network_class(self._path)
 
-    @property
-    def best_epoch(self) -> int | None:
-        """Epoch of the lowest validation loss, counted from 1; None without validation."""
-        epoch: int | None = self._artifact["best_epoch"]
-        return epoch
-
     def check(self, training: TrainingSet) -> None:
         """See :meth:`Estimator.check`; validation recordings do not count.
 
@@ -104,14 +98,14 @@ class ModuleEstimator(Estimator):
             cell=cell,
         )
 
-    def _design(self, device: Device, training: TrainingSet) -> Design:
+    def _design(self, device: NetworkInput, training: TrainingSet) -> Design:
         options = options_of(self._path, self._settings, self._options, training.rate_hz)
         return Design(self._path, device.biases.shape[1], training.size, options)
 
     def trained(self, network: TrainedNetwork) -> Self:
         """Take over the result of a training."""
-        self._artifact, self.history = network.artifact, network.history
-        self.engine = network.engine
+        self._artifact, self.losses = network.artifact, network.losses
+        self._size, self.engine = network.artifact["network"]["window"], network.engine
         return self
 
     def variants(self) -> Mapping[str, Estimator]:
@@ -126,13 +120,12 @@ class ModuleEstimator(Estimator):
         self.trained(run_training(self.job(training)))
 
     def _estimate(self, windows: Windows) -> tuple[ArrayLike, ArrayLike]:
-        self._demand_size(windows, self._artifact["network"]["window"])
         if self._network is None:
             self._network = StoredNetwork(self._artifact, self._weights)
         return self._network.biases(windows.samples), np.nan
 
 
-def _devices(training: TrainingSet, role: str, only_device: bool = False) -> list[Device]:
+def _devices(training: TrainingSet, role: str, only_device: bool = False) -> list[NetworkInput]:
     """All inputs with windows of a role: the device, other real IMUs, virtual IMUs."""
     windows = training.windows[(training.windows.role == role).to_numpy()]
     inputs = windows[["origin", "imu"]].drop_duplicates().to_numpy().tolist()
@@ -157,10 +150,12 @@ def _windows_of_all(windows: pd.DataFrame, imus: tuple[int, ...]) -> pd.DataFram
     return shared[(shared == len(imus)).to_numpy()].index.to_frame(index=False)
 
 
-def _device(recordings: Any, imus: tuple[int, ...], windows: pd.DataFrame) -> Device:
+def _device(recordings: Any, imus: tuple[int, ...], windows: pd.DataFrame) -> NetworkInput:
     """IMUs side by side with their windows, sorted by recording and start."""
     numbers, firsts = np.unique(windows.recording.to_numpy(), return_index=True)
     starts = np.split(windows.start.to_numpy(), firsts[1:])
     chosen = recordings.recording_mean.sel(imu=list(imus), recording=numbers)
     biases = chosen.transpose("recording", "imu", "axis").to_numpy().reshape(len(numbers), -1)
-    return Device(recordings.angular_rate, imus, tuple(numbers.tolist()), biases, tuple(starts))
+    return NetworkInput(
+        recordings.angular_rate, imus, tuple(numbers.tolist()), biases, tuple(starts)
+    )

@@ -86,7 +86,8 @@ class TrainingSet:
 
         Args:
             uses: NOTHING; OWN, the windows of the device, or of all real IMUs if it is unseen;
-                REAL, the windows of all real IMUs; or ALL.
+                REAL, the windows of all real IMUs; or ALL. The rows of a study are reduced alike,
+                by :func:`gyro_pipeline.studies.run_spec`.
         """
         if uses not in (NOTHING, OWN, REAL, ALL):
             raise InputError(f"uses: expected {NOTHING}, {OWN}, {REAL} or {ALL}, got {uses!r}")
@@ -135,12 +136,11 @@ class TrainingSet:
             return [self.imus[ORIGIN_REAL, self.device]]
         return [imu for (origin, _), imu in self.imus.items() if origin == ORIGIN_REAL]
 
-    def recordings(self, role: str | None = None) -> int:
-        """Number of recordings of the known IMUs: all, or those with windows of a role."""
+    def recordings(self) -> int:
+        """Number of recordings of the known IMUs."""
         real = self.windows.origin == ORIGIN_REAL
         device = self.windows.imu == self.device if self.seen else True
-        chosen = self.windows[real & device & (True if role is None else self.windows.role == role)]
-        return len(chosen[["imu", "recording"]].drop_duplicates())
+        return len(self.windows.loc[real & device, ["imu", "recording"]].drop_duplicates())
 
     @property
     def samples(self) -> int:

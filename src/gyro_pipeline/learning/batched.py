@@ -126,8 +126,8 @@ class _StackedNetworks:
         self._networks = [copy.deepcopy(network).to(device) for network in networks]
         self._parameters, self._buffers = stack_module_state(self._networks)
         self._optimizer = torch.optim.Adam(self._parameters.values(), fused=True)
-        self._called = copy.deepcopy(self._networks[0])
-        self._called.forward = forward_of(self._called)
+        self._template = copy.deepcopy(self._networks[0])
+        self._template.forward = forward_of(self._template)
 
     def train(
         self, examples: _SharedExamples, orders: Tensor, rate: float, batch_size: int
@@ -158,7 +158,7 @@ class _StackedNetworks:
         """Outputs of each network for its windows, (networks, n, gyroscopes)."""
 
         def single(parameters: StateDict, buffers: StateDict, windows: Tensor) -> Tensor:
-            return functional_call(self._called, (parameters, buffers), (windows,))
+            return functional_call(self._template, (parameters, buffers), (windows,))
 
         return vmap(single)(self._parameters, self._buffers, inputs)
 

@@ -16,7 +16,7 @@ _READ_AT_ONCE = 16
 
 
 @dataclass(frozen=True)
-class Device:
+class NetworkInput:
     """IMUs side by side as one input of the network, and their windows.
 
     Attributes:
@@ -52,7 +52,7 @@ class Device:
                 yield samples[row, imus - imus.min()].reshape(-1, samples.shape[-1])
 
 
-def with_shuffled_labels(device: Device, generator: np.random.Generator) -> Device:
+def with_shuffled_labels(device: NetworkInput, generator: np.random.Generator) -> NetworkInput:
     """The device with its biases permuted between recordings: a leak detector.
 
     Each gyroscope is permuted independently. Windows then say nothing about their bias, and only
@@ -88,7 +88,7 @@ class Examples:
     targets: np.ndarray
 
 
-def device_centres(devices: Sequence[Device], centring: str) -> list[np.ndarray]:
+def device_centres(devices: Sequence[NetworkInput], centring: str) -> list[np.ndarray]:
     """The centres of devices: the means of their gyroscopes, or one mean for all.
 
     Args:
@@ -107,7 +107,7 @@ def device_centres(devices: Sequence[Device], centring: str) -> list[np.ndarray]
 
 
 def training_examples(
-    devices: Sequence[Device], layout: Layout, centring: str
+    devices: Sequence[NetworkInput], layout: Layout, centring: str
 ) -> tuple[Examples, Scaling]:
     """All windows of the training devices, scaled, with the scaling fitted to them."""
     centres = device_centres(devices, centring)
@@ -126,7 +126,7 @@ def training_examples(
     return examples, Scaling(centres, input_scale, target_scale)
 
 
-def scaled_examples(device: Device, layout: Layout, scaling: Scaling) -> Examples:
+def scaled_examples(device: NetworkInput, layout: Layout, scaling: Scaling) -> Examples:
     """Windows of other recordings of the first training device, scaled as in training."""
     examples = _centred([device], scaling.centres[:1], layout)
     examples.inputs[...] /= scaling.input_scale
@@ -134,7 +134,9 @@ def scaled_examples(device: Device, layout: Layout, scaling: Scaling) -> Example
     return examples
 
 
-def _centred(devices: Sequence[Device], centres: Sequence[np.ndarray], layout: Layout) -> Examples:
+def _centred(
+    devices: Sequence[NetworkInput], centres: Sequence[np.ndarray], layout: Layout
+) -> Examples:
     n = sum(device.windows for device in devices)
     inputs = aligned_zeros((n, *layout.shape))
     targets = np.empty((n, layout.gyroscopes), np.float32)

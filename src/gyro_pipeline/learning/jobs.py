@@ -12,8 +12,8 @@ import torch
 from gyro_pipeline.learning import fused
 from gyro_pipeline.learning.design import Design
 from gyro_pipeline.learning.examples import (
-    Device,
     Examples,
+    NetworkInput,
     Scaling,
     scaled_examples,
     training_examples,
@@ -24,7 +24,7 @@ from gyro_pipeline.learning.packing import aligned_zeros
 from gyro_pipeline.learning.trainer import (
     TorchEngine,
     Trained,
-    nothing,
+    do_nothing,
     one_thread,
     predict,
     train,
@@ -55,8 +55,8 @@ class TrainingJob:
     """
 
     design: Design
-    devices: Sequence[Device]
-    validation: Device | None
+    devices: Sequence[NetworkInput]
+    validation: NetworkInput | None
     settings: Training
     seed: int
     cell: Hashable = None
@@ -78,16 +78,12 @@ class TrainingJob:
         return sum(len(device.numbers) for device in used)
 
     @property
-    def epoch_work(self) -> float:
-        """Estimated cost of an epoch, in samples of three gyroscopes."""
-        samples = self.windows * self.design.window * len(self.devices[0].imus)
-        return samples * (1 + samples / _LARGE) + _EPOCH_OVERHEAD
-
-    @property
     def work(self) -> float:
         """Estimated cost of the training, in samples of three gyroscopes."""
         epochs = len(self.settings.learning_rates(self.windows))
-        return self.recordings * _RECORDING_WORK + epochs * self.epoch_work
+        samples = self.windows * self.design.window * len(self.devices[0].imus)
+        epoch = samples * (1 + samples / _LARGE) + _EPOCH_OVERHEAD
+        return self.recordings * _RECORDING_WORK + epochs * epoch
 
 
 @dataclass(frozen=True)
@@ -95,12 +91,12 @@ class TrainedNetwork:
     """The result of a training: an artifact to store, losses, start time and engine."""
 
     artifact: Mapping[str, Any]
-    history: pd.DataFrame
+    losses: pd.DataFrame
     started: float
     engine: str
 
 
-def run_training(job: TrainingJob, after_epoch: Callable[[], None] = nothing) -> TrainedNetwork:
+def run_training(job: TrainingJob, after_epoch: Callable[[], None] = do_nothing) -> TrainedNetwork:
     """Run a training on one thread of the processor.
 
     Args:
@@ -113,7 +109,7 @@ def run_training(job: TrainingJob, after_epoch: Callable[[], None] = nothing) ->
     started = time.time()
     torch.set_num_threads(1)
     torch.use_deterministic_algorithms(True)
-    examples, validation, scaling = prepared(job)
+    examples, validation, scaling = prepare_examples(job)
     network = job.design.build(job.seed)
     compiled = type(network) is CalibrationNetwork and fused.available()
     with torch.random.fork_rng(devices=[]):
@@ -127,11 +123,11 @@ def run_training(job: TrainingJob, after_epoch: Callable[[], None] = nothing) ->
             after_epoch,
             FusedEngine if compiled else TorchEngine,
         )
-    artifact = stored(job.design, scaling, trained)
-    return TrainedNetwork(artifact, trained.history, started, "fused" if compiled else "cpu")
+    artifact = artifact_of(job.design, scaling, trained)
+    return TrainedNetwork(artifact, trained.losses, started, "fused" if compiled else "cpu")
 
 
-def prepared(job: TrainingJob) -> tuple[Examples, Examples | None, Scaling]:
+def prepare_examples(job: TrainingJob) -> tuple[Examples, Examples | None, Scaling]:
     """Training and validation examples with their scaling, which do not depend on the seed."""
     layout = job.design.layout
     examples, scaling = training_examples(job.devices, layout, job.settings.centring)
@@ -140,7 +136,7 @@ def prepared(job: TrainingJob) -> tuple[Examples, Examples | None, Scaling]:
     return examples, scaled_examples(job.validation, layout, scaling), scaling
 
 
-def stored(design: Design, scaling: Scaling, trained: Trained) -> dict[str, Any]:
+def artifact_of(design: Design, scaling: Scaling, trained: Trained) -> dict[str, Any]:
     """The artifact of a training: plain values and tensors."""
     return {
         "network": vars(design),
@@ -151,7 +147,6 @@ def stored(design: Design, scaling: Scaling, trained: Trained) -> dict[str, Any]
         },
         "last": trained.last,
         "best": trained.best,
-        "best_epoch": trained.best_epoch,
     }
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from gyro_pipeline.learning.trainer import one_thread
 
 _HIDDEN, _BATCH, _LEARNING_RATE, _WEIGHT_DECAY = 32, 256, 6e-3, 1e-2
+_STEPS = 400
 
 
 @dataclass(frozen=True)
@@ -41,8 +42,6 @@ def train_perceptrons(
     inputs: NDArray[np.float64],
     targets: NDArray[np.float64],
     used: NDArray[np.bool_],
-    steps: int = 400,
-    seed: int = 0,
 ) -> Perceptrons:
     """Train networks with squared errors and AdamW, on the one-cycle learning rate.
 
@@ -50,20 +49,18 @@ def train_perceptrons(
         inputs: (n, d), of the order of 1.
         targets: (n, outputs), of the order of 1.
         used: Whether each network is trained on an example, (K, n); at least one is needed.
-        steps: Steps of the optimiser, with a random batch of 256 for each network.
-        seed: Seed of weights and batches; nothing else is random.
 
     Returns:
         The networks; before training their output is 0.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     x, y = torch.from_numpy(inputs), torch.from_numpy(targets)
     rows = [torch.from_numpy(np.flatnonzero(mask)) for mask in used]
     networks = Perceptrons(_initial(len(used), inputs.shape[1], targets.shape[1], generator))
     parameters = [tensor for layer in networks.layers for tensor in layer]
     optimizer = torch.optim.AdamW(parameters, _LEARNING_RATE, weight_decay=_WEIGHT_DECAY)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _LEARNING_RATE, total_steps=steps)
-    for _ in range(steps):
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _LEARNING_RATE, total_steps=_STEPS)
+    for _ in range(_STEPS):
         picks = [r[torch.randint(len(r), (_BATCH,), generator=generator)] for r in rows]
         batch = torch.stack(picks)
         loss = torch.square(networks.forward(x[batch]) - y[batch]).mean(dim=(1, 2)).sum()

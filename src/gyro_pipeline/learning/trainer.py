@@ -17,7 +17,7 @@ from gyro_pipeline.parameters import Training
 StateDict = dict[str, Tensor]
 
 
-def nothing() -> None:
+def do_nothing() -> None:
     """Do nothing after an epoch."""
 
 
@@ -31,15 +31,13 @@ class Trained:
     Attributes:
         last: Weights at the last epoch (the paper's).
         best: Weights at the epoch of the lowest validation loss; None without validation.
-        best_epoch: The epoch of ``best``, counted from 1.
-        history: Columns ``epoch, learning_rate, train_loss`` and, if validated, ``val_loss``;
+        losses: Columns ``epoch, learning_rate, train_loss`` and, if validated, ``val_loss``;
             losses are squared errors in units of the target scale.
     """
 
     last: StateDict
     best: StateDict | None
-    best_epoch: int | None
-    history: pd.DataFrame
+    losses: pd.DataFrame
 
 
 class Losses:
@@ -47,7 +45,8 @@ class Losses:
 
     def __init__(self) -> None:
         self._rows: list[dict[str, float]] = []
-        self._lowest, self._best = np.inf, dict[int, StateDict]()
+        self._lowest: float = np.inf
+        self._best: StateDict | None = None
 
     def add(
         self, rate: float, loss: float, val_loss: float | None, weights: Callable[[], StateDict]
@@ -63,12 +62,11 @@ class Losses:
         row = {"epoch": epoch, "learning_rate": rate, "train_loss": loss}
         self._rows.append(row if val_loss is None else row | {"val_loss": val_loss})
         if val_loss is not None and val_loss < self._lowest:
-            self._lowest, self._best = val_loss, {epoch: weights()}
+            self._lowest, self._best = val_loss, weights()
 
     def trained(self, last: StateDict) -> Trained:
         """The result, with the weights at the last epoch."""
-        ((best_epoch, best),) = self._best.items() or [(None, None)]
-        return Trained(last, best, best_epoch, pd.DataFrame(self._rows))
+        return Trained(last, self._best, pd.DataFrame(self._rows))
 
 
 class Engine(Protocol):
@@ -125,7 +123,7 @@ def train(
     validation: Examples | None,
     schedule: Training,
     shuffling: torch.Generator,
-    after_epoch: Callable[[], None] = nothing,
+    after_epoch: Callable[[], None] = do_nothing,
     engine: Callable[..., Engine] = TorchEngine,
 ) -> Trained:
     """Train a network; equal inputs give equal weights.
@@ -140,7 +138,7 @@ def train(
         engine: Class of the engine.
 
     Returns:
-        Weights and history.
+        Weights and losses.
 
     Raises:
         FloatingPointError: If the loss is no longer finite.

@@ -8,16 +8,15 @@ from itertools import groupby
 import psutil
 import torch
 
-from gyro_pipeline.conventions import InputError
 from gyro_pipeline.learning.batched import Learner, obstacle, train_together
 from gyro_pipeline.learning.examples import Examples, Scaling
 from gyro_pipeline.learning.jobs import (
     TrainedNetwork,
     TrainingJob,
-    prepared,
+    artifact_of,
+    prepare_examples,
     run_training,
     shuffling,
-    stored,
 )
 
 logger = logging.getLogger(__name__)
@@ -60,8 +59,8 @@ def run_trainings(
         logger.info("%s", title)
         try:
             results: Sequence[TrainedNetwork | Exception] = train_batch(batch, device, title)
-        except (InputError, FloatingPointError) as error:
-            logger.info("%s: trained one by one: %s", title, error)
+        except Exception as error:  # one network's error, or a lack of memory, must not stop others
+            logger.info("%s: trained one by one: %r", title, error)
             results = [_attempt(job) for job in batch]
         for job, trained in zip(batch, results, strict=True):
             yield numbers[id(job)], trained
@@ -106,7 +105,7 @@ def train_batch(
     examples: dict[Hashable, tuple[Examples, Examples | None, Scaling]] = {}
     for job in batch:
         if _cell(job) not in examples:
-            examples[_cell(job)] = prepared(job)
+            examples[_cell(job)] = prepare_examples(job)
     learners = [
         Learner(network, *examples[_cell(job)][:2], shuffling(job.seed))
         for job, network in zip(batch, networks, strict=True)
@@ -115,7 +114,10 @@ def train_batch(
     engine = f"batched {device.type}"
     return [
         TrainedNetwork(
-            stored(job.design, examples[_cell(job)][2], trained), trained.history, started, engine
+            artifact_of(job.design, examples[_cell(job)][2], trained),
+            trained.losses,
+            started,
+            engine,
         )
         for job, trained in zip(batch, results, strict=True)
     ]
@@ -124,7 +126,7 @@ def train_batch(
 def _attempt(job: TrainingJob) -> TrainedNetwork | Exception:
     try:
         return run_training(job)
-    except (InputError, FloatingPointError) as error:
+    except Exception as error:  # a user's network may raise any
         return error
 
 

@@ -13,11 +13,11 @@ from gyro_pipeline.scoring.scores import (
     SquaredErrors,
     WeightedCurve,
     clusters,
-    curve_errors,
     gain_pct,
     leave_one_out,
     score,
     squared_errors,
+    weighted_curve,
     with_interval,
 )
 
@@ -46,8 +46,8 @@ class Scorer:
     window_s: float
 
     @cached_property
-    def weights(self) -> np.ndarray:
-        """Weights of recordings, or devices, with each left out in turn (jackknife)."""
+    def jackknife(self) -> np.ndarray:
+        """Weights of recordings, or devices: all of them, then all but each in turn."""
         return leave_one_out(int(clusters(self.mean_errors).nunique()))
 
     @cached_property
@@ -59,12 +59,12 @@ class Scorer:
     def curves(self) -> dict[View, WeightedCurve]:
         """The running-mean curve by truth and windows, with each recording left out in turn."""
         views = product(self.curve.truth.unique(), (FIRST, ALL))
-        return {view: curve_errors(self.curve, *view).of(self.weights) for view in views}
+        return {view: weighted_curve(self.curve, *view, self.jackknife) for view in views}
 
     def scores(self, errors: pd.DataFrame, view: View) -> dict[str, Estimate]:
         """The figures of merit of an estimator, see :func:`score`."""
         squares, mean = squared_errors(errors, *view), self.mean_squares[view]
-        return score(squares, mean, self.curves[view], self.window_s, self.weights)
+        return score(squares, mean, self.curves[view], self.window_s, self.jackknife)
 
     def gains_by_axis(self, errors: pd.DataFrame, view: View) -> dict[str, Estimate]:
         """A of each axis, ``accuracy_gain_pct_<axis>``."""
@@ -78,13 +78,13 @@ class Scorer:
 
     def rmse_and_gain(self, squares: SquaredErrors, view: View) -> dict[str, Estimate]:
         """``rmse_dps`` and ``accuracy_gain_pct`` of a reference with an exact truth."""
-        rmse = with_interval(np.sqrt(squares.mean(self.weights)), positive=True)
+        rmse = with_interval(np.sqrt(squares.mean(self.jackknife)), positive=True)
         gain = self._gain(squares, self.mean_squares[view])
         return {"rmse_dps": rmse, "accuracy_gain_pct": gain}
 
     def _gain(self, squares: SquaredErrors, mean: SquaredErrors) -> Estimate:
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.sqrt(squares.mean(self.weights) / mean.mean(self.weights))
+            ratio = np.sqrt(squares.mean(self.jackknife) / mean.mean(self.jackknife))
         return gain_pct(with_interval(ratio, positive=True))
 
 

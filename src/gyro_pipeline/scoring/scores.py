@@ -13,6 +13,7 @@ measures how often they contain the truth.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 import pandas as pd
@@ -99,24 +100,6 @@ def squared_errors(errors: pd.DataFrame, truth: str, windows: str) -> SquaredErr
 
 
 @dataclass(frozen=True)
-class Curve:
-    """Squared errors of the running mean against its length.
-
-    Attributes:
-        times_s: Shape (times,), increasing, seconds.
-        squares: With sums and counts of shape (recordings, times).
-    """
-
-    times_s: np.ndarray
-    squares: SquaredErrors
-
-    def of(self, weights: np.ndarray) -> "WeightedCurve":
-        """The curve for each weighting of the recordings (:func:`leave_one_out`)."""
-        squares = np.maximum(np.nan_to_num(self.squares.mean(weights)), 0.0)
-        return WeightedCurve(self.times_s, np.sqrt(squares), self.squares.counts.sum(axis=0))
-
-
-@dataclass(frozen=True)
 class WeightedCurve:
     """RMSE of the running mean against its length, for each weighting of the recordings.
 
@@ -129,6 +112,18 @@ class WeightedCurve:
     times_s: np.ndarray
     rmse: np.ndarray
     counts: np.ndarray
+
+    @classmethod
+    def of(cls, times_s: np.ndarray, errors: SquaredErrors, weights: np.ndarray) -> Self:
+        """The curve of squared errors by recording and time, for weights of the recordings.
+
+        Args:
+            times_s: Shape (times,), increasing, seconds.
+            errors: Sums and counts of shape (recordings, times).
+            weights: From :func:`leave_one_out`, shape (n, recordings).
+        """
+        squares = np.maximum(np.nan_to_num(errors.mean(weights)), 0.0)
+        return cls(times_s, np.sqrt(squares), errors.counts.sum(axis=0))
 
     @cached_property
     def falling(self) -> np.ndarray:
@@ -181,19 +176,22 @@ class WeightedCurve:
         return float(np.interp(-level, -self.falling, self.times_s))
 
 
-def curve_errors(curve: pd.DataFrame, truth: str, windows: str) -> Curve:
-    """The running-mean curve by recording (or device, see :func:`clusters`), in order.
+def weighted_curve(
+    curve: pd.DataFrame, truth: str, windows: str, weights: np.ndarray
+) -> WeightedCurve:
+    """The running-mean curve, for weights of the recordings (or devices, see :func:`clusters`).
 
     Args:
         curve: From :func:`gyro_pipeline.scoring.truths.running_mean_curve`, concatenated.
         truth: Name of the truth.
         windows: ``first`` or ``all``.
+        weights: From :func:`leave_one_out`.
     """
     chosen = curve[(curve.truth == truth) & (curve.windows == windows)]
     sums = chosen.groupby([clusters(chosen).rename("cluster"), "time_s"])[["sum_sq", "count"]].sum()
     table = sums.unstack("time_s")
-    squares = SquaredErrors(table["sum_sq"].to_numpy(), table["count"].to_numpy())
-    return Curve(table["sum_sq"].columns.to_numpy(float), squares)
+    errors = SquaredErrors(table["sum_sq"].to_numpy(), table["count"].to_numpy())
+    return WeightedCurve.of(table["sum_sq"].columns.to_numpy(float), errors, weights)
 
 
 def leave_one_out(recordings: int) -> np.ndarray:
@@ -303,8 +301,8 @@ def paired_difference(
     Returns:
         Negative where the estimator is better, significantly so if both ends are.
     """
-    ours, theirs = (squares.mean(weights) for squares in (errors, reference))
-    difference = np.sqrt(ours) - np.sqrt(theirs) if root else ours - theirs
+    squares, of_reference = (each.mean(weights) for each in (errors, reference))
+    difference = np.sqrt(squares) - np.sqrt(of_reference) if root else squares - of_reference
     return with_interval(difference, confidence_pct)
 
 

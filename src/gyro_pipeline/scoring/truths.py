@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gyro_pipeline.conventions import ALL, AXES, DISJOINT, FIRST, PAPER, TRUE
 from gyro_pipeline.physics.allan import NoiseFigures
@@ -119,7 +119,7 @@ def error_columns(
     truth: str,
     value_and_variance: tuple[np.ndarray, np.ndarray],
     estimates: np.ndarray,
-    sigma: np.ndarray,
+    sigma: ArrayLike,
 ) -> Columns:
     """Errors of the estimates on one recording against one truth, a row per window and axis.
 
@@ -128,7 +128,8 @@ def error_columns(
         truth: Name of the truth.
         value_and_variance: From :meth:`TestRecording.truths`.
         estimates: Estimates for all test windows, shape (windows, 3), deg/s.
-        sigma: The standard deviations that the estimator states, same shape; NaN for none.
+        sigma: The standard deviations that the estimator states, same shape, or NaN
+            for none.
 
     Returns:
         Columns ``imu, recording, window, start, axis, truth, error_dps, truth_variance,
@@ -146,7 +147,7 @@ def error_columns(
         "truth": np.full(rows, truth),
         "error_dps": (estimates - value).ravel(),
         "truth_variance": variance.ravel(),
-        "sigma_dps": np.ravel(sigma),
+        "sigma_dps": np.ravel(np.broadcast_to(sigma, estimates.shape)),
     }
 
 

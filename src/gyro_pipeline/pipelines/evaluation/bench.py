@@ -1,13 +1,14 @@
 """The test bench: the test windows of a sensor, on which all estimators are judged alike."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations, product
 
 import numpy as np
 import pandas as pd
 import xarray as xr
+from numpy.typing import ArrayLike
 
 from gyro_pipeline.conventions import (
     ALL,
@@ -52,6 +53,10 @@ SIGMAS = {"coverage_1sigma_pct": 1.0, "coverage_2sigma_pct": 2.0, "coverage_95_p
 """Numbers of standard deviations within which errors are counted."""
 
 TARGETS = (RECORDING_MEAN, BIAS)
+
+Estimates = Callable[[str], tuple[np.ndarray, ArrayLike]]
+"""Biases and sigma of the windows of a recording, (windows, 3), deg/s, for each truth."""
+
 _MIN_CORRELATED = 5
 
 
@@ -63,8 +68,6 @@ class Bench:
     device: TestDevice  # the tested IMUs
     tests: pd.DataFrame  # test rows of the windows table: fold, imu, recording, start
     window_s: float  # calibration time T0, seconds
-    # means of the device's training recordings by fold, (n, axes), deg/s; empty if unseen
-    labels: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @cached_property
     def size(self) -> int:
@@ -120,14 +123,12 @@ class Bench:
             InputError: The estimate of a window is NaN.
         """
         fits = {fold: self._with_calibrations(str(fold), fit) for fold, fit in estimators.items()}
-        parts = []
-        for recording, truths in zip(self.test_recordings, self._truths, strict=True):
-            estimates = self._estimates(fits, recording, imus)
-            parts += [
-                error_columns(recording, truth, value, *estimates[TARGET_OF[truth]])
-                for truth, value in truths.items()
-            ]
-        errors = stack_columns(parts)
+
+        def estimates(recording: TestRecording) -> Estimates:
+            by_target = self._estimates(fits, recording, imus)
+            return lambda truth: by_target[TARGET_OF[truth]]
+
+        errors = self._table(estimates)
         for number in errors.recording[errors.error_dps.isna()].unique():
             raise InputError(
                 f"{self.recordings.attrs['sensor']} recording {number}: expected an estimate for "
@@ -135,6 +136,17 @@ class Bench:
                 "leave the estimator out of the study"
             )
         return errors
+
+    def _table(self, estimates_of: Callable[[TestRecording], Estimates]) -> pd.DataFrame:
+        """Errors of the estimates for each test recording against all truths."""
+        parts = []
+        for recording, truths in zip(self.test_recordings, self._truths, strict=True):
+            estimates = estimates_of(recording)
+            parts += [
+                error_columns(recording, truth, value, *estimates(truth))
+                for truth, value in truths.items()
+            ]
+        return stack_columns(parts)
 
     def _with_calibrations(self, fold: str, estimator: Estimator) -> Estimator:
         """The fit of a fold, which may use a test recording as a calibration of later ones."""
@@ -196,30 +208,20 @@ class Bench:
         """Errors of the best possible estimator for each truth; None on measured data."""
         if self.device.unit_bias is None:
             return None
-        return self._errors_without_sigma(self._oracle_estimates)
+        return self._table(lambda r: lambda truth: (self._oracle_estimates(r, truth), np.nan))
 
     @cached_property
     def constant_errors(self) -> pd.DataFrame | None:
         """Errors of the mean of the training recordings; None for unseen devices."""
-        if not self.labels:
+        if not self.device.labels:
             return None
 
-        def constants(recording: TestRecording, truth: str) -> np.ndarray:
+        def constants(recording: TestRecording) -> Estimates:
             rows = self._rows(recording).sort_values("start").drop_duplicates("start")
-            return np.stack([self.labels[fold].mean(axis=0) for fold in rows.fold])
+            biases = np.stack([self.device.labels[fold].mean(axis=0) for fold in rows.fold])
+            return lambda _: (biases, np.nan)
 
-        return self._errors_without_sigma(constants)
-
-    def _errors_without_sigma(
-        self, estimate: Callable[[TestRecording, str], np.ndarray]
-    ) -> pd.DataFrame:
-        parts = []
-        for recording, truths in zip(self.test_recordings, self._truths, strict=True):
-            for truth, value in truths.items():
-                biases = estimate(recording, truth)
-                sigma = np.full(biases.shape, np.nan)
-                parts.append(error_columns(recording, truth, value, biases, sigma))
-        return stack_columns(parts)
+        return self._table(constants)
 
     @cached_property
     def prior_p(self) -> dict[str, float]:
@@ -227,7 +229,7 @@ class Bench:
 
         The least p value of all folds is corrected for their number.
         """
-        if not self.labels:
+        if not self.device.labels:
             return {}
         means = {
             (recording.imu, recording.number): recording.mean for recording in self.test_recordings
@@ -236,7 +238,7 @@ class Bench:
         for fold, rows in self.tests.groupby("fold", observed=True):
             keys = rows[["imu", "recording"]].drop_duplicates().itertuples(index=False, name=None)
             of_fold = np.stack([means[key] for key in keys])
-            p_values.append(prior_conflict(self.labels[str(fold)], of_fold))
+            p_values.append(prior_conflict(self.device.labels[str(fold)], of_fold))
         least = np.minimum(len(p_values) * np.min(p_values, axis=0), 1.0)
         return dict(zip(AXES, least.tolist(), strict=True))
 
@@ -281,7 +283,7 @@ class Bench:
         return list(enumerate(models, axes.start))
 
     @cached_property
-    def _distinct(self) -> dict[tuple[int, float], RecordingModel]:
+    def _distinct_models(self) -> dict[tuple[int, float], RecordingModel]:
         """All distinct models, by axis and time constant."""
         if self.device.models is None:
             return {}
@@ -305,7 +307,7 @@ class Bench:
     @cached_property
     def ceilings(self) -> Ceilings:
         """The least expected errors."""
-        distinct = [(axis, model) for (axis, _), model in self._distinct.items()]
+        distinct = [(axis, model) for (axis, _), model in self._distinct_models.items()]
         samples, rate_hz = self.recordings.sizes["sample"], self.recordings.attrs["rate_hz"]
         return Ceilings(self.device, distinct, self.size, samples, rate_hz)
 
@@ -341,7 +343,7 @@ class Bench:
         if windows == ALL and truth != DISJOINT and errors.sigma_dps.notna().any():
             for name, sigmas in SIGMAS.items():
                 scores[name] = Estimate(100 * coverage(errors, truth, sigmas))
-        if "oracle" in self._bounds and len(self._scorer.weights) > 1:
+        if "oracle" in self._bounds and len(self._scorer.jackknife) > 1:
             oracle_squares = self._bounds["oracle"][view]
             p = beats_oracle(squared_errors(errors, *view), oracle_squares)
             scores["beats_oracle_p"] = Estimate(p)
@@ -361,7 +363,7 @@ class Bench:
 
     def _turn_on_correlations(self) -> dict[str, Estimate]:
         """Correlations of the training labels between axes, with intervals (Fisher 1915)."""
-        labels = max(self.labels.values(), key=len, default=np.empty(0))
+        labels = max(self.device.labels.values(), key=len, default=np.empty(0))
         if len(labels) < _MIN_CORRELATED:
             return {}
         scores, half = {}, 1.96 / np.sqrt(len(labels) - 3)

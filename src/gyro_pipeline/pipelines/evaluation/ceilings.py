@@ -30,7 +30,7 @@ class Ceilings:
 
     device: TestDevice  # the tested device
     # distinct models by axis and time constant, unless noise is white without warm-up
-    distinct: Sequence[tuple[int, RecordingModel]]
+    distinct_models: Sequence[tuple[int, RecordingModel]]
     size: int  # samples of a window
     samples: int  # samples of a recording
     rate_hz: float  # samples per second
@@ -41,7 +41,7 @@ class Ceilings:
         if self.device.unit_bias is None:
             noise = "white noise" if self.device.models is None else "fitted N, B and K"
             return f"estimated from recordings, {noise}; {PREMISE}"
-        if self.device.models is not None and len(self.distinct) > len(self.device.models):
+        if self.device.models is not None and len(self.distinct_models) > len(self.device.models):
             return (
                 "drawn values, the time constant of each warm-up among them: an estimator that "
                 "must learn it from the window cannot be as good"
@@ -91,8 +91,8 @@ class Ceilings:
                 for start in starts
             ]
             others["joint"] = np.mean(squares, axis=0), mean[0]
-        if device.history is not None:
-            others["history"] = self._expected(truth, windows, self.size, device.history)
+        if device.given_earlier is not None:
+            others["history"] = self._expected(truth, windows, self.size, device.given_earlier)
         for name, (square, mean_square) in others.items():
             limits[f"ceiling_{name}_rmse_dps"] = with_draws(np.sqrt(square))
             gain = 100 * best_gain(np.sqrt(square / mean_square))
@@ -125,7 +125,7 @@ class Ceilings:
             return best, np.full(best.shape, mean)
         squares = [
             mean_squares(model, start, size, truth, covariances=_priors(model, variances[:, axis]))
-            for axis, model in self.distinct
+            for axis, model in self.distinct_models
             for start in self._starts(windows, size)
         ]
         best, mean = np.mean(squares, axis=0)

@@ -1,7 +1,7 @@
 """The description of tested devices: their noise, and the spread of their bias."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
@@ -38,12 +38,15 @@ class TestDevice:
     # The model of each axis, if its noise is not white or its bias warms up: drawn if simulated
     # (with the time constant of a single recording), else fitted.
     models: tuple[RecordingModel, ...] | None = None
+    # Means of the training recordings by test fold, (n, axes), deg/s; empty for unseen devices, and
+    # if a fold has none.
+    labels: Mapping[str, np.ndarray] = field(default_factory=dict)
     # Covariance of the turn-on bias of all axes, (1 + draws, axes, axes), (deg/s)^2; None with few
     # recordings, and on simulated data, where axes are independent.
     joint: np.ndarray | None = None
-    # Variance of the next bias given the calibrations before it, mean over the test recordings,
-    # (1 + draws, axes), (deg/s)^2; None with few recordings, and on simulated data.
-    history: np.ndarray | None = None
+    # Variance of the bias given earlier calibrations, mean over the test recordings, (1 + draws,
+    # axes), (deg/s)^2; None with few recordings, and on simulated data.
+    given_earlier: np.ndarray | None = None
 
     @property
     def figures(self) -> tuple[NoiseFigures, ...]:
@@ -70,37 +73,27 @@ def describe_devices(
     tests = rows[rows.role == TEST].groupby("imu").fold.unique()
     training = [learning[(learning.imu == imu) & learning.fold.isin(tests[imu])] for imu in imus]
     if len(imus) == 1 and len(training[0]):
+        means = bias[bias.imu == imus[0]].pivot(
+            index="recording", columns="axis", values="bias_dps"
+        )
         if recordings.attrs["simulated"]:
-            return _describe_drawn(recordings, imus[0])
-        of_imu = bias[bias.imu == imus[0]]
-        means = of_imu.pivot(index="recording", columns="axis", values="bias_dps")
-        numbers = rows.recording[rows.role == TEST].unique()
-        trained = means.loc[means.index.isin(training[0].recording)]
-        return _describe_known(recordings, trained, means.loc[sorted(numbers)], allan, imus[0])
+            device = _describe_drawn(recordings, imus[0])
+        else:
+            numbers = rows.recording[rows.role == TEST].unique()
+            trained = means.loc[means.index.isin(training[0].recording)]
+            tested = means.loc[sorted(numbers)]
+            device = _describe_known(recordings, trained, tested, allan, imus[0])
+        return replace(device, labels=_labels(means, training[0], tests[imus[0]]))
     keys = learning[learning.fold.isin(tests.explode())][_KEYS].drop_duplicates()
     return _describe_unseen(recordings, allan, sorted(map(tuple, keys.to_numpy().tolist())), imus)
 
 
-def training_labels(bias: pd.DataFrame, table: pd.DataFrame) -> dict[str, np.ndarray]:
-    """Means of the tested device's training recordings in each fold, (n, axes), deg/s.
-
-    Args:
-        bias: Ground truth.
-        table: A windows table.
-
-    Returns:
-        Means by test fold; empty if a fold has no training recording, or several devices test.
-    """
-    rows = table[table.origin == ORIGIN_REAL].drop_duplicates(["fold", "role", *_KEYS])
-    imus = rows.imu[rows.role == TEST].unique().tolist()
-    if len(imus) > 1:
-        return {}
-    means = bias[bias.imu == imus[0]].pivot(index="recording", columns="axis", values="bias_dps")
-    training = rows[(rows.imu == imus[0]) & (rows.role != TEST)]
-    labels = {
-        str(fold): means.loc[sorted(training.recording[training.fold == fold].unique())].to_numpy()
-        for fold in rows.fold[rows.role == TEST].unique()
-    }
+def _labels(
+    means: pd.DataFrame, training: pd.DataFrame, folds: Iterable[str]
+) -> dict[str, np.ndarray]:
+    """Means of the training recordings of each fold; empty if a fold has none."""
+    numbers = {fold: sorted(training.recording[training.fold == fold].unique()) for fold in folds}
+    labels = {str(fold): means.loc[chosen].to_numpy() for fold, chosen in numbers.items()}
     return labels if all(map(len, labels.values())) else {}
 
 
@@ -178,14 +171,14 @@ def _describe_known(
     models = _fitted_models(recordings, [(imu, number) for number in numbers])
     averaging = np.square(noise) / duration_s + _beyond_white(models, duration_s)
     spread = np.vstack([turn_on_spread(labels, averaging), spread_draws(labels, averaging, _DRAWS)])
-    joint = history = None
+    joint = given_earlier = None
     if models is not None:
-        history = _history(models, means, tests)
+        given_earlier = _given_earlier(models, means, tests)
         joint = joint_draws(labels, averaging, _DRAWS) if len(labels) > len(AXES) else None
-    return TestDevice((imu,), noise, spread, None, models, joint, history)
+    return TestDevice((imu,), noise, spread, None, models, joint=joint, given_earlier=given_earlier)
 
 
-def _history(
+def _given_earlier(
     models: Sequence[RecordingModel], means: pd.DataFrame, tests: pd.DataFrame
 ) -> np.ndarray:
     """Variance of a bias given the calibrations before it, mean over test recordings.

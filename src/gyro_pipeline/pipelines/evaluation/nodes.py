@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterator, Mapping
-from itertools import product
+from itertools import groupby, product
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.fingerprints import code_hash, data_hash, fingerprint
 from gyro_pipeline.pipelines.evaluation.bench import Bench
 from gyro_pipeline.pipelines.evaluation.ceilings import PREMISE
-from gyro_pipeline.pipelines.evaluation.device import TestDevice, describe_devices, training_labels
+from gyro_pipeline.pipelines.evaluation.device import TestDevice, describe_devices
 from gyro_pipeline.scoring.scorer import MISSING, Scores, read_scores
 from gyro_pipeline.scoring.truths import CURVE_STEP_S
 from gyro_pipeline.studies import MEAN, RunSpec, possible_runs
@@ -71,58 +71,54 @@ def evaluate(
     ]
     evaluated_with = fingerprint([code_hash(__name__), truths])
     specs, stored = possible_runs(plan), {run.fingerprint: run for run in reversed(runs)}
-    benches = Benches(recordings, windows, bias, allan)
-    evaluated = 0
-    for key, spec in sorted(specs.items(), key=lambda item: _bench_key(item[1])):
-        run = stored[key]
-        if run.finished and run.tags.get(EVALUATED_WITH) == evaluated_with:
-            continue
-        yield _evaluate_run(run, spec, benches.of(spec), evaluated_with)
-        evaluated += 1
+    pending = {
+        key: spec
+        for key, spec in sorted(specs.items(), key=lambda item: _windows_of(item[1]))
+        if not (stored[key].finished and stored[key].tags.get(EVALUATED_WITH) == evaluated_with)
+    }
+    tables = dict(iter(windows.groupby(_WINDOWS, observed=True)))
+    devices = Devices(recordings, bias, allan)
+    for chosen, group in groupby(pending, key=lambda key: _windows_of(pending[key])):
+        bench = _bench(recordings, devices, tables[chosen])
+        for key in group:
+            yield _evaluate_run(stored[key], pending[key], bench, evaluated_with)
     label = recordings.attrs["sensor"]
-    logger.info("%s: %d runs evaluated, %d skipped", label, evaluated, len(specs) - evaluated)
+    logger.info("%s: %d runs evaluated, %d skipped", label, len(pending), len(specs) - len(pending))
 
 
-def _bench_key(spec: RunSpec) -> tuple[str, float, float]:
-    return spec.protocol, spec.window_s, spec.window_stride_s
+_WINDOWS = ["protocol", "window_s", "window_stride_s"]
+"""Fields of a run, and columns of the windows table, that choose the windows."""
 
 
-class Benches:
-    """The benches of a study on a sensor; only the last one is kept in memory.
+def _windows_of(spec: RunSpec) -> tuple[Any, ...]:
+    return tuple(getattr(spec, name) for name in _WINDOWS)
+
+
+def _bench(recordings: xr.Dataset, devices: "Devices", table: pd.DataFrame) -> Bench:
+    """The bench of a part of the windows table."""
+    columns = ["fold", "imu", "recording", "start"]
+    tests = table[table.role == TEST][columns].astype({"fold": str})
+    return Bench(recordings, devices.of(table), tests, float(table.window_s.iloc[0]))
+
+
+class Devices:
+    """The descriptions of tested devices, which are the same for most windows.
 
     Args:
-        recordings, windows, bias, allan: As :func:`evaluate` takes them.
+        recordings, bias, allan: As :func:`evaluate` takes them.
     """
 
-    def __init__(
-        self, recordings: xr.Dataset, windows: pd.DataFrame, bias: pd.DataFrame, allan: xr.Dataset
-    ) -> None:
-        self._recordings, self._bias, self._allan = recordings, bias, allan
-        key = ["protocol", "window_s", "window_stride_s"]
-        self._tables = dict(iter(windows.groupby(key, observed=True)))
-        self._devices: dict[str, TestDevice] = {}
-        self._cache: dict[Any, Bench] = {}
+    def __init__(self, recordings: xr.Dataset, bias: pd.DataFrame, allan: xr.Dataset) -> None:
+        self._data = recordings, bias, allan
+        self._cache: dict[str, TestDevice] = {}
 
-    def of(self, spec: RunSpec) -> Bench:
-        """The bench on which a run is evaluated."""
-        key = _bench_key(spec)
-        if key not in self._cache:
-            table = self._tables[key]
-            columns = ["fold", "imu", "recording", "start"]
-            tests = table[table.role == TEST][columns].astype({"fold": str})
-            device = self._device(table)
-            labels = training_labels(self._bias, table)
-            bench = Bench(self._recordings, device, tests, spec.window_s, labels)
-            self._cache = {key: bench}
-        return self._cache[key]
-
-    def _device(self, table: pd.DataFrame) -> TestDevice:
-        """The description of the tested devices, which is the same for most windows."""
+    def of(self, table: pd.DataFrame) -> TestDevice:
+        """The description of the devices that are tested in a part of the windows table."""
         roles = table[["fold", "role", "origin", "imu", "recording"]].drop_duplicates()
         key = fingerprint(roles.astype(str).to_numpy().tolist())
-        if key not in self._devices:
-            self._devices[key] = describe_devices(self._recordings, self._bias, self._allan, table)
-        return self._devices[key]
+        if key not in self._cache:
+            self._cache[key] = describe_devices(*self._data, table)
+        return self._cache[key]
 
 
 def _evaluate_run(run: StoredRun, spec: RunSpec, bench: Bench, evaluated_with: str) -> EvaluatedRun:
@@ -145,7 +141,7 @@ def _evaluate_run(run: StoredRun, spec: RunSpec, bench: Bench, evaluated_with: s
         artifacts[CURVE] = bench.curve
     tags = {EVALUATED_WITH: evaluated_with, "ceiling": bench.ceilings.basis}
     tags |= {"recommended": str(first.recommended)} | _off_the_curve(metrics)
-    tags |= below_the_ceiling(table)
+    tags |= ceiling_warning(table)
     if first.uses_prior:
         tags |= {"uses_prior": ORIENTATION_NOTE} | _conflict(scores, metrics, run)
     logger.info(
@@ -169,27 +165,27 @@ def _metrics(scores: Scores) -> dict[str, float]:
     }
 
 
-def below_the_ceiling(table: pd.DataFrame) -> dict[str, str]:
+def ceiling_warning(table: pd.DataFrame) -> dict[str, str]:
     """A warning where the interval of a result lies entirely beyond that of the ceiling.
 
     Args:
         table: Scores from :meth:`gyro_pipeline.pipelines.evaluation.bench.Bench.scores`.
 
     Returns:
-        The tag ``below_ceiling``; empty without such a result.
+        The tag ``beyond_ceiling``; empty without such a result.
     """
-    below = []
+    beyond = []
     for truth, windows in product((PAPER, TRUE), (FIRST, ALL)):
         scores = read_scores(table, truth)
         gain, ceiling = (
             scores.get((f"{kind}accuracy_gain_pct", windows), MISSING) for kind in ("", "ceiling_")
         )
         if gain.lies_above(ceiling):
-            below.append(f"{windows} windows, truth {truth}")
-    if not below:
+            beyond.append(f"{windows} windows, truth {truth}")
+    if not beyond:
         return {}
     return {
-        "below_ceiling": f"{'; '.join(below)}: the interval of A lies wholly beyond the ceiling. "
+        "beyond_ceiling": f"{'; '.join(beyond)}: the interval of A lies wholly beyond the ceiling. "
         f"Its premise does not hold ({PREMISE}), or test information has reached the training"
     }
 

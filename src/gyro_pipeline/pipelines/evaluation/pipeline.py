@@ -10,7 +10,7 @@ def create_pipeline(study: str, sensor: str) -> Pipeline:
     stage, splits = f"{study}.{sensor}", f"{sensor}.windowed_splits"
     inputs = {
         "plan": f"{stage}.training.plan",
-        "runs": f"{stage}.training.runs",
+        "runs": f"{stage}.training.runs",  # StoredRun objects, whose fits training has saved
         "recordings": f"{splits}.recordings",
         "windows": f"{stage}.windowed_splits.windows",
         "bias": f"{splits}.bias",

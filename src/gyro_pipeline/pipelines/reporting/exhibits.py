@@ -15,14 +15,14 @@ from gyro_pipeline.physics.warm_up import amplitude_needed
 from gyro_pipeline.pipelines.reporting.recordings import WARM_UPS_S
 from gyro_pipeline.pipelines.reporting.results import CNN_BEST, column
 from gyro_pipeline.scoring.scores import Estimate
-from gyro_pipeline.studies import CNN, CONSTANT, MEAN
+from gyro_pipeline.studies import CNN, CNN_SHUFFLED, CONSTANT, MEAN
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LEAK_VARIANTS = {
     ("k_fold", "cnn"): "Split by recording",
-    ("k_fold", "cnn_shuffled"): "By recording, labels shuffled",
+    ("k_fold", CNN_SHUFFLED): "By recording, labels shuffled",
     ("window_split", "cnn"): "Windows split at random",
     ("test_in_training", "cnn"): "Test windows in training",
     ("best_epoch_on_test", "cnn"): "By recording, epoch chosen on test",

@@ -47,7 +47,7 @@ def findings(material: Material) -> list[str]:
         _matched(material),
         _more_data(networks, "virtual_gyros", "virtual gyroscopes to the same real ones"),
         _more_data(networks[networks.method == 2], "real_gyros", "real gyroscopes"),  # noqa: PLR2004
-        _below_ceiling(rows),
+        _beyond_ceiling(rows),
         _prior_conflicts(rows),
         _oracle_check(rows),
     ]
@@ -194,9 +194,9 @@ def _more_data(networks: pd.DataFrame, count: str, addition: str) -> str:
     )
 
 
-def _below_ceiling(rows: pd.DataFrame) -> str:
+def _beyond_ceiling(rows: pd.DataFrame) -> str:
     flagged = [
-        beyond_ceiling(row, ALL) or beyond_ceiling(row, FIRST) or pd.notna(row.below_ceiling)
+        beyond_ceiling(row, ALL) or beyond_ceiling(row, FIRST) or pd.notna(row.beyond_ceiling)
         for _, row in rows.iterrows()
     ]
     if not any(flagged):

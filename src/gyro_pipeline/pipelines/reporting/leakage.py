@@ -91,9 +91,11 @@ def _pooled(
     }
     for name, estimate in scorer.scores(errors, view).items():
         row |= with_ends(name, estimate)
-    ours, of_constant = (squared_errors(table, *view) for table in (errors, errors_of([constant])))
+    squares, of_constant = (
+        squared_errors(table, *view) for table in (errors, errors_of([constant]))
+    )
     gain = scorer.rmse_and_gain(of_constant, view)["accuracy_gain_pct"]
-    difference = paired_difference(ours, of_constant, scorer.weights, DETECTOR_PCT)
+    difference = paired_difference(squares, of_constant, scorer.jackknife, DETECTOR_PCT)
     row |= {
         "constant_accuracy_gain_pct": gain.value,
         "over_constant_dps2": difference.value,

@@ -1,4 +1,8 @@
-"""Results from tracked runs: a row for each, with seeds pooled and intervals."""
+"""Results from tracked runs: a row for each, with seeds pooled and intervals.
+
+RMSE, S and A are computed from the stored errors of the windows, so that seeds are pooled.
+Ceilings, oracle, constant, coverage and p values are read from the scores of the evaluation.
+"""
 
 import logging
 from collections.abc import Iterable, Sequence
@@ -21,8 +25,16 @@ from gyro_pipeline.scoring.scores import (
     paired_difference,
     squared_errors,
 )
-from gyro_pipeline.studies import CNN, CONSTANT, LEFT_OUT, MEAN, RunSpec, possible_runs, run_spec
-from gyro_pipeline.studies import study_rows as rows_of_study
+from gyro_pipeline.studies import (
+    CNN,
+    CONSTANT,
+    LEFT_OUT,
+    MEAN,
+    RunSpec,
+    possible_runs,
+    run_spec,
+    study_rows,
+)
 from gyro_pipeline.tracking import CURVE, ERRORS, SCORES, StoredRun
 
 logger = logging.getLogger(__name__)
@@ -44,7 +56,7 @@ BOUND_GAINS = ["oracle_accuracy_gain_pct", "constant_accuracy_gain_pct"]
 OTHERS = ["coverage_1sigma_pct", "coverage_2sigma_pct", "beats_oracle_p"]
 OTHERS += [f"prior_p_{axis}" for axis in AXES]
 OTHERS += [f"turn_on_correlation_{axes}" for axes in ("xy", "xz", "yz")]
-WARNINGS = ["below_ceiling", "prior_conflict"]
+WARNINGS = ["beyond_ceiling", "prior_conflict"]
 """Tags of a run with a warning in words."""
 
 COMPARED_WITH = (MEAN, DEFAULT, CONSTANT)
@@ -93,7 +105,7 @@ def pool_results(  # noqa: PLR0913, PLR0917 - a node's arguments are its dataset
     results: list[dict[str, Any]] = []
     curves = [pd.DataFrame(columns=_CURVES)]
     for sensor in sensors:
-        specs = rows_of_study(study, sensor, source, windows_s, seeds, only)
+        specs = study_rows(study, sensor, source, windows_s, seeds, only)
         cells = [
             Cell([spec for spec in specs if spec.window_s == window_s], finder)
             for window_s in dict.fromkeys(spec.window_s for spec in specs)
@@ -132,9 +144,9 @@ class Finder:
         """Fingerprints of the planned runs."""
         return set(self._keys.values())
 
-    def __call__(self, row: Iterable[RunSpec]) -> tuple[list[StoredRun], str]:
-        """The runs of all seeds of a row, or none and the reason."""
-        specs = dict.fromkeys(run_spec(spec, self._unseen_devices) for spec in row)
+    def __call__(self, seeds: Iterable[RunSpec]) -> tuple[list[StoredRun], str]:
+        """The runs of all seeds of a result, or none and the reason."""
+        specs = dict.fromkeys(run_spec(spec, self._unseen_devices) for spec in seeds)
         reasons = [self._left_out[spec] for spec in specs if self._left_out.get(spec)]
         keys = [self._keys.get(spec, "") for spec in specs]
         runs = [self._runs[key] for key in keys if key in self._runs]
@@ -264,7 +276,7 @@ class Cell:
             if getattr(spec, count) > fewest:
                 more, base = (squared_errors(errors_of(r), PAPER, ALL) for r in (runs, base_runs))
                 mean = self._scorer.mean_squares[PAPER, ALL]
-                change = gain_difference(more, base, mean, self._scorer.weights)
+                change = gain_difference(more, base, mean, self._scorer.jackknife)
                 row |= with_ends(f"added_{count}_pct", change)
         return row
 
@@ -281,7 +293,7 @@ class Cell:
             squares = squared_errors(table, truth, ALL)
             for name, errors in self._errors_compared.items():
                 pair = squares, squared_errors(errors, truth, ALL)
-                difference = paired_difference(*pair, self._scorer.weights, root=truth == PAPER)
+                difference = paired_difference(*pair, self._scorer.jackknife, root=truth == PAPER)
                 key = f"less_{name}_dps" + ("" if truth == PAPER else f"2_{truth}")
                 row |= with_ends(key, difference)
         return row

@@ -35,7 +35,7 @@ from gyro_pipeline.pipelines.reporting.results import (
     WARNINGS,
     column,
 )
-from gyro_pipeline.studies import CNN, CONSTANT, MEAN, RESIDUAL_NETWORK
+from gyro_pipeline.studies import CNN, CNN_SHUFFLED, CONSTANT, MEAN, RESIDUAL_NETWORK
 
 logger = logging.getLogger(__name__)
 
@@ -129,7 +129,7 @@ def _result_row(material: Material, claim: PublishedResult) -> dict[str, Any]:
     row = material.result(claim, CNN)
     others = {name: material.result(claim, name) for name in (RESIDUAL_NETWORK, CONSTANT, DEFAULT)}
     residual = others[RESIDUAL_NETWORK]
-    ours: Any = {} if row is None else row
+    result: Any = {} if row is None else row
     runs = [other.run_ids for other in (row, residual) if other is not None]
     fewer = row is not None and bool(row.real_gyros < claim.real_gyros)
     other = f" ({gyroscopes(claim)})" * fewer
@@ -137,7 +137,7 @@ def _result_row(material: Material, claim: PublishedResult) -> dict[str, Any]:
         "Approach": claim.approach,
         "Sensor": claim.sensor,
         "Source": material.source_name,
-        "Split": split(ours),
+        "Split": split(result),
         "Gyroscopes": gyroscopes(claim if row is None else row),
         "Published S/A %": f"{claim.time_saving_pct:.0f}/{claim.accuracy_gain_pct:.0f}" + other,
         "S %": interval(row, "time_saving_pct"),
@@ -153,10 +153,10 @@ def _result_row(material: Material, claim: PublishedResult) -> dict[str, Any]:
         _ORACLE_A: interval(row, "oracle_accuracy_gain_pct"),
         "Paper's way ceiling A %": interval(row, "ceiling_accuracy_gain_pct", FIRST),
         _WARM_UP: _warm_up(material, claim),
-        "Seeds": ours.get("seeds"),
-        "Spread of S over seeds": _spread(ours, "time_saving_pct"),
-        "Spread of A over seeds": _spread(ours, "accuracy_gain_pct"),
-        "Recordings": ours.get("recordings"),
+        "Seeds": result.get("seeds"),
+        "Spread of S over seeds": _spread(result, "time_saving_pct"),
+        "Spread of A over seeds": _spread(result, "accuracy_gain_pct"),
+        "Recordings": result.get("recordings"),
         "Section": claim.section,
         "Runs": " ".join(_short(ids) for ids in runs) or None,
         "Note": material.status(claim) if row is None else remark(row),
@@ -297,13 +297,14 @@ def ratios(material: Material, study: str, sensor: str) -> Exhibit | None:
     columns = [*errors.columns]
     errors.insert(1, "Source", material.source_name)
     errors = errors.assign(Split=split(rows.iloc[0]))
+    priors = dict.fromkeys(rows[rows.uses_prior.astype(bool)].estimator.map(label))
     unseen = " No estimator has seen the device that it is tested on; intervals are over devices."
     caption = (
         "RMSE over all windows against the mean of the recording, relative to that of the running "
         "mean over the same window, with 95 % intervals. A gain is one whose interval lies below "
         "1. The ceiling is that of white noise without drift or, if fitted, of the noise of the "
         f"recordings. `tables/{study}_comparison.csv` has differences, coverage and the other "
-        f"truths. Every estimator except mean, median and trimmed mean {ORIENTATION_NOTE}."
+        f"truths. Each of {', '.join(priors)} {ORIENTATION_NOTE}."
     ) + unseen * ("device" in split(rows.iloc[0]))
     title = f"{material.sensor_name(sensor)}, {study.replace('_', ' ')}: error relative to the mean"
     return Exhibit(f"{study}_{sensor}", title, caption, errors, columns)
@@ -522,7 +523,7 @@ def leakage_results(material: Material) -> Exhibit | None:
 def _leak_row(material: Material, ways: pd.DataFrame) -> dict[str, Any]:
     first = ways.iloc[0]
     claim = published_claim(material, first)
-    shuffled = ways[ways.index.get_level_values("estimator") == "cnn_shuffled"]
+    shuffled = ways[ways.index.get_level_values("estimator") == CNN_SHUFFLED]
     p_values = ways.beats_oracle_p.dropna()
     leaking = [LEAK_VARIANTS[way] for way in p_values.index[p_values < BEATS_ORACLE_P]]
     return {

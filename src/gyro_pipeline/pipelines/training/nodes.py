@@ -66,10 +66,8 @@ class TrainingSets:
         counts = spec.method, spec.real_imus, spec.virtual_imus
         if (key, counts) not in self._cache:
             rows = self.table_of(spec)
-            tested = rows.imu[rows.role == TEST].unique()
-            device = int(tested[0]) if len(tested) == 1 else UNSEEN
             self._cache[key, counts] = {
-                str(fold): self._training_set(spec, in_fold, device)
+                str(fold): self._training_set(spec, in_fold, _estimated_device(in_fold, rows))
                 for fold, in_fold in rows.groupby("fold", observed=True, sort=False)
             }
         return self._cache[key, counts]
@@ -87,9 +85,7 @@ class TrainingSets:
         return w[chosen]
 
     def _training_set(self, spec: RunSpec, rows: pd.DataFrame, device: int) -> TrainingSet:
-        """The training set of a fold, with the tested IMU first, if it trains, then others."""
-        tests = rows.imu[rows.role == TEST].unique()
-        device = int(tests[0]) if len(tests) else device
+        """The training set of a fold, with the estimated IMU first, if it trains, then others."""
         learned = rows[rows.role != TEST]
         real = sorted(
             learned.imu[learned.origin == ORIGIN_REAL].unique().tolist(),
@@ -101,10 +97,9 @@ class TrainingSets:
                 f"{spec.source} recordings hold {len(AXES) * len(real)} that train; narrow with "
                 "--params=only.real_gyros=..."
             )
-        # the model of a study on unseen devices is trained on all of them
-        additional = device == UNSEEN and len(tests) == 0
+        # the model of a study on unseen devices is trained on all of them, one more than in a fold
         imus = {
-            ORIGIN_REAL: real[: spec.real_imus + additional],
+            ORIGIN_REAL: real[: spec.real_imus + (device == UNSEEN)],
             ORIGIN_VIRTUAL: range(1, 1 + spec.virtual_imus),
         }
         used = [(learned.origin == origin) & learned.imu.isin(i) for origin, i in imus.items()]
@@ -117,6 +112,18 @@ class TrainingSets:
             device,
             tuple(imus[ORIGIN_REAL]) if spec.method == 1 else (),
         )
+
+
+def _estimated_device(fold: pd.DataFrame, table: pd.DataFrame) -> int:
+    """The IMU that a fit of a fold estimates: the one that tests, in the fold or else in any.
+
+    It is UNSEEN in a fold of all recordings if several IMUs test in the others.
+    """
+    for rows in (fold, table):
+        tested = rows.imu[rows.role == TEST].unique()
+        if len(tested):
+            return int(tested[0]) if len(tested) == 1 else UNSEEN
+    return UNSEEN
 
 
 def plan_runs(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
@@ -155,7 +162,7 @@ def plan_runs(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     for spec in run_specs(rows, study.unseen_devices):
         folds = sets.of(spec)
         content = _content(spec, sets, settings)
-        problem = _lacking(spec, sets) or _problem(spec, folds, settings)
+        problem = _missing_imu(spec, sets) or _problem(spec, folds, settings)
         if problem:
             logger.warning("%s is left out: %s", _name(spec), problem)
         runs.append(vars(spec) | {FINGERPRINT: fingerprint(content), LEFT_OUT: problem})
@@ -187,7 +194,7 @@ def _content(spec: RunSpec, sets: TrainingSets, settings: Training) -> list[Any]
         code_hash(__name__, *fitting, entry(spec.estimator)),
         {name: value for name, value in vars(spec).items() if name not in ("study", "seed")},
         [(data.attrs["data_hash"], _labels_hash(data)) for data in used],
-        {fold: _hash(training.windows) for fold, training in sets.of(spec).items()},
+        {fold: _hash(training_set.windows) for fold, training_set in sets.of(spec).items()},
         _hash(_tests(sets.table_of(spec))),
         [spec.seed, settings_of(spec.estimator, settings)] if estimator.seeded else [],
     ]
@@ -213,16 +220,16 @@ def _problem(spec: RunSpec, folds: Mapping[str, TrainingSet], settings: Training
         InputError: The settings do not fit the windows.
     """
     estimator = make_estimator(spec.estimator, settings, spec.seed)
-    for fold, training in folds.items():
+    for fold, training_set in folds.items():
         try:
-            estimator.check(training.part(estimator.uses))
+            estimator.check(training_set)
         except InputError as error:
             return f"{fold}: {spec.estimator} cannot be fitted: {error}"
-    estimator.work(next(iter(folds.values())))
+    estimator.work(next(iter(folds.values())))  # refuses a schedule without an epoch
     return ""
 
 
-def _lacking(spec: RunSpec, sets: TrainingSets) -> str:
+def _missing_imu(spec: RunSpec, sets: TrainingSets) -> str:
     """The reason why a recording cannot test: an IMU side by side with the tested one lacks it."""
     if spec.method != 1:
         return ""
@@ -237,7 +244,7 @@ def _lacking(spec: RunSpec, sets: TrainingSets) -> str:
 def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     study: Study,
     plan: pd.DataFrame,
-    tracked: list[StoredRun],
+    all_runs: list[StoredRun],
     recordings: xr.Dataset,
     windows: pd.DataFrame,
     training: Training,
@@ -251,7 +258,7 @@ def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     Args:
         study: The study.
         plan: The plan from :func:`plan_runs`.
-        tracked: All runs on these logs, of any study.
+        all_runs: All runs on these logs, of any study.
         recordings: Real recordings, which workers read only in part.
         windows: The windows table.
         training: Hyper-parameters.
@@ -269,8 +276,8 @@ def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     sets, settings = TrainingSets(windows, recordings, virtual), study.training_of(training)
     specs = possible_runs(plan)
     _check_plan(specs, sets, settings)
-    in_study = {run.fingerprint: run for run in reversed(tracked) if run.study == study.experiment}
-    trained = {run.fingerprint: run for run in reversed(tracked) if run.trained}
+    in_study = {run.fingerprint: run for run in reversed(all_runs) if run.study == study.experiment}
+    trained = {run.fingerprint: run for run in reversed(all_runs) if run.trained}
     missing = {
         key: [f for f in sets.of(spec) if key not in in_study or f not in in_study[key].fits]
         for key, spec in specs.items()
@@ -306,7 +313,7 @@ def _load_fit(run: StoredRun, fold: str) -> Estimator:
     """The fit of another study's run; a network gets its losses, which are stored separately."""
     estimator = run.load_fit(fold)
     if "train_loss" in run.metrics:
-        estimator.history = run.load(HISTORY)
+        estimator.losses = run.load(HISTORY)
     return estimator
 
 
@@ -323,6 +330,7 @@ def _fitted_run(  # noqa: PLR0917 - contents of a stored fit
     folds, attributes = sets.of(spec), sets.recordings.attrs
     is_model = fold == ALL_RECORDINGS or ALL_RECORDINGS not in folds and fold == next(iter(folds))
     tags = {"data_hash": attributes["data_hash"], "simulated": str(attributes["simulated"])}
+    tags |= {"engine": estimator.engine} if estimator.seeded else {}
     return FittedRun(
         run=RunIdentity(
             study=spec.study,
@@ -347,14 +355,14 @@ def _fitted_run(  # noqa: PLR0917 - contents of a stored fit
     )
 
 
-def _example(spec: RunSpec, training: TrainingSet, recordings: xr.Dataset) -> np.ndarray:
+def _example(spec: RunSpec, training_set: TrainingSet, recordings: xr.Dataset) -> np.ndarray:
     """A window in the shape of the estimator's input, (1, gyroscopes, samples), deg/s."""
     visible = recordings.isel(imu=slice(spec.real_imus if spec.method == 1 else 1))
     common = (visible["samples"] > 0).all("imu").to_numpy()
     first = int(common.argmax())  # the first recording that all IMUs have
-    window = visible.angular_rate.isel(recording=first, sample=slice(training.size))
+    window = visible.angular_rate.isel(recording=first, sample=slice(training_set.size))
     samples = window.transpose("imu", "axis", "sample").to_numpy()
-    return fill_masked(samples.reshape(1, -1, training.size)).astype(np.float32)
+    return fill_masked(samples.reshape(1, -1, training_set.size)).astype(np.float32)
 
 
 def _name(spec: RunSpec) -> str:

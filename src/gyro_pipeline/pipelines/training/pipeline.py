@@ -26,9 +26,10 @@ def create_pipeline(study: str, sensor: str, virtual: bool) -> Pipeline:
         data["virtual"] = f"{sensor}.virtual_gyros.recordings"
     grid = {name: f"params:{name}" for name in ("windows_s", "seeds", "only")}
     settings = {name: f"params:{name}" for name in ("splits", "virtual_gyros", "execution")}
-    runs = {"plan": f"{stage}.plan", "tracked": f"{sensor}.training.tracked"}
+    runs = {"plan": f"{stage}.plan", "all_runs": f"{sensor}.training.tracked"}
     nodes: list[tuple[str, Any, dict[str, str], str]] = [
         ("plan", plan_runs, data | grid, f"{stage}.plan"),
+        # the run store: FittedRun objects are saved, and StoredRun objects are loaded
         ("train", train, data | settings | runs, f"{stage}.runs"),
     ]
     namespace, tags = "training", [study, sensor]

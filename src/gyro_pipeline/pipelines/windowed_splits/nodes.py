@@ -20,8 +20,8 @@ from gyro_pipeline.parameters import Only, Splits, Study
 from gyro_pipeline.pipelines.windowed_splits.copies import SAMPLES as COMPARED
 from gyro_pipeline.pipelines.windowed_splits.copies import near_copies
 from gyro_pipeline.pipelines.windowed_splits.protocols import (
-    APART,
     PROTOCOLS,
+    SINGLE_ROLE_COLUMNS,
     Candidates,
     check_table,
 )
@@ -152,8 +152,8 @@ def split_windows(  # noqa: PLR0917 - a node's arguments are its datasets
             folds = table[["fold"]].drop_duplicates()
             virtual_table = _virtual_windows(virtual, size, splits).merge(folds, how="cross")
             table = pd.concat([table, virtual_table])
-        if apart := APART[protocol]:
-            check_table(table, apart, contents, drawn_from)
+        if column := SINGLE_ROLE_COLUMNS[protocol]:
+            check_table(table, column, contents, drawn_from)
         tables.append(table.assign(protocol=protocol, window_s=window_s, window_stride_s=stride_s))
     return pd.concat(tables, ignore_index=True)[WINDOWS_TABLE].astype(_COMPACT)
 
@@ -199,9 +199,10 @@ def _real_windows(  # noqa: PLR0917 - everything that a table depends on
         ]
         return pd.concat(folds, ignore_index=True).assign(origin=ORIGIN_REAL)
 
+    used = contents
     if study.recordings is not None:
-        contents = _first_recordings(contents, samples, size, imu, study)
-    windows = usable_windows(contents, samples, size, stride)
+        used = _first_recordings(contents, samples, size, imu, study)
+    windows = usable_windows(used, samples, size, stride)
     numbers = sorted(windows.recording[windows.imu == imu].unique().tolist())
     tested = table(windows)
     if not (tested.role == TEST).any():
@@ -216,7 +217,7 @@ def _real_windows(  # noqa: PLR0917 - everything that a table depends on
         first = trained.groupby(["fold", *_KEYS]).start.transform("min") == trained.start
         return pd.concat([trained[first], tested[tested.role == TEST]])
     training_stride = round(splits.training_windows * rate_hz)
-    trained = table(usable_windows(contents, samples, size, max(training_stride, 1)))
+    trained = table(usable_windows(used, samples, size, max(training_stride, 1)))
     return pd.concat([trained[trained.role != TEST], tested[tested.role == TEST]])
 
 

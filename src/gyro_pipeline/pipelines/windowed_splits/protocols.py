@@ -3,6 +3,10 @@
 Without a leak, a recording (of all IMUs, which were recorded together) or a device has only one
 role in a fold. The leaks of the leak study break this rule on purpose. One of them yields a fold
 twice, once for each role of its windows.
+
+A run has one fit for each fold. The fit to a hold-out is also the model that users load. A protocol
+of several folds ends with the fold ALL_RECORDINGS, in which nothing tests and whose fit is the
+model; leaks have no model for use, so the first fold stands for it.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,7 +33,7 @@ from gyro_pipeline.conventions import (
     InputError,
 )
 from gyro_pipeline.parameters import Splits
-from gyro_pipeline.splits import choose_validation, deal
+from gyro_pipeline.splits import choose_validation, split_at_random
 
 Texts = NDArray[np.object_]
 Folds = Iterator[tuple[str, Texts]]
@@ -64,7 +68,7 @@ def by_recording(candidates: Candidates) -> Folds:
     if len(numbers) <= splits.leave_one_out_up_to:
         parts = [[number] for number in numbers]
     else:
-        positions = deal(len(numbers), splits.folds, splits.split_seed)
+        positions = split_at_random(len(numbers), splits.folds, splits.split_seed)
         parts = [sorted(numbers[position] for position in part) for part in positions]
     others = dict.fromkeys(candidates.windows.recording.unique().tolist(), TRAIN)
     for fold, test in enumerate([*parts, []]):
@@ -76,9 +80,9 @@ def by_recording(candidates: Candidates) -> Folds:
 
 
 def k_fold(candidates: Candidates) -> Folds:
-    """Deal recordings to folds, without validation."""
+    """Assign recordings to folds at random, without validation."""
     numbers, splits = candidates.numbers, candidates.splits
-    parts = deal(len(numbers), splits.folds, splits.split_seed)
+    parts = split_at_random(len(numbers), splits.folds, splits.split_seed)
     for fold, part in enumerate([*parts, np.array([], np.intp)]):
         test = {numbers[position] for position in part}
         roles = {number: TEST if number in test else TRAIN for number in numbers}
@@ -112,10 +116,11 @@ def leave_one_device_out(candidates: Candidates) -> Folds:
 
 
 def window_split(candidates: Candidates) -> Folds:
-    """Leak: windows are dealt at random, so test windows share recordings with training ones."""
+    """Leak: windows are assigned at random, so test windows share recordings with training ones."""
     of_tested = np.flatnonzero(candidates.windows.imu == candidates.tested)
     splits = candidates.splits
-    for fold, part in enumerate(deal(len(of_tested), splits.folds, splits.split_seed)):
+    parts = split_at_random(len(of_tested), splits.folds, splits.split_seed)
+    for fold, part in enumerate(parts):
         roles = np.where(candidates.windows.imu == candidates.tested, TRAIN, UNUSED).astype(object)
         roles[of_tested[part]] = TEST
         yield f"fold {fold}", roles
@@ -146,7 +151,7 @@ PROTOCOLS: Mapping[str, Callable[[Candidates], Folds]] = {
 }
 """Protocols by their name in the setting ``protocol`` of a study."""
 
-APART: Mapping[str, str | None] = {
+SINGLE_ROLE_COLUMNS: Mapping[str, str | None] = {
     BY_RECORDING: "recording",
     LEAVE_ONE_DEVICE_OUT: "imu",
     K_FOLD: "recording",
@@ -158,14 +163,15 @@ APART: Mapping[str, str | None] = {
 
 
 def check_table(
-    table: pd.DataFrame, apart: str, contents: pd.DataFrame, drawn_from: Sequence[int]
+    table: pd.DataFrame, single_role: str, contents: pd.DataFrame, drawn_from: Sequence[int]
 ) -> None:
     """Refuse a windows table that breaks the rules of protocols without leaks.
 
     Args:
         table: Columns ``fold, role, origin, imu, recording`` and more.
-        apart: Column whose values have one role in a fold: ``recording`` or ``imu``.
-        contents: A row per real recording: ``imu, recording, copies``, from
+        single_role: Column whose values have one role in a fold: ``recording`` or ``imu``.
+        contents: A row per real recording: ``imu, recording``, and ``copies``, the positions of
+            the rows of its copies, each with its correlation; from
             :func:`gyro_pipeline.pipelines.windowed_splits.nodes.cut_to_common_length`.
         drawn_from: Real recordings from which the virtual ones were drawn.
 
@@ -177,7 +183,7 @@ def check_table(
     keys = table.drop_duplicates(["fold", "role", "origin", "imu", "recording"])
     for fold, rows in keys.groupby("fold", observed=True, sort=False):
         real = rows[rows.origin == ORIGIN_REAL]
-        _refuse_two_roles(str(fold), real, apart)
+        _refuse_two_roles(str(fold), real, single_role)
         _refuse_copies(str(fold), real, contents)
         tests = set(real.recording[real.role == TEST])
         leaked = sorted(tests & set(drawn_from)) if len(real) < len(rows) else []
@@ -194,16 +200,16 @@ def check_table(
             )
 
 
-def _refuse_two_roles(fold: str, rows: pd.DataFrame, apart: str) -> None:
-    if apart == "imu":  # a device that does not test may train and validate
+def _refuse_two_roles(fold: str, rows: pd.DataFrame, column: str) -> None:
+    if column == "imu":  # a device that does not test may train and validate
         rows = rows.assign(role=np.where(rows.role == TEST, TEST, TRAIN))
-    roles = rows.drop_duplicates([apart, "role"]).groupby(apart, observed=True).role
+    roles = rows.drop_duplicates([column, "role"]).groupby(column, observed=True).role
     for name, of_name in roles:
         if len(of_name) > 1:
-            uses = rows[rows[apart] == name].groupby("role", observed=True).imu.unique()
+            uses = rows[rows[column] == name].groupby("role", observed=True).imu.unique()
             texts = (f"{role} (IMU {', '.join(map(str, imus))})" for role, imus in uses.items())
             raise InputError(
-                f"{fold}: {apart} {name} has more than one role: {', '.join(texts)}; a recording "
+                f"{fold}: {column} {name} has more than one role: {', '.join(texts)}; a recording "
                 "trains, validates or tests, for all IMUs recorded together, and an unseen device "
                 "never trains"
             )
