@@ -295,6 +295,24 @@ def rms(errors: Array) -> float:
     return float(np.sqrt(np.mean(errors**2)))
 
 
+def learning_limit(optimum: float) -> float:
+    """The least RMSE over the optimum for (c) in the world *warm-up*, if its means are learned.
+
+    The means of bias and amplitude on each axis, and the time constant, which the axes share, are
+    unknown; spreads and noise are known. The Cramer-Rao bound of the mean bias, from the recordings
+    to learn from, adds to the square of the optimum.
+    """
+    shape = np.exp(-TIME_S / 30)
+    unknown = np.stack([np.ones(SAMPLES), shape, 5 * shape * TIME_S / 30**2], axis=1)
+    covariance = np.sum([part.covariance for part in WORLDS["warm-up"].parts], axis=0) + SPREAD**2
+    information = TRAINED * unknown.T @ linalg.solve(covariance, unknown, assume_a="pos")
+    of_means, shared = information[:2, :2], information[:2, 2]
+    moved = linalg.solve(of_means, shared)
+    variance = linalg.inv(of_means)[0, 0]
+    variance += moved[0] ** 2 / (len(AXES) * (information[2, 2] - shared @ moved))
+    return float(np.sqrt(1 + variance / optimum**2))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("--worlds", nargs="+", default=list(WORLDS), choices=list(WORLDS))
@@ -310,6 +328,10 @@ def main() -> None:
         warns = "yes" if arena.warns else ""
         row = [name, arena.world.optimum, limits, warns, *cells]
         print(f"| {' | '.join(row)} |", flush=True)
+        if name == "warm-up":
+            limit = learning_limit(arena.optimum["c"])
+    if "warm-up" in asked.worlds:
+        print(f"\nwarm-up, (c): at least {limit:.2f} if mean and time constant are learned")
 
 
 if __name__ == "__main__":
