@@ -1,4 +1,4 @@
-"""Links in Markdown files outside docs/ lead to files and headings; MkDocs checks those in docs/."""
+"""Links in Markdown files outside docs/ lead somewhere; MkDocs checks those in docs/."""
 
 import re
 from pathlib import Path

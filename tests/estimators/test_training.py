@@ -114,7 +114,7 @@ def test_keys_tell_training_sets_and_recordings_apart(training):
 def test_recordings_of_a_file_are_read_once_for_all_folds_and_go_to_a_worker_as_references(
     tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(module, "_FILE_CACHE", module._ArrayCache())
+    monkeypatch.setattr(module, "_FILE_CACHE", module._array_cache())
     drawn().to_netcdf(tmp_path / "recordings.nc", engine="h5netcdf")
     filed = xr.open_dataset(tmp_path / "recordings.nc", engine="h5netcdf")
     windows = table((TRAIN, ORIGIN_REAL, 1, range(1, 7), [0]))

@@ -1,7 +1,6 @@
 """Training sets: windows and recordings to learn from, and figures that estimators share."""
 
 import hashlib
-from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from functools import cached_property
 from typing import Any
@@ -9,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import xarray as xr
+from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import (
@@ -31,7 +31,7 @@ from gyro_pipeline.physics.allan import (
 from gyro_pipeline.physics.bias import fill_masked
 
 _CACHE_BYTES = 512 << 20
-"""Limit of the recordings from files that are cached in each process."""
+"""Bytes of recordings from files that each process caches."""
 
 Imu = tuple[str, int]
 """Origin and number of an IMU."""
@@ -204,7 +204,7 @@ class ImuRecordings:
         self.sample_count = int(recordings.sizes["sample"])
         in_file = not recordings.angular_rate.variable._in_memory
         self._from_file = in_file and "data_hash" in recordings.attrs
-        self._cache = _FILE_CACHE if self._from_file else _ArrayCache()
+        self._cache = _FILE_CACHE if self._from_file else _array_cache()
 
     @property
     def rates(self) -> NDArray[np.floating]:
@@ -238,25 +238,25 @@ class ImuRecordings:
     ) -> list[NDArray[np.float64]]:
         """A figure of each recording, from the cache or computed now."""
         keys = [(name, *self._key(number)) for number in self.numbers.tolist()]
-        arrays = self._cache.get(keys)
-        if arrays is None:
-            arrays = [compute(samples) for samples in self._read()]
-            self._cache.put(keys, arrays)
+        if all(key in self._cache for key in keys):
+            return [self._cache[key] for key in keys]
+        arrays = [compute(samples) for samples in self._read()]
+        self._cache.update(zip(keys, arrays, strict=True))
         return arrays
 
     def _read(self) -> list[NDArray[np.floating]]:
         """The samples of each recording, (axes, samples), NaN where masked."""
         keys = [("samples", *self._key(number)) for number in self.numbers.tolist()]
-        arrays = self._cache.get(keys)
-        if arrays is None:
-            rates = self._recordings.angular_rate.sel(imu=self._imu)
-            rows = rates.get_index("recording").get_indexer(pd.Index(self.numbers))
-            # reading a range is far faster than reading single recordings
-            part = rates.isel(recording=slice(int(rows.min()), int(rows.max()) + 1))
-            samples = part.transpose("recording", "axis", "sample").to_numpy()
-            arrays = [samples[row] for row in rows - rows.min()]
-            if self._from_file:
-                self._cache.put(keys, [array.copy() for array in arrays])
+        if all(key in self._cache for key in keys):
+            return [self._cache[key] for key in keys]
+        rates = self._recordings.angular_rate.sel(imu=self._imu)
+        rows = rates.get_index("recording").get_indexer(pd.Index(self.numbers))
+        # reading a range is far faster than reading single recordings
+        part = rates.isel(recording=slice(int(rows.min()), int(rows.max()) + 1))
+        samples = part.transpose("recording", "axis", "sample").to_numpy()
+        arrays = [samples[row] for row in rows - rows.min()]
+        if self._from_file and samples[0].nbytes <= _CACHE_BYTES:
+            self._cache.update((key, array.copy()) for key, array in zip(keys, arrays, strict=True))
         return arrays
 
     def _key(self, number: int) -> tuple[Hashable, ...]:
@@ -289,29 +289,8 @@ def _mean(samples: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.asarray(fill_masked(samples).mean(axis=-1, dtype=np.float64))
 
 
-class _ArrayCache:
-    """Arrays by key; the least recently used ones are dropped beyond ``_CACHE_BYTES``."""
-
-    def __init__(self) -> None:
-        self._arrays: OrderedDict[Hashable, NDArray[Any]] = OrderedDict()
-        self._bytes = 0
-
-    def get(self, keys: Sequence[Hashable]) -> list[NDArray[Any]] | None:
-        """Arrays, if all of them are cached."""
-        if any(key not in self._arrays for key in keys):
-            return None
-        for key in keys:
-            self._arrays.move_to_end(key)
-        return [self._arrays[key] for key in keys]
-
-    def put(self, keys: Sequence[Hashable], arrays: Sequence[NDArray[Any]]) -> None:
-        """Store arrays."""
-        for key, array in zip(keys, arrays, strict=True):
-            self._bytes += array.nbytes - (self._arrays[key].nbytes if key in self._arrays else 0)
-            self._arrays[key] = array
-        while self._bytes > _CACHE_BYTES:
-            _, dropped = self._arrays.popitem(last=False)
-            self._bytes -= dropped.nbytes
+def _array_cache() -> LRUCache[Hashable, NDArray[Any]]:
+    return LRUCache(_CACHE_BYTES, getsizeof=lambda array: array.nbytes)
 
 
-_FILE_CACHE = _ArrayCache()
+_FILE_CACHE = _array_cache()
