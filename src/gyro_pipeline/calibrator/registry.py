@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 from filelock import FileLock, Timeout
 
-from gyro_pipeline.calibrator.calibrator import Calibrator
 from gyro_pipeline.calibrator.device_types import validated
 from gyro_pipeline.calibrator.history import STILL, Calibration
+from gyro_pipeline.calibrator.stretch import Setup
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 
 VARIABLE = "GYRO_CALIBRATE_REGISTRY"
@@ -61,11 +61,6 @@ def registry_folder(path: str | Path | None = None) -> Path:
     return Path(platformdirs.user_data_dir("gyro-calibrate"))
 
 
-def devices(registry: Path) -> list["Device"]:
-    """All devices of a registry, by name."""
-    return [Device(registry, path.parent.name) for path in sorted(registry.glob("*/device.toml"))]
-
-
 class Device:
     """The folder of a device.
 
@@ -82,6 +77,11 @@ class Device:
         self.lines_path = self.folder / "calibrations.jsonl"
         self.settings_path = self.folder / "device.toml"
         self.model_path = self.folder / "model.json"
+
+    @classmethod
+    def all(cls, registry: Path) -> "list[Device]":
+        """All devices of a registry, by name."""
+        return [cls(registry, path.parent.name) for path in sorted(registry.glob("*/device.toml"))]
 
     def settings(self) -> dict[str, Any]:
         """The content of ``device.toml``; empty where there is none."""
@@ -144,9 +144,9 @@ class Device:
             _append(self.lines_path, data)
         return True
 
-    def write_model(self, calibrator: Calibrator) -> None:
+    def write_model(self, setup: Setup) -> None:
         """Replace ``model.json``, which people and other programs read, by the current model."""
-        setup, fitted = calibrator.setup, calibrator.best.prior.fitted or ({},) * len(AXES)
+        fitted = setup.unseen_prior.fitted or ({},) * len(AXES)
         noise = setup.noise_factor * setup.noise.white / MDPS
         freedom = np.maximum(setup.noise_prior[1], 1e-9)
         sigma = noise / np.sqrt(2 * freedom)

@@ -37,6 +37,12 @@ many calibrations (Ville's inequality); half as often in simulations."""
 
 BLOCK_S = 0.5
 
+LEAST_S, LEAST_UNKNOWN_S = 1.0, 10.0
+"""Seconds at rest before a target counts as reached, with known and with unknown noise."""
+
+LONGEST_S = 3600.0
+"""The longest time at rest that is predicted as seconds left."""
+
 _MIN_BLOCK_SAMPLES = 5  # fewer do not show the noise
 _TEMPERATURE_STEP_C = 0.5  # after which the prior is computed again
 _LOOKAHEAD_BLOCKS = 64  # that are predicted at a time
@@ -51,6 +57,7 @@ class Setup:
     rate_hz: float
     history: Sequence[Calibration]  # the oldest first
     now: Circumstances
+    target_dps: float = np.inf  # infinite without a target
 
     def __post_init__(self) -> None:
         size = max(round(BLOCK_S * self.rate_hz), _MIN_BLOCK_SAMPLES)  # samples in a block
@@ -58,6 +65,8 @@ class Setup:
         # N^2 relative to the type, (3,), and its degrees of freedom: infinite where N is known, 0
         # where it is not.
         self.noise_prior = noise_of(self.history, self.device_type)
+        self.noise_known = bool(np.all(self.noise_prior[1] > 0))
+        self.least_s = LEAST_S if self.noise_known else LEAST_UNKNOWN_S
         self.noise_factor = np.sqrt(self.noise_prior[0])
         # standard deviation of a block mean
         self.white = self.noise_factor * self.noise.white / np.sqrt(self.block_s)
@@ -330,31 +339,36 @@ class Stretch:
         """Floor of the standard deviation of any average of the sensor, (3,), deg/s."""
         return np.asarray(self.setup.noise.floor_dps * np.sqrt(self.noise_scale[0]))
 
-    def reached(self, target_dps: float) -> Mask:
-        """Whether an axis is at the target, (3,); below the floor only with a history."""
-        below = (self.floor_dps > target_dps) & ~self.usable
-        return np.asarray((self.variance <= target_dps**2) & ~below)
+    @property
+    def below_floor(self) -> Mask:
+        """Whether the target is below the floor of an axis without a history, (3,)."""
+        return np.asarray((self.floor_dps > self.setup.target_dps) & ~self.usable)
 
-    def seconds_left(self, target_dps: float, most_s: float) -> Array:
-        """Seconds at rest until the target, (3,); infinite where it takes more than ``most_s``.
+    @property
+    def reached(self) -> Mask:
+        """Whether an axis is at the target, (3,)."""
+        return np.asarray((self.variance <= self.setup.target_dps**2) & ~self.below_floor)
+
+    def seconds_left(self) -> Array:
+        """Seconds at rest until the target, (3,); infinite where that takes over ``LONGEST_S``.
 
         The variances of future blocks do not depend on the data. The distance from the history and
         an unknown noise do, and are assumed to stay as they are now.
         """
-        below = (self.floor_dps > target_dps) & ~self.usable
-        seconds = np.where(self.reached(target_dps), 0.0, np.inf)
+        setup, seconds = self.setup, np.where(self.reached, 0.0, np.inf)
         start = self.estimate.start if self.blocks else np.where(self.usable, self.prior.mean, 0.0)
         (scale, freedom), following, count = self.noise_scale, self.filter, 0
-        while np.any(np.isinf(seconds) & ~below) and count * self.setup.block_s < most_s:
+        open_axes = ~self.below_floor
+        while np.any(np.isinf(seconds) & open_axes) and count * setup.block_s < LONGEST_S:
             following, stack = following.ahead(_LOOKAHEAD_BLOCKS)
             number = count + 1 + np.arange(_LOOKAHEAD_BLOCKS)[:, None]
             later = self._scaled(stack.estimate(), scale, freedom + number)
             later = later._replace(start=np.broadcast_to(start, (_LOOKAHEAD_BLOCKS, 3)))
-            reached = self._posterior(later)[1] <= target_dps**2
+            reached = self._posterior(later)[1] <= setup.target_dps**2
             first = np.where(reached.any(axis=0), count + 1 + reached.argmax(axis=0), np.inf)
-            seconds = np.minimum(seconds, first * self.setup.block_s)
+            seconds = np.minimum(seconds, first * setup.block_s)
             count += _LOOKAHEAD_BLOCKS
-        return np.where(below, np.inf, seconds)
+        return np.where(open_axes, seconds, np.inf)
 
 
 def _temperature_rise(start: float, end: float) -> float:
