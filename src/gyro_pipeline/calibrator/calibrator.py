@@ -20,8 +20,9 @@ from gyro_pipeline.calibrator.filter import Array
 from gyro_pipeline.calibrator.history import MOVING, STILL, UNSURE, Calibration, Circumstances
 from gyro_pipeline.calibrator.reasons import Reason, reason, reasons_of, unit_reason
 from gyro_pipeline.calibrator.rest import ATTITUDE, MOTION, NOISE, Alarm, Blocks
-from gyro_pipeline.calibrator.stretch import BLOCK_S, LEAST_S, Mask, Setup, Stretch
+from gyro_pipeline.calibrator.stretch import BLOCK_S, LEAST_S, Setup, Stretch
 from gyro_pipeline.conventions import AXES, MDPS, InputError
+from gyro_pipeline.quality.rest import Mask
 
 _JUMP_S = 3600.0  # a clock that moves by more has jumped
 _DEAD_BLOCKS = 4  # in a row without any change on an axis
@@ -259,7 +260,7 @@ class Calibrator:
             rows[4:7] = np.atleast_2d(accel_g).T
         if temperature_c is not None:
             rows[7] = temperature_c
-        finite, zero = np.isfinite(rows[:4].sum(axis=0)), ~rows[1:4].any(axis=0)
+        finite, zero = np.isfinite(rows[:4]).all(axis=0), ~rows[1:4].any(axis=0)
         invalid = {"not_finite": int(np.sum(~finite)), "zero": int(np.sum(zero))}
         self.counts.update(samples=len(rates), **invalid)
         if len(rates) and np.isfinite(rows[0, -1]):
@@ -332,8 +333,8 @@ class Calibrator:
         motion, note = [mean], None
         if not self._motion_blocks:
             if self._previous is not None:
-                motion.append(self.stretch.last_mean)
                 self.stretch, blocks = self._previous
+                motion.append(blocks.mean[-1])
                 while len(blocks.mean) > 1:
                     self.stretch, count, _ = self.stretch.update(blocks.part(0, -1))
                     blocks = blocks.part(count)

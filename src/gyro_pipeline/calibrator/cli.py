@@ -7,6 +7,7 @@ The exit code is the highest of all files: 0 done; 2 usage; 3 target not reached
 import hashlib
 import json
 import re
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -35,7 +36,6 @@ DONE, USAGE, NOT_REACHED, NOT_AT_REST, NO_HISTORY, UNUSABLE, NOT_STORED = 0, 2, 
 
 
 def _posix_seconds(_: click.Context, __: click.Parameter, text: str | None) -> float | None:
-    """A time in ISO 8601 as POSIX seconds."""
     try:
         return datetime.fromisoformat(text).timestamp() if text else None
     except ValueError as error:
@@ -77,8 +77,6 @@ _READING = tuple(
 
 
 def _with(*options: Any) -> Callable[[Any], Any]:
-    """Add options to a command."""
-
     def add(command: Any) -> Any:
         for add_option in reversed(options):
             command = add_option(command)
@@ -177,7 +175,6 @@ def log(files: tuple[Path, ...], **values: Any) -> int:
 
 
 def _calibrate(path: Path, job: SimpleNamespace) -> int:
-    """Calibrate from a file; returns the exit code."""
     from gyro_pipeline.readers import read_log  # noqa: PLC0415
 
     try:
@@ -199,7 +196,6 @@ def _calibrate(path: Path, job: SimpleNamespace) -> int:
 
 
 def _feed(calibrator: Calibrator, recording: Any, chunk_s: float) -> list[State]:
-    """Feed a log in chunks; returns the state after each."""
     count, rate_hz = len(recording.samples), calibrator.setup.rate_hz
     times = np.arange(count) / rate_hz
     for row in recording.gap_rows:  # a log does not say how long a gap is
@@ -217,7 +213,7 @@ def _report(
 ) -> int:
     """Print, plot and store the result; returns the exit code."""
     state = calibrator.finish()
-    code = _exit_code(state, job)
+    code = _exit_code(state, job.require_history)
     if job.as_json or code != UNUSABLE:
         result = output.as_json(state, job.opening["device"], source=name)
         _print(job.as_json, result, output.as_text(state))
@@ -227,25 +223,26 @@ def _report(
     if job.plot:
         output.plot(job.plot, [*states, state])
     if job.device is not None and code != UNUSABLE:
-        calibration = replace(
-            calibrator.calibration(), hash=source, source=name, version=gyro_pipeline.__version__
-        )
-        if not job.device.append(calibration):
-            _remark(f"{name} is stored already; it is not stored again")
-            return code
-        rate_hz = calibrator.setup.rate_hz
-        try:
-            job.device.write_model(Calibrator.open(rate_hz=rate_hz, **job.opening).setup)
-        except RegistryError as error:
-            _remark(f"{name} is stored, but model.json was not updated: {error}")
+        _store(calibrator, job, source, name)
     return code
 
 
-def _exit_code(state: State, job: SimpleNamespace) -> int:
-    """The exit code of a result."""
+def _store(calibrator: Calibrator, job: SimpleNamespace, source: str, name: str) -> None:
+    version, rate_hz = gyro_pipeline.__version__, calibrator.setup.rate_hz
+    stored = replace(calibrator.calibration(), hash=source, source=name, version=version)
+    if not job.device.append(stored):
+        _remark(f"{name} is stored already; it is not stored again")
+        return
+    try:
+        job.device.write_model(Calibrator.open(rate_hz=rate_hz, **job.opening).setup)
+    except RegistryError as error:
+        _remark(f"{name} is stored, but model.json was not updated: {error}")
+
+
+def _exit_code(state: State, require_history: bool) -> int:
     if any(reason.code in UNUSABLE_CODES for reason in state.reasons):
         return UNUSABLE
-    if job.require_history and not all(outcome == USED for outcome in state.history):
+    if require_history and set(state.history) != {USED}:
         return NO_HISTORY
     if state.rest != STILL:
         return NOT_AT_REST
@@ -314,7 +311,7 @@ def _heading_mdps(text: str) -> float:
     """A rate such as 1deg/h, in mdps."""
     from gyro_pipeline.units import read_unit  # noqa: PLC0415
 
-    match = re.fullmatch(r"([\d.]+) *(.+)", text)
+    match = re.fullmatch(r"(\d+\.?\d*|\.\d+) *(.+)", text)
     unit = read_unit(match[2]) if match else None
     if match is None or unit is None or unit.quantity != "rate":
         raise InputError(f"--heading: expected a rate such as 1deg/h, got {text!r}")
@@ -389,7 +386,7 @@ def forget(name: str, source: str | None, everything: bool, registry: Path) -> N
     """Withdraw a calibration by the name or hash of its file; it stays stored without counting."""
     device = _existing_device(registry, name)
     if everything:
-        device.remove()
+        shutil.rmtree(device.folder)
         return
     stored = device.calibrations()
     matches = {key for key in stored if source and key.startswith(source)}

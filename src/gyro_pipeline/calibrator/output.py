@@ -67,7 +67,6 @@ def target_mdps(state: State) -> float:
 
 
 def _summary(state: State) -> str:
-    """The time at rest, motions that were cut, the temperature and the history."""
     cut = ", ".join(f"{r.value:.1f} s" for r in state.reasons if r.code == "cut")
     text = "" if state.rest == STILL else f"not at rest ({state.rest}): "
     text += f"at rest for {state.seconds_at_rest:.1f} of {state.time_s:.1f} s"
@@ -96,18 +95,20 @@ def _sources(state: State, axis: int) -> str:
         variances = stretch.estimate.variance[axis], stretch.prior.narrow[axis]
         log, history = np.sqrt(variances) / MDPS
         return f"this log {log:.2f}, history {history:.2f}"
-    conflicts = [r for r in state.reasons if r.code == "conflict" and r.axis == AXES[axis]]
-    return f"this log alone: {conflicts[0].sentence}" if conflicts else "this log"
+    for reason in state.reasons:
+        if (reason.code, reason.axis) == ("conflict", AXES[axis]):
+            return f"this log alone: {reason.sentence}"
+    return "this log"
 
 
 def _time_left(state: State) -> str:
-    """The seconds that each axis still needs."""
-    floors = {r.axis: f", below its floor of {r.value:.2g}" for r in state.reasons
-              if r.code == "floor"}  # fmt: skip
+    floors = {r.axis: r.value for r in state.reasons if r.code == "floor"}
     target, parts = f"{target_mdps(state):g} mdps", []
     for name, seconds in zip(AXES, state.seconds_left, strict=True):
         if np.isinf(seconds):
-            why = floors.get(name, " within an hour")
+            why = (
+                f", below its floor of {floors[name]:.2g}" if name in floors else " within an hour"
+            )
             parts.append(f"{name} does not reach {target}{why}")
         elif seconds:
             parts.append(f"{name} needs {math.ceil(seconds)} s more at rest for {target}")
@@ -161,9 +162,7 @@ def device_table(device: Device) -> Iterator[str]:
 def plot(path: Path, states: Sequence[State]) -> None:
     """Plot the running estimate with its limits, the history, the stop and motions that were cut.
 
-    Args:
-        path: File to write; its suffix sets the format.
-        states: About one for each second; the last one is the final result.
+    The suffix of the file sets its format, and the last state is the final result.
 
     Raises:
         InputError: matplotlib is not installed.

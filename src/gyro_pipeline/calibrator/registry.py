@@ -1,18 +1,12 @@
 """The registry of devices: each has a folder, and its history is append-only.
 
-    <registry>/<device>/device.toml         written by people: type, mounted, latitude, frame, notes
-                        calibrations.jsonl  a line for each calibration, note or withdrawal
-                        model.json          derived: noise, level, tau, walk, slope
-    <registry>/types/<type>.json
-
-A line is written in one call, under a lock, and synced before the call returns. A line that a crash
-cut off is ignored, and the next one starts on a new line.
+docs/calibrator.md lists the files. A line is written in one call, under a lock, and synced before
+the call returns. A line that a crash cut off is ignored, and the next one starts on a new line.
 """
 
 import json
 import os
 import re
-import shutil
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -190,10 +184,6 @@ class Device:
         for line in lines:
             if line not in stored:
                 self.append(line)
-
-    def remove(self) -> None:
-        """Remove the folder with its content."""
-        shutil.rmtree(self.folder)
 
     @contextmanager
     def _locked(self) -> Iterator[None]:

@@ -7,7 +7,7 @@ from statistics import NormalDist
 from typing import NamedTuple, SupportsIndex
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from gyro_pipeline.calibrator.device_types import DeviceType
 from gyro_pipeline.calibrator.filter import Array, Estimate, Filter
@@ -27,9 +27,7 @@ from gyro_pipeline.calibrator.reasons import VERTICAL, Reason, reason
 from gyro_pipeline.calibrator.rest import Alarm, Blocks, RestMonitor
 from gyro_pipeline.conventions import MDPS
 from gyro_pipeline.physics.mixture import log_e, log_ratios, mixture_posterior
-from gyro_pipeline.quality.rest import student_limits
-
-Mask = NDArray[np.bool_]
+from gyro_pipeline.quality.rest import Mask, student_limits
 
 CONFLICT = 120.0
 """The e-value at which the history is dropped. A right history is dropped in at most one of this
@@ -116,7 +114,6 @@ class Stretch:
     notes: tuple[Reason, ...] = ()  # motions that were cut, conflicts
     gravity: Array = field(default_factory=lambda: np.zeros(4))  # sum over blocks, and their number
     temperature: Temperature = Temperature()
-    last_mean: Array = field(default_factory=lambda: np.zeros(3))  # of the last block
 
     @classmethod
     def start(cls, setup: Setup, start_s: float) -> "Stretch":
@@ -204,7 +201,6 @@ class Stretch:
             monitor=monitor,
             gravity=np.add.accumulate(np.vstack([self.gravity, added]))[-1],
             temperature=temperature,
-            last_mean=blocks.mean[-1],
         )
 
     def cut(self, seconds: float, motion: Reason | None) -> "Stretch":
