@@ -84,7 +84,7 @@ class State:
     @cached_property
     def reasons(self) -> tuple[Reason, ...]:
         """Remarks on the result, the most important first."""
-        return tuple(reasons_of(self.counts, self.ended, self.stretch))
+        return tuple(reasons_of(self))
 
 
 class Calibrator:

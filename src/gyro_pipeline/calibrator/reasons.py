@@ -1,6 +1,5 @@
 """Remarks on a result: codes for programs, sentences for people."""
 
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, SupportsIndex
@@ -10,6 +9,7 @@ import numpy as np
 from gyro_pipeline.conventions import AXES, MDPS
 
 if TYPE_CHECKING:
+    from gyro_pipeline.calibrator.calibrator import State
     from gyro_pipeline.calibrator.stretch import Stretch
 
 UNUSABLE_CODES = {"dead", "unit"}
@@ -101,11 +101,10 @@ def unit_reason(factor: float, name: str) -> Reason | None:
     return reason("unit", factor, _UNIT_FACTOR, **words)
 
 
-def reasons_of(
-    counts: Counter[str], ended: dict[str, Reason], stretch: "Stretch"
-) -> Iterator[Reason]:
+def reasons_of(state: "State") -> Iterator[Reason]:
     """All remarks on a result, the most important first."""
-    yield from ended.values()
+    counts, stretch = state.counts, state.stretch
+    yield from state.ended.values()
     for code in ("zero", "not_finite"):
         if 0 < counts[code] < counts["samples"]:
             yield reason(code, counts[code], counts["samples"])

@@ -71,15 +71,6 @@ class Setup:
         # for an unknown attitude and temperature
         self.unseen_prior = prior_of(self.history, self.device_type, self.now)
 
-    def prior(self, up: Array | None, celsius: float, trust_heading: bool) -> Prior:
-        """The prior at an attitude and a temperature, with or without the declared heading."""
-        if up is None and np.isnan(celsius) and trust_heading:
-            return self.unseen_prior
-        temperature_c = celsius if np.isfinite(celsius) else None
-        same_heading = self.now.same_heading and trust_heading
-        now = replace(self.now, up=up, temperature_c=temperature_c, same_heading=same_heading)
-        return prior_of(self.history, self.device_type, now)
-
 
 class Temperature(NamedTuple):
     """Temperature of the blocks of a stretch, degrees Celsius; NaN where it is unknown."""
@@ -214,12 +205,19 @@ class Stretch:
 
     def turned_deg(self, rotation: Array, gravity: Array) -> float:
         """The angle of a turn during a motion, from the integrated rates (3,) or from gravity."""
-        measured = self.up is not None and np.isfinite(gravity).all()
-        tilt = angle_deg(gravity, self.up) if measured and self.up is not None else 0.0
-        return max(float(np.linalg.norm(rotation)), tilt)
+        turn = float(np.linalg.norm(rotation))
+        if self.up is None or not np.isfinite(gravity).all():
+            return turn
+        return max(turn, angle_deg(gravity, self.up))
 
     def _with_prior(self, up: Array | None, celsius: float, trust_heading: bool) -> "Stretch":
-        prior = self.setup.prior(up, celsius, trust_heading)
+        """The stretch with the prior at an attitude and a temperature."""
+        setup, prior = self.setup, self.setup.unseen_prior
+        if up is not None or not np.isnan(celsius) or not trust_heading:
+            temperature_c = celsius if np.isfinite(celsius) else None
+            same_heading = setup.now.same_heading and trust_heading
+            now = replace(setup.now, up=up, temperature_c=temperature_c, same_heading=same_heading)
+            prior = prior_of(setup.history, setup.device_type, now)
         return replace(self, prior=prior, prior_c=celsius, trust_heading=trust_heading)
 
     def _first_conflict(
@@ -288,12 +286,16 @@ class Stretch:
     @cached_property
     def bias(self) -> Array:
         """The bias in the last block, (3,), deg/s; the settled one where the device warms up."""
-        return self._posterior(self.estimate)[0] + self.prior.slope * self._rise_c
+        return self._at_mean_temperature[0] + self.prior.slope * self._rise_c
 
     @cached_property
     def variance(self) -> Array:
         """Variance of the bias, (3,), (deg/s)^2."""
-        return self._posterior(self.estimate)[1] + (self.prior.slope_sigma * self._rise_c) ** 2
+        return self._at_mean_temperature[1] + (self.prior.slope_sigma * self._rise_c) ** 2
+
+    @cached_property
+    def _at_mean_temperature(self) -> tuple[Array, Array]:
+        return self._posterior(self.estimate)
 
     @property
     def _rise_c(self) -> float:
