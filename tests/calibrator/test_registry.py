@@ -6,10 +6,11 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 
 import pytest
 
-from gyro_pipeline.calibrator import Calibrator, registry
+from gyro_pipeline.calibrator import Calibration, Calibrator, registry
 from gyro_pipeline.calibrator.registry import Device, RegistryError
 from gyro_pipeline.conventions import InputError
 
@@ -19,13 +20,8 @@ def opened(device, registry, **options):
 
 
 def line(number, **more):
-    return {
-        "event": "calibration", "hash": f"{number:04d}", "source": f"{number}.csv", "time": None,
-        "rest": "still", "schema": 1, "mean_dps": [0.1, 1 / 3, number * 1e-3],
-        "variance_dps2": [1e-6] * 3,
-        "temperature_c": None, "gravity": None, "outcome": ["none"] * 3, "noise_mdps_rts": None,
-        "noise_freedom": 0, "seconds": 10.0, **more,
-    }  # fmt: skip
+    made = {"seconds": 10.0, "hash": f"{number:04d}", "source": f"{number}.csv"}
+    return asdict(Calibration((0.1, 1 / 3, number * 1e-3), (1e-6,) * 3, **made)) | more
 
 
 @pytest.fixture

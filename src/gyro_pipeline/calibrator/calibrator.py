@@ -20,14 +20,9 @@ from gyro_pipeline.calibrator.filter import Array
 from gyro_pipeline.calibrator.history import MOVING, STILL, UNSURE, Calibration, Circumstances
 from gyro_pipeline.calibrator.reasons import Reason, reason, reasons_of, unit_reason
 from gyro_pipeline.calibrator.rest import ATTITUDE, MOTION, NOISE, Alarm, Blocks
-from gyro_pipeline.calibrator.stretch import BLOCK_S, Mask, Setup, Stretch
+from gyro_pipeline.calibrator.stretch import BLOCK_S, LEAST_S, Setup, Stretch
 from gyro_pipeline.conventions import AXES, MDPS, InputError
-
-LEAST_S, LEAST_UNKNOWN_S = 1.0, 10.0
-"""Seconds at rest before a target counts as reached, with known and with unknown noise."""
-
-LONGEST_S = 3600.0
-"""The longest time at rest that is predicted as seconds left."""
+from gyro_pipeline.quality.rest import Mask
 
 _JUMP_S = 3600.0  # a clock that moves by more has jumped
 _DEAD_BLOCKS = 4  # in a row without any change on an axis
@@ -46,8 +41,6 @@ class State:
     ended: dict[str, Reason]  # why stretches ended, the last reason of each code; dead axes
     rest: str  # STILL, MOVING or UNSURE
     time_s: float  # since the first sample
-    least_s: float  # seconds at rest before a target counts as reached
-    target_dps: float | None
 
     @property
     def bias_dps(self) -> Array:
@@ -72,9 +65,8 @@ class State:
     @property
     def reached(self) -> bool:
         """Whether all axes are at the target, if there is one, after the least time."""
-        target_dps = np.inf if self.target_dps is None else self.target_dps
-        long_enough = self.seconds_at_rest >= self.least_s
-        return long_enough and bool(self.stretch.reached(target_dps).all())
+        long_enough = self.seconds_at_rest >= self.stretch.setup.least_s
+        return long_enough and bool(self.stretch.reached.all())
 
     @property
     def done(self) -> bool:
@@ -84,15 +76,15 @@ class State:
     @cached_property
     def seconds_left(self) -> Array:
         """Seconds at rest until the target; infinite where never, NaN without a target."""
-        if self.target_dps is None:
+        setup = self.stretch.setup
+        if np.isinf(setup.target_dps):
             return np.full(3, np.nan)
-        left = self.stretch.seconds_left(self.target_dps, LONGEST_S)
-        return np.maximum(left, self.least_s - self.seconds_at_rest)
+        return np.maximum(self.stretch.seconds_left(), setup.least_s - self.seconds_at_rest)
 
     @cached_property
     def reasons(self) -> tuple[Reason, ...]:
         """Remarks on the result, the most important first."""
-        return tuple(reasons_of(self.counts, self.ended, self.stretch, self.target_dps))
+        return tuple(reasons_of(self))
 
 
 class Calibrator:
@@ -112,12 +104,10 @@ class Calibrator:
     ) -> None:  # fmt: skip
         if not (np.isfinite(rate_hz) and rate_hz >= 2):  # noqa: PLR2004
             raise InputError(f"rate_hz: expected at least 2 samples a second, got {rate_hz}")
-        now = now or Circumstances()
-        self.setup = Setup(device_type, float(rate_hz), tuple(history), now)
-        self.target_dps, self.counts = target_dps, Counter[str]()
-        self.ended = dict[str, Reason]()
+        target_dps, now = np.inf if target_dps is None else target_dps, now or Circumstances()
+        self.setup = Setup(device_type, float(rate_hz), tuple(history), now, target_dps)
+        self.counts, self.ended = Counter[str](), dict[str, Reason]()
         self._constant = np.zeros(3)  # blocks in a row without any change
-        self.least_s = LEAST_S if np.all(self.setup.noise_prior[1] > 0) else LEAST_UNKNOWN_S
         self._pending = np.empty((_COLUMNS, 0))  # samples of an incomplete block
         self._last_time: float | None = None
         self._end: float | None = None  # end of the last block, on the clock of the samples
@@ -125,7 +115,10 @@ class Calibrator:
         self._block_count, self._gaps_s = 0, 0.0
         self._ended_rest_s = 0.0  # at rest in stretches that ended
         self._ended_best: Stretch | None = None
-        self.stretch = Stretch.start(self.setup, 0.0)
+        self._start_stretch()
+
+    def _start_stretch(self) -> None:
+        self.stretch = Stretch.start(self.setup, self.time_s)
         # the stretch before its last update, and the blocks of this update
         self._previous: tuple[Stretch, Blocks] | None = None
         self._motion_blocks = 0  # of the motion that is going on
@@ -213,8 +206,7 @@ class Calibrator:
         rest = self._rest(stretch, finished)
         if finished and rest == MOVING:
             stretch = Stretch.start(self.setup, self.time_s)
-        counts, target_dps = self.counts.copy(), self.target_dps
-        return State(stretch, counts, self.ended, rest, self.time_s, self.least_s, target_dps)
+        return State(stretch, self.counts.copy(), self.ended, rest, self.time_s)
 
     @property
     def best(self) -> Stretch:
@@ -268,7 +260,7 @@ class Calibrator:
             rows[4:7] = np.atleast_2d(accel_g).T
         if temperature_c is not None:
             rows[7] = temperature_c
-        finite, zero = np.isfinite(rows[:4].sum(axis=0)), ~rows[1:4].any(axis=0)
+        finite, zero = np.isfinite(rows[:4]).all(axis=0), ~rows[1:4].any(axis=0)
         invalid = {"not_finite": int(np.sum(~finite)), "zero": int(np.sum(zero))}
         self.counts.update(samples=len(rates), **invalid)
         if len(rates) and np.isfinite(rows[0, -1]):
@@ -341,8 +333,8 @@ class Calibrator:
         motion, note = [mean], None
         if not self._motion_blocks:
             if self._previous is not None:
-                motion.append(self.stretch.last_mean)
                 self.stretch, blocks = self._previous
+                motion.append(blocks.mean[-1])
                 while len(blocks.mean) > 1:
                     self.stretch, count, _ = self.stretch.update(blocks.part(0, -1))
                     blocks = blocks.part(count)
@@ -364,14 +356,13 @@ class Calibrator:
             self._ended_best = self.best
         else:
             self._min_rest_s = max(self._min_rest_s, self.time_s - self.stretch.start_s)
-        self.stretch, self._previous = Stretch.start(self.setup, self.time_s), None
-        self._motion_blocks, self._rotation = 0, np.zeros(3)
+        self._start_stretch()
 
     def _rest(self, stretch: Stretch, finished: bool) -> str:
         """Whether the device is at rest; when finished, whether it was for half of the time."""
         if self.setup.now.known_still:
             return STILL if stretch.blocks else UNSURE
-        enough = stretch.seconds >= max(min(self.least_s, 2 * LEAST_S), self._min_rest_s)
+        enough = stretch.seconds >= max(min(self.setup.least_s, 2 * LEAST_S), self._min_rest_s)
         ended = bool(self.ended.keys() - {ATTITUDE, *AXES})
         if finished:
             half = self._ended_rest_s + self.stretch.seconds >= self.time_s / 2

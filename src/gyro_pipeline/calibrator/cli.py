@@ -7,84 +7,87 @@ The exit code is the highest of all files: 0 done; 2 usage; 3 target not reached
 import hashlib
 import json
 import re
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import click
 import numpy as np
+from click import argument, option
 
 import gyro_pipeline
-from gyro_pipeline.calibrator import output, registry
+from gyro_pipeline.calibrator import output
 from gyro_pipeline.calibrator.calibrator import Calibrator, State
 from gyro_pipeline.calibrator.device_types import type_names
 from gyro_pipeline.calibrator.history import STILL, USED, Calibration
 from gyro_pipeline.calibrator.reasons import UNUSABLE_CODES
 from gyro_pipeline.calibrator.registry import SET, Device, RegistryError, registry_folder
 from gyro_pipeline.calibrator.stretch import BLOCK_S
-from gyro_pipeline.conventions import MDPS, InputError
+from gyro_pipeline.conventions import IN_READER, MDPS, InputError
+from gyro_pipeline.parameters import ReaderOptions
 
 DONE, USAGE, NOT_REACHED, NOT_AT_REST, NO_HISTORY, UNUSABLE, NOT_STORED = 0, 2, 3, 4, 5, 6, 7
 
-_option = partial(partial, click.option)  # the name of its argument is added later
-_OPEN = {  # arguments of Calibrator.open
-    "device": _option("--device", help="name in the registry; its history is used and added to"),
-    "device_type": _option("--type", help="type of the device: noise, turn-on spread, ..."),
-    "registry": _option("--registry", help="folder of the registry"),
-    "target_mdps": _option("--target", type=float, help="standard deviation to reach, mdps"),
-    "same_heading": _option(
-        "--same-heading/--any-heading", default=None, help="whether the heading repeats"
-    ),
-    "latitude_deg": _option("--latitude", type=float, help="latitude, degrees"),
-    "started_at": _option("--started-at", metavar="TIME", help="of the first sample, ISO 8601"),
-    "since_power_on_s": _option("--since-power-on", type=float, help="age of the first sample, s"),
-    "known_still": _option("--known-still", is_flag=True, help="it is at rest: cut nothing"),
-}
-_JSON = {"as_json": _option("--json", is_flag=True, help="one JSON object")}
-_SHARED = {
-    "require_history": _option("--require-history", is_flag=True, help="exit 5 if it is not used"),
-    "store": _option("--store/--no-store", default=True, help="add to the device's history"),
-    "plot": _option("--plot", type=Path, help="file for a plot of the running estimate"),
-    "rate_hz": _option("--rate", type=float, help="samples per second, if times do not show it"),
-    **_JSON,
-}
-_FOLDER = {"folder": _OPEN["registry"]}
 
-
-def _with(options: dict[str, Any]) -> Callable[[Any], Any]:
-    """Add options to a command, each under the name of an argument."""
-
-    def add(command: Any) -> Any:
-        for name, option in reversed(options.items()):
-            command = option(name)(command)
-        return command
-
-    return add
-
-
-def _reader_options() -> dict[str, Any]:
-    from gyro_pipeline.parameters import ReaderOptions  # noqa: PLC0415
-
-    fields = ReaderOptions.model_fields.items()
-    texts = {name: info.description or "a name, or a number from 0" for name, info in fields}
-    return {name: _option(_flag(name), help=text, metavar="VALUE") for name, text in texts.items()}
+def _posix_seconds(_: click.Context, __: click.Parameter, text: str | None) -> float | None:
+    try:
+        return datetime.fromisoformat(text).timestamp() if text else None
+    except ValueError as error:
+        raise InputError(f"--started-at: expected 2026-01-31T12:00:00Z, got {text!r}") from error
 
 
 def _flag(name: str) -> str:
     return "--scale" if name == "scale_dps" else "--" + name.replace("_", "-")
 
 
+_REGISTRY = option(
+    "--registry", help="folder of the registry", callback=lambda _, __, path: registry_folder(path)
+)
+_TYPE = option("--type", "device_type", help="type of the device: noise, turn-on spread, ...")
+_JSON = option("--json", "as_json", is_flag=True, help="one JSON object")
+_OPENING = (  # arguments of Calibrator.open
+    option("--device", help="name in the registry; its history is used and added to"),
+    _TYPE,
+    _REGISTRY,
+    option("--target", "target_mdps", type=float, help="standard deviation to reach, mdps"),
+    option("--same-heading/--any-heading", default=None, help="whether the heading repeats"),
+    option("--latitude", "latitude_deg", type=float, help="latitude, degrees"),
+)
+_TIME: dict[str, Any] = {"metavar": "TIME", "callback": _posix_seconds}
+_MEASURING = (  # of log and stream; the first three are arguments of Calibrator.open as well
+    option("--started-at", **_TIME, help="of the first sample, ISO 8601"),
+    option("--since-power-on", "since_power_on_s", type=float, help="age of the first sample, s"),
+    option("--known-still", is_flag=True, help="it is at rest: cut nothing"),
+    option("--require-history", is_flag=True, help="exit 5 if it is not used"),
+    option("--store/--no-store", default=True, help="add to the device's history"),
+    option("--plot", type=Path, help="file for a plot of the running estimate"),
+    option("--rate", "rate_hz", type=float, help="samples per second, if times do not show it"),
+    _JSON,
+)
+_READING = tuple(
+    option(_flag(name), name, metavar="VALUE", help=f.description or "a name, or a number from 0")
+    for name, f in ReaderOptions.model_fields.items()
+)
+
+
+def _with(*options: Any) -> Callable[[Any], Any]:
+    def add(command: Any) -> Any:
+        for add_option in reversed(options):
+            command = add_option(command)
+        return command
+
+    return add
+
+
 def _read_reader_options(texts: dict[str, str]) -> Any:
     """Options of the readers from their texts: lists with commas, ``rows`` as COLUMN=VALUE."""
     from pydantic import ValidationError  # noqa: PLC0415
-
-    from gyro_pipeline.parameters import ReaderOptions  # noqa: PLC0415
 
     values: Any = {name: _parse(text) for name, text in texts.items() if text is not None}
     for name in {"columns", "acceleration_columns"} & values.keys():
@@ -112,9 +115,6 @@ def _parse(text: str) -> Any:
 
 def _name_options(message: str) -> str:
     """A message of a reader, with options of the command line in place of catalog keys."""
-    from gyro_pipeline.conventions import IN_READER  # noqa: PLC0415
-    from gyro_pipeline.parameters import ReaderOptions  # noqa: PLC0415
-
     if IN_READER not in message:
         return message
     text, _, advice = message.replace(f" {IN_READER}", "").partition("; ")
@@ -150,37 +150,31 @@ def main() -> None:
     """Calibrate a gyroscope at rest: its bias, a standard deviation, the seconds still needed."""
 
 
-def _job(values: dict[str, Any]) -> SimpleNamespace:
+def _job(store: bool, **values: Any) -> SimpleNamespace:
     """The options of ``log`` and ``stream``; ``opening`` is for :meth:`.Calibrator.open`.
 
     The device is created here, so that a registry that cannot be written fails before measuring.
     """
-    opening = {name: values.pop(name) for name in _OPEN}
-    try:
-        text = opening["started_at"]
-        opening["started_at"] = text and datetime.fromisoformat(text).timestamp()
-    except ValueError as error:
-        raise InputError(f"--started-at: expected 2026-01-31T12:00:00Z, got {text!r}") from error
-    job = SimpleNamespace(opening=opening, **{name: values.pop(name) for name in _SHARED})
-    job.reader, job.device = _read_reader_options(values), None
-    if opening["device"] is not None and job.store:
-        job.device = Device(registry_folder(opening["registry"]), opening["device"])
-        job.device.create(opening["device_type"])
+    reader = _read_reader_options({name: values.pop(name) for name in ReaderOptions.model_fields})
+    names = "require_history", "plot", "rate_hz", "as_json"
+    job = SimpleNamespace(reader=reader, device=None, **{name: values.pop(name) for name in names})
+    if values["device"] is not None and store:
+        job.device = Device(values["registry"], values["device"])
+        job.device.create(values["device_type"])
+    job.opening = values
     return job
 
 
 @main.command()
-@click.argument("files", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
-@_with({**_OPEN, **_SHARED, **_reader_options()})
+@argument("files", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@_with(*_OPENING, *_MEASURING, *_READING)
 def log(files: tuple[Path, ...], **values: Any) -> int:
     """Calibrate from log files, one after the other."""
-    job = _job(values)
+    job = _job(**values)
     return max(_calibrate(path, job) for path in files)
 
 
 def _calibrate(path: Path, job: SimpleNamespace) -> int:
-    """Calibrate from a file; returns the exit code."""
-    from gyro_pipeline.conventions import IN_READER  # noqa: PLC0415
     from gyro_pipeline.readers import read_log  # noqa: PLC0415
 
     try:
@@ -202,7 +196,6 @@ def _calibrate(path: Path, job: SimpleNamespace) -> int:
 
 
 def _feed(calibrator: Calibrator, recording: Any, chunk_s: float) -> list[State]:
-    """Feed a log in chunks; returns the state after each."""
     count, rate_hz = len(recording.samples), calibrator.setup.rate_hz
     times = np.arange(count) / rate_hz
     for row in recording.gap_rows:  # a log does not say how long a gap is
@@ -219,36 +212,37 @@ def _report(
     calibrator: Calibrator, job: SimpleNamespace, states: Sequence[State], source: str, name: str
 ) -> int:
     """Print, plot and store the result; returns the exit code."""
-    state, target = calibrator.finish(), job.opening["target_mdps"]
-    code = _exit_code(state, job)
+    state = calibrator.finish()
+    code = _exit_code(state, job.require_history)
     if job.as_json or code != UNUSABLE:
         result = output.as_json(state, job.opening["device"], source=name)
-        _print(job.as_json, result, output.as_text(state, target, calibrator))
+        _print(job.as_json, result, output.as_text(state))
     if not job.as_json:
         for sentence in output.notes(state):
             _remark(sentence, "red" if code in {UNUSABLE, NOT_AT_REST} else "yellow")
     if job.plot:
-        output.plot(job.plot, [*states, state], target)
+        output.plot(job.plot, [*states, state])
     if job.device is not None and code != UNUSABLE:
-        calibration = replace(
-            calibrator.calibration(), hash=source, source=name, version=gyro_pipeline.__version__
-        )
-        if not job.device.append(calibration):
-            _remark(f"{name} is stored already; it is not stored again")
-            return code
-        rate_hz = calibrator.setup.rate_hz
-        try:
-            job.device.write_model(Calibrator.open(rate_hz=rate_hz, **job.opening))
-        except RegistryError as error:
-            _remark(f"{name} is stored, but model.json was not updated: {error}")
+        _store(calibrator, job, source, name)
     return code
 
 
-def _exit_code(state: State, job: SimpleNamespace) -> int:
-    """The exit code of a result."""
+def _store(calibrator: Calibrator, job: SimpleNamespace, source: str, name: str) -> None:
+    version, rate_hz = gyro_pipeline.__version__, calibrator.setup.rate_hz
+    stored = replace(calibrator.calibration(), hash=source, source=name, version=version)
+    if not job.device.append(stored):
+        _remark(f"{name} is stored already; it is not stored again")
+        return
+    try:
+        job.device.write_model(Calibrator.open(rate_hz=rate_hz, **job.opening).setup)
+    except RegistryError as error:
+        _remark(f"{name} is stored, but model.json was not updated: {error}")
+
+
+def _exit_code(state: State, require_history: bool) -> int:
     if any(reason.code in UNUSABLE_CODES for reason in state.reasons):
         return UNUSABLE
-    if job.require_history and not all(outcome == USED for outcome in state.history):
+    if require_history and set(state.history) != {USED}:
         return NO_HISTORY
     if state.rest != STILL:
         return NOT_AT_REST
@@ -256,15 +250,15 @@ def _exit_code(state: State, job: SimpleNamespace) -> int:
 
 
 @main.command()
-@click.option("--port", help="serial port instead of standard input")
-@click.option("--baud", type=int, default=115200, show_default=True)
-@click.option("--timeout", type=float, default=5.0, show_default=True, help="seconds of silence")
-@_with({**_OPEN, **_SHARED, **_reader_options()})
+@option("--port", help="serial port instead of standard input")
+@option("--baud", type=int, default=115200, show_default=True)
+@option("--timeout", type=float, default=5.0, show_default=True, help="seconds of silence")
+@_with(*_OPENING, *_MEASURING, *_READING)
 def stream(port: str | None, baud: int, timeout: float, **values: Any) -> int:
     """Calibrate from a live stream until the target is reached; prints a JSON line a second."""
     from gyro_pipeline.calibrator import stream as lines  # noqa: PLC0415
 
-    job = _job(values)
+    job = _job(**values)
     parser, name = lines.Parser(job.reader, job.rate_hz), port or "standard input"
     job.opening["started_at"] = job.opening["started_at"] or time.time()
     calibrator, states = None, list[State]()
@@ -284,9 +278,8 @@ def stream(port: str | None, baud: int, timeout: float, **values: Any) -> int:
             if state.done and job.opening["target_mdps"] is not None:
                 break
     if calibrator is None:
-        raise InputError(
-            "stream: expected lines of samples, got none; check the program that sends them"
-        )
+        text = "expected lines of samples, got none; check the program that sends them"
+        raise InputError(f"stream: {text}")
     if parser.bad:
         _remark(f"{parser.bad} lines were of another shape and were left out")
     source = hashlib.sha256(f"{name} {job.opening['started_at']}".encode()).hexdigest()
@@ -294,8 +287,8 @@ def stream(port: str | None, baud: int, timeout: float, **values: Any) -> int:
 
 
 @main.command()
-@click.option("--heading", help="drift of the heading instead of --target, such as 1deg/h")
-@_with({**{name: _OPEN[name] for name in [*_OPEN][:6]}, **_JSON})
+@option("--heading", help="drift of the heading instead of --target, such as 1deg/h")
+@_with(*_OPENING, _JSON)
 def plan(heading: str | None, as_json: bool, **opening: Any) -> int:
     """Predict the seconds at rest that a standard deviation takes."""
     target_mdps = opening["target_mdps"]
@@ -304,13 +297,13 @@ def plan(heading: str | None, as_json: bool, **opening: Any) -> int:
     if heading is not None:
         target_mdps = opening["target_mdps"] = _heading_mdps(heading)
     calibrator = Calibrator.open(rate_hz=100.0, **opening)
-    if not np.all(calibrator.setup.noise_prior[1] > 0):
-        listed = ", ".join(type_names(registry_folder(opening["registry"])))
+    if not calibrator.setup.noise_known:
+        listed = ", ".join(type_names(opening["registry"]))
         text = f"expected a device of known noise; give --type ({listed})"
         raise InputError(f"plan: {text} or a --device with history")
     state = calibrator.state()
     result = {"target_mdps": target_mdps, "seconds": output.numbers(state.seconds_left)}
-    _print(as_json, result, output.planned(state, target_mdps))
+    _print(as_json, result, output.planned(state))
     return DONE if np.isfinite(state.seconds_left).all() else NOT_REACHED
 
 
@@ -318,7 +311,7 @@ def _heading_mdps(text: str) -> float:
     """A rate such as 1deg/h, in mdps."""
     from gyro_pipeline.units import read_unit  # noqa: PLC0415
 
-    match = re.fullmatch(r"([\d.]+) *(.+)", text)
+    match = re.fullmatch(r"(\d+\.?\d*|\.\d+) *(.+)", text)
     unit = read_unit(match[2]) if match else None
     if match is None or unit is None or unit.quantity != "rate":
         raise InputError(f"--heading: expected a rate such as 1deg/h, got {text!r}")
@@ -330,72 +323,70 @@ def devices() -> None:
     """List and manage the devices of the registry."""
 
 
-def _existing_device(folder: str | None, name: str) -> Device:
-    device = Device(registry_folder(folder), name)
+def _existing_device(registry: Path, name: str) -> Device:
+    device = Device(registry, name)
     if not device.folder.is_dir():
-        listed = ", ".join(d.name for d in registry.devices(registry_folder(folder))) or "none"
+        listed = ", ".join(d.name for d in Device.all(registry)) or "none"
         raise InputError(f"device: expected one of {listed}, got {name!r}; see devices list")
     return device
 
 
 @devices.command("list")
-@_with({**_FOLDER, **_JSON})
-def list_devices(folder: str | None, as_json: bool) -> None:
+@_with(_REGISTRY, _JSON)
+def list_devices(registry: Path, as_json: bool) -> None:
     """List devices, their types and the number of calibrations that count."""
     rows = [
         {"device": d.name, "type": d.settings().get("type"), "calibrations": len(d.history())}
-        for d in registry.devices(registry_folder(folder))
+        for d in Device.all(registry)
     ]
-    _print(as_json, rows, output.device_list(rows, type_names(registry_folder(folder))))
+    _print(as_json, rows, output.device_list(rows, type_names(registry)))
 
 
 @devices.command()
-@click.argument("name")
-@_with({**_FOLDER, **_JSON})
-def show(name: str, folder: str | None, as_json: bool) -> None:
+@argument("name")
+@_with(_REGISTRY, _JSON)
+def show(name: str, registry: Path, as_json: bool) -> None:
     """Show level over time, turn-on spread, walk, temperature slope, noise and health."""
-    device = _existing_device(folder, name)
+    device = _existing_device(registry, name)
     content = {"lines": device.lines(), "model": device.model()}
     _print(as_json, content, output.device_table(device))
 
 
 @devices.command()
-@click.argument("name")
-@click.argument("text")
-@_with(_FOLDER)
-def note(name: str, text: str, folder: str | None) -> None:
+@argument("name")
+@argument("text")
+@_REGISTRY
+def note(name: str, text: str, registry: Path) -> None:
     """Append a note to the history of a device."""
-    _existing_device(folder, name).append({"event": "note", "time": time.time(), "text": text})
+    _existing_device(registry, name).append({"event": "note", "time": time.time(), "text": text})
 
 
 @devices.command("set", context_settings={"ignore_unknown_options": True})  # -0.1 is a number
-@click.argument("name")
-@click.argument("bias_dps", nargs=3, type=float)
-@click.option(
-    "--sigma", type=float, default=0.0, show_default=True, help="its standard deviation, mdps"
-)
-@_with({**_FOLDER, "device_type": _OPEN["device_type"]})
+@argument("name")
+@argument("bias_dps", nargs=3, type=float)
+@option("--sigma", type=float, default=0.0, show_default=True, help="its standard deviation, mdps")
+@_with(_REGISTRY, _TYPE)
 def set_bias(
-    name: str, bias_dps: tuple[float, float, float], sigma: float, folder: str | None,
+    name: str, bias_dps: tuple[float, float, float], sigma: float, registry: Path,
     device_type: str | None,
 ) -> None:  # fmt: skip
     """Set a bias, deg/s about x, y and z, which replaces the history until it is forgotten."""
-    device, variance = Device(registry_folder(folder), name), (sigma * MDPS) ** 2
+    device, variance = Device(registry, name), (sigma * MDPS) ** 2
     device.create(device_type)
     typed: Any = {"time": time.time(), "hash": SET, "source": SET, "event": SET}
     device.append(Calibration(bias_dps, (variance,) * 3, **typed))
 
 
 @devices.command()
-@click.argument("name")
-@click.argument("source", required=False)
-@click.option("--all", "everything", is_flag=True, help="remove the device's folder")
-@_with(_FOLDER)
-def forget(name: str, source: str | None, everything: bool, folder: str | None) -> None:
+@argument("name")
+@argument("source", required=False)
+@option("--all", "everything", is_flag=True, help="remove the device's folder")
+@_REGISTRY
+def forget(name: str, source: str | None, everything: bool, registry: Path) -> None:
     """Withdraw a calibration by the name or hash of its file; it stays stored without counting."""
-    device = _existing_device(folder, name)
+    device = _existing_device(registry, name)
     if everything:
-        device.remove()
+        shutil.rmtree(device.folder)
         return
     stored = device.calibrations()
     matches = {key for key in stored if source and key.startswith(source)}
@@ -408,24 +399,24 @@ def forget(name: str, source: str | None, everything: bool, folder: str | None) 
 
 
 @devices.command()
-@click.argument("name")
-@click.argument("file", type=click.Path(dir_okay=False, path_type=Path))
-@_with(_FOLDER)
-def save(name: str, file: Path, folder: str | None) -> None:
+@argument("name")
+@argument("file", type=click.Path(dir_okay=False, path_type=Path))
+@_REGISTRY
+def save(name: str, file: Path, registry: Path) -> None:
     """Write a device to a file."""
-    content = _existing_device(folder, name).content()
+    content = _existing_device(registry, name).content()
     file.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
 
 
 @devices.command()
-@click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
-@click.option("--as", "name", help="new name of the device")
-@_with(_FOLDER)
-def load(file: Path, name: str | None, folder: str | None) -> None:
+@argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@option("--as", "name", help="new name of the device")
+@_REGISTRY
+def load(file: Path, name: str | None, registry: Path) -> None:
     """Read a device from a file that ``devices save`` wrote; stored lines are kept, once each."""
     try:
         content = json.loads(file.read_text("utf-8"))
-        Device(registry_folder(folder), name or content["device"]).restore(content)
+        Device(registry, name or content["device"]).restore(content)
     except InputError:
         raise
     except (ValueError, KeyError, TypeError) as error:

@@ -11,9 +11,10 @@ from dataclasses import dataclass, field
 from functools import cache, cached_property
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gyro_pipeline.calibrator.filter import FLICKER_S, Array, Noise
 from gyro_pipeline.conventions import MDPS, InputError
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
 
 Axes = float | tuple[float, float, float]
 """One number for all axes, or one each for x, y and z."""
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ class DeviceType:
 
     def dps(self, name: str) -> Array:
         """A field that is in mdps, converted to deg/s, (3,)."""
-        return np.broadcast_to(np.asarray(getattr(self, name), np.float64) * MDPS, 3)
+        return _axes_dps(getattr(self, name))
 
     @cached_property
     def noise(self) -> Noise:
@@ -68,9 +67,8 @@ class DeviceType:
         white = np.ones(3) if self.noise_mdps_rts is None else self.dps("noise_mdps_rts")
         warm_up = None
         if self.warm_up is not None:
-            mean = np.broadcast_to(np.multiply(self.warm_up.amplitude_mdps, MDPS), 3)
-            spread = np.broadcast_to(np.maximum(self.warm_up.spread_mdps, 1e-3) * MDPS, 3)
-            warm_up = mean, spread, self.warm_up.time_constant_s
+            spread = _axes_dps(np.maximum(self.warm_up.spread_mdps, 1e-3))
+            warm_up = _axes_dps(self.warm_up.amplitude_mdps), spread, self.warm_up.time_constant_s
         random_walk = self.dps("random_walk_mdps_per_rts")
         return Noise(white, self.dps("flicker_mdps"), random_walk, warm_up)
 
@@ -80,6 +78,10 @@ class DeviceType:
         if self.noise_mdps_rts is None:
             return 0.0
         return 1 / (2 * self.noise_spread**2) if self.noise_spread else np.inf
+
+
+def _axes_dps(mdps: ArrayLike) -> Array:
+    return np.broadcast_to(np.asarray(mdps, np.float64) * MDPS, 3)
 
 
 def read_type(name: str | None, registry: Path | None = None) -> DeviceType:
@@ -122,7 +124,7 @@ def type_of(content: Mapping[str, Any], where: str) -> DeviceType:
     return validated(DeviceType, content, where)
 
 
-def validated(kind: type[T], content: Mapping[str, Any], where: str) -> T:
+def validated(kind: Any, content: Mapping[str, Any], where: str) -> Any:
     """A dataclass made from the content of a file.
 
     Raises:
@@ -131,7 +133,7 @@ def validated(kind: type[T], content: Mapping[str, Any], where: str) -> T:
     from pydantic import ValidationError  # noqa: PLC0415
 
     try:
-        return cast(T, _adapter(cast(Any, kind)).validate_python(content))
+        return _adapter(kind).validate_python(content)
     except ValidationError as error:
         first = error.errors()[0]
         key, text = str(first["loc"][0]), first["msg"].lower()

@@ -159,8 +159,8 @@ class Filter(NamedTuple):
         if mean is None or not self.blocks:
             return following, np.zeros(3)
         c, covariance = self._constants()
-        spread = variance + np.sum(_matvec(covariance, e_x) * e_x, axis=1)
-        return following, (e_y - np.sum(e_x * c, axis=1)) / np.sqrt(spread)
+        spread = variance + (_matvec(covariance, e_x) * e_x).sum(axis=1)
+        return following, (e_y - (e_x * c).sum(axis=1)) / np.sqrt(spread)
 
     def skip(self, seconds: float) -> Self:
         """Move on over a gap without data."""
@@ -220,12 +220,12 @@ class Filter(NamedTuple):
         shared = _matvec(covariance, gradient)
         free = self.noise.warm_up is not None and self.age_s is None
         return Estimate(
-            bias=self.reference + walk[..., 0] + np.sum(gradient * c, axis=-1),
-            variance=self.covariance[..., 0, 0] + np.sum(shared * gradient, axis=-1),
+            bias=self.reference + walk[..., 0] + (gradient * c).sum(axis=-1),
+            variance=self.covariance[..., 0, 0] + (shared * gradient).sum(axis=-1),
             start=self.reference + c[..., 0],
             start_variance=covariance[..., 0, 0],
             transfer=shared[..., 0] / covariance[..., 0, 0],
-            squares=self.squares - np.sum(c * self.weighted, axis=-1),
+            squares=self.squares - (c * self.weighted).sum(axis=-1),
             freedom=np.maximum(np.asarray(self.blocks, float)[..., None] - 1 - free, 0),
         )
 

@@ -77,12 +77,12 @@ class Calibration:
     @property
     def mean(self) -> Array:
         """Mean of the data, (3,), deg/s."""
-        return _floats(self.mean_dps or [None] * 3)
+        return np.array(self.mean_dps or [np.nan] * 3, np.float64)
 
     @property
     def variance(self) -> Array:
         """Variance of the mean, (3,), (deg/s)^2."""
-        return _floats(self.variance_dps2 or [None] * 3)
+        return np.array(self.variance_dps2 or [np.nan] * 3, np.float64)
 
     @property
     def celsius(self) -> float | None:
@@ -143,7 +143,7 @@ def prior_of(
         spread = device_type.dps("temperature_spread_mdps_per_c")
         slope = device_type.dps("temperature_slope_mdps_per_c")
         return Prior(unknown, infinite, infinite, slope, spread)
-    times = _floats([*(c.time for c in past), now.time]) / _DAY_S
+    times = np.array([*(c.time for c in past), now.time], np.float64) / _DAY_S  # NaN for None
     days = np.nan_to_num(np.abs(np.diff(times)), nan=1.0)  # an unknown gap counts as one day
     days = np.append(0.0, np.cumsum(days))
     turn_on = device_type.dps("turn_on_mdps")
@@ -157,16 +157,10 @@ def prior_of(
     earth, earth_reasons = _earth_rate_variance(past, now, np.array(tau))
     temperature, temperature_reasons = _temperature_variance(past, device_type, now)
     narrow = np.array(variance) + earth + temperature
-    wide = np.maximum(
-        device_type.dps("conflict_mdps") ** 2, 9 * narrow
-    )  # at least three times the spread
+    # A wrong history spreads at least three times as much as a right one.
+    wide = np.maximum(device_type.dps("conflict_mdps") ** 2, 9 * narrow)
     count, reasons = max(map(len, members)), (*earth_reasons, *temperature_reasons)
     return Prior(np.array(mean), narrow, wide, slope, slope_sigma, count, reasons, fitted)
-
-
-def _floats(values: Sequence[float | None]) -> Array:
-    """An array with NaN for None."""
-    return np.array(values, np.float64)
 
 
 def level_members(past: Sequence[Calibration], axis: int, turn_on: float) -> list[int]:
@@ -198,7 +192,7 @@ def _axis_prior(
     past: Sequence[Calibration], days: Array, axis: int, device_type: DeviceType, now: Circumstances
 ) -> tuple[float, float, float, Fitted]:
     """Mean and variance of the next bias without the Earth's rate, tau^2, and the parameters."""
-    temperatures = _floats([*(c.celsius for c in past), now.temperature_c])
+    temperatures = np.array([*(c.celsius for c in past), now.temperature_c], np.float64)
     unknown = np.isnan(temperatures[:-1])
     measured = temperatures[:-1][~unknown] if not unknown.all() else np.zeros(1)
     warmth = np.nan_to_num(temperatures - measured.mean()) * (not unknown.all())

@@ -8,7 +8,7 @@ from typing import Any
 import click
 import numpy as np
 
-from gyro_pipeline.calibrator.calibrator import Calibrator, State
+from gyro_pipeline.calibrator.calibrator import State
 from gyro_pipeline.calibrator.filter import Array
 from gyro_pipeline.calibrator.history import DROPPED, NONE, STILL, USED
 from gyro_pipeline.calibrator.registry import SET, Device
@@ -40,9 +40,9 @@ def numbers(values: Array) -> list[float | None]:
     return [value if math.isfinite(value) else None for value in values.tolist()]
 
 
-def as_text(state: State, target_mdps: float | None, calibrator: Calibrator) -> Iterator[str]:
+def as_text(state: State) -> Iterator[str]:
     """A coloured table of the axes, with a summary above and the time left below."""
-    yield click.style(_summary(state, calibrator), fg="green" if state.rest == STILL else "red")
+    yield click.style(_summary(state), fg="green" if state.rest == STILL else "red")
     sigmas = state.sigma_dps / MDPS
     if state.rest != STILL:
         if np.isinf(sigmas).all():
@@ -52,8 +52,8 @@ def as_text(state: State, target_mdps: float | None, calibrator: Calibrator) -> 
     for axis, name in enumerate(AXES):
         row = f"{name}{state.bias_dps[axis]:+16.6f}{sigmas[axis]:11.2f}   {_sources(state, axis)}"
         yield click.style(row, fg="yellow") if state.history[axis] == DROPPED else row
-    if target_mdps is not None:
-        yield _time_left(state, target_mdps)
+    if np.isfinite(target_mdps(state)):
+        yield _time_left(state)
     if np.isfinite(sigmas).all():
         drifts = zip(sigmas * HEADING_DEG, AXES, strict=True)
         listed = ", ".join(f"{drift:.2g}° about {name}" for drift, name in drifts)
@@ -61,20 +61,23 @@ def as_text(state: State, target_mdps: float | None, calibrator: Calibrator) -> 
     yield from (r.sentence for r in state.reasons if r.code == "rotation_bound")
 
 
-def _summary(state: State, calibrator: Calibrator) -> str:
-    """The time at rest, motions that were cut, the temperature and the history."""
+def target_mdps(state: State) -> float:
+    """The target of a calibration; infinite without one."""
+    return state.stretch.setup.target_dps / MDPS
+
+
+def _summary(state: State) -> str:
     cut = ", ".join(f"{r.value:.1f} s" for r in state.reasons if r.code == "cut")
     text = "" if state.rest == STILL else f"not at rest ({state.rest}): "
     text += f"at rest for {state.seconds_at_rest:.1f} of {state.time_s:.1f} s"
     text += f" (a motion at {cut} was cut)" if cut else ""
-    temperature, count = state.stretch.temperature, state.stretch.prior.count
-    text += f"; {temperature.mean:.1f} °C" if temperature.blocks else ""
-    history = calibrator.setup.history
+    stretch, count = state.stretch, state.stretch.prior.count
+    text += f"; {stretch.temperature.mean:.1f} °C" if stretch.temperature.blocks else ""
     if not count:
         return f"{text}; history: none"
     past = f"{count} calibration{'s' * (count != 1)}"
-    past = "set by hand" if history[0].event == SET else past
-    heading = "" if calibrator.setup.now.same_heading else "not "
+    past = "set by hand" if stretch.setup.history[0].event == SET else past
+    heading = "" if stretch.setup.now.same_heading else "not "
     return f"{text}; history: {past}, heading {heading}declared to repeat"
 
 
@@ -92,33 +95,35 @@ def _sources(state: State, axis: int) -> str:
         variances = stretch.estimate.variance[axis], stretch.prior.narrow[axis]
         log, history = np.sqrt(variances) / MDPS
         return f"this log {log:.2f}, history {history:.2f}"
-    conflicts = [r for r in state.reasons if r.code == "conflict" and r.axis == AXES[axis]]
-    return f"this log alone: {conflicts[0].sentence}" if conflicts else "this log"
+    for reason in state.reasons:
+        if (reason.code, reason.axis) == ("conflict", AXES[axis]):
+            return f"this log alone: {reason.sentence}"
+    return "this log"
 
 
-def _time_left(state: State, target_mdps: float) -> str:
-    """The seconds that each axis still needs."""
-    floors = {r.axis: f", below its floor of {r.value:.2g}" for r in state.reasons
-              if r.code == "floor"}  # fmt: skip
-    parts = []
+def _time_left(state: State) -> str:
+    floors = {r.axis: r.value for r in state.reasons if r.code == "floor"}
+    target, parts = f"{target_mdps(state):g} mdps", []
     for name, seconds in zip(AXES, state.seconds_left, strict=True):
         if np.isinf(seconds):
-            why = floors.get(name, " within an hour")
-            parts.append(f"{name} does not reach {target_mdps:g} mdps{why}")
+            why = (
+                f", below its floor of {floors[name]:.2g}" if name in floors else " within an hour"
+            )
+            parts.append(f"{name} does not reach {target}{why}")
         elif seconds:
-            needed = f"{math.ceil(seconds)} s more at rest for {target_mdps:g} mdps"
-            parts.append(f"{name} needs {needed}")
-    return f"{'; '.join(parts)}." if parts else f"The target of {target_mdps:g} mdps is reached."
+            parts.append(f"{name} needs {math.ceil(seconds)} s more at rest for {target}")
+    return f"{'; '.join(parts)}." if parts else f"The target of {target} is reached."
 
 
-def planned(state: State, target_mdps: float) -> Iterator[str]:
+def planned(state: State) -> Iterator[str]:
     """A line for each axis: the seconds that a target takes, or why it cannot be reached."""
-    target = f"{target_mdps:.3g} mdps ({target_mdps * HEADING_DEG:.3g}° of heading an hour)"
+    target = target_mdps(state)
+    text = f"{target:.3g} mdps ({target * HEADING_DEG:.3g}° of heading an hour)"
     floors = state.stretch.floor_dps / MDPS
     for name, needed, floor in zip(AXES, state.seconds_left, floors, strict=True):
         if np.isfinite(needed):
-            yield f"{name}: {needed:.1f} s at rest for {target}"
-        elif floor > target_mdps:
+            yield f"{name}: {needed:.1f} s at rest for {text}"
+        elif floor > target:
             yield f"{name}: not with this sensor: its floor is {floor:.2g} mdps"
         else:
             yield f"{name}: not within an hour"
@@ -154,13 +159,10 @@ def device_table(device: Device) -> Iterator[str]:
     yield f"{len(attempts)} attempts: {failed} not at rest, {dropped} dropped the history"
 
 
-def plot(path: Path, states: Sequence[State], target_mdps: float | None) -> None:
+def plot(path: Path, states: Sequence[State]) -> None:
     """Plot the running estimate with its limits, the history, the stop and motions that were cut.
 
-    Args:
-        path: File to write; its suffix sets the format.
-        states: About one for each second; the last one is the final result.
-        target_mdps: Target whose first reach is marked.
+    The suffix of the file sets its format, and the last state is the final result.
 
     Raises:
         InputError: matplotlib is not installed.
@@ -172,11 +174,12 @@ def plot(path: Path, states: Sequence[State], target_mdps: float | None) -> None
         raise InputError(text) from error
     figure = Figure(figsize=(8, 7), layout="constrained")
     panels = figure.subplots(3, 1, sharex=True)
+    target = target_mdps(states[-1])
     stop = next((state.time_s for state in states if state.done), None)
     for axis, panel in enumerate(panels):
         _draw(panel, states, axis)
-        if target_mdps is not None and stop is not None:
-            panel.axvline(stop, color="C2", linestyle="--", label=f"{target_mdps:g} mdps reached")
+        if np.isfinite(target) and stop is not None:
+            panel.axvline(stop, color="C2", linestyle="--", label=f"{target:g} mdps reached")
     panels[0].legend(loc="upper right", fontsize="small")
     panels[-1].set_xlabel("time, s")
     figure.savefig(path)

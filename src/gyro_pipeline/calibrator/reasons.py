@@ -1,6 +1,5 @@
 """Remarks on a result: codes for programs, sentences for people."""
 
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, SupportsIndex
@@ -10,6 +9,7 @@ import numpy as np
 from gyro_pipeline.conventions import AXES, MDPS
 
 if TYPE_CHECKING:
+    from gyro_pipeline.calibrator.calibrator import State
     from gyro_pipeline.calibrator.stretch import Stretch
 
 UNUSABLE_CODES = {"dead", "unit"}
@@ -91,22 +91,27 @@ def unit_reason(factor: float, name: str) -> Reason | None:
         return None
     ratio, way = max(factor, 1 / factor), "above" if factor > 1 else "below"
     near = min(_UNITS, key=lambda unit: abs(np.log(ratio / unit)))
-    words: dict[str, Any] = {"ratio": ratio, "way": way, "name": name, "near": near}
-    return reason("unit", factor, _UNIT_FACTOR, unit=_UNITS[near], **words)
+    words: dict[str, Any] = {
+        "ratio": ratio,
+        "way": way,
+        "name": name,
+        "near": near,
+        "unit": _UNITS[near],
+    }
+    return reason("unit", factor, _UNIT_FACTOR, **words)
 
 
-def reasons_of(
-    counts: Counter[str], ended: dict[str, Reason], stretch: "Stretch", target_dps: float | None
-) -> Iterator[Reason]:
+def reasons_of(state: "State") -> Iterator[Reason]:
     """All remarks on a result, the most important first."""
-    yield from ended.values()
+    counts, stretch = state.counts, state.stretch
+    yield from state.ended.values()
     for code in ("zero", "not_finite"):
         if 0 < counts[code] < counts["samples"]:
             yield reason(code, counts[code], counts["samples"])
         elif counts[code]:
             yield reason(f"dead {code}")
     setup, (noise, freedom) = stretch.setup, stretch.log_noise()
-    if noise is not None and freedom >= _MIN_FREEDOM and np.all(setup.noise_prior[1] > 0):
+    if noise is not None and freedom >= _MIN_FREEDOM and setup.noise_known:
         factors = noise / (setup.noise_factor * setup.noise.white)  # also too little noise
         if wrong_unit := unit_reason(sorted(factors.tolist())[1], setup.device_type.type):
             yield wrong_unit
@@ -115,7 +120,7 @@ def reasons_of(
     yield from stretch.notes
     if setup.now.attempt > 1:
         yield reason("attempt", setup.now.attempt)
-    yield from _noise_reasons(stretch, target_dps)
+    yield from _noise_reasons(stretch)
     if counts["gaps"]:
         yield reason("gap", counts["gap_ms"] / 1e3, places=counts["gaps"])
     if counts["jumps"]:
@@ -124,13 +129,12 @@ def reasons_of(
     yield from _rotation_reasons(stretch)
 
 
-def _noise_reasons(stretch: "Stretch", target_dps: float | None) -> Iterator[Reason]:
+def _noise_reasons(stretch: "Stretch") -> Iterator[Reason]:
     setup, floor = stretch.setup, stretch.floor_dps / MDPS
     if not setup.device_type.noise_freedom:
         yield reason("colour")
-    if target_dps is not None:
-        for axis in np.flatnonzero(stretch.floor_dps > target_dps):
-            yield reason("floor", float(floor[axis]), target_dps / MDPS, axis)
+    for axis in np.flatnonzero(stretch.floor_dps > setup.target_dps):
+        yield reason("floor", float(floor[axis]), setup.target_dps / MDPS, axis)
     if setup.noise.warm_up is not None and stretch.blocks:
         left, sigma = stretch.filter.warm_up()
         for axis in np.flatnonzero(np.abs(left) > np.maximum(2 * sigma, MDPS)):

@@ -1,18 +1,12 @@
 """The registry of devices: each has a folder, and its history is append-only.
 
-    <registry>/<device>/device.toml         written by people: type, mounted, latitude, frame, notes
-                        calibrations.jsonl  a line for each calibration, note or withdrawal
-                        model.json          derived: noise, level, tau, walk, slope
-    <registry>/types/<type>.json
-
-A line is written in one call, under a lock, and synced before the call returns. A line that a crash
-cut off is ignored, and the next one starts on a new line.
+docs/calibrator.md lists the files. A line is written in one call, under a lock, and synced before
+the call returns. A line that a crash cut off is ignored, and the next one starts on a new line.
 """
 
 import json
 import os
 import re
-import shutil
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -23,9 +17,9 @@ from typing import Any
 import numpy as np
 from filelock import FileLock, Timeout
 
-from gyro_pipeline.calibrator.calibrator import Calibrator
 from gyro_pipeline.calibrator.device_types import validated
 from gyro_pipeline.calibrator.history import STILL, Calibration
+from gyro_pipeline.calibrator.stretch import Setup
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 
 VARIABLE = "GYRO_CALIBRATE_REGISTRY"
@@ -61,11 +55,6 @@ def registry_folder(path: str | Path | None = None) -> Path:
     return Path(platformdirs.user_data_dir("gyro-calibrate"))
 
 
-def devices(registry: Path) -> list["Device"]:
-    """All devices of a registry, by name."""
-    return [Device(registry, path.parent.name) for path in sorted(registry.glob("*/device.toml"))]
-
-
 class Device:
     """The folder of a device.
 
@@ -82,6 +71,11 @@ class Device:
         self.lines_path = self.folder / "calibrations.jsonl"
         self.settings_path = self.folder / "device.toml"
         self.model_path = self.folder / "model.json"
+
+    @classmethod
+    def all(cls, registry: Path) -> "list[Device]":
+        """All devices of a registry, by name."""
+        return [cls(registry, path.parent.name) for path in sorted(registry.glob("*/device.toml"))]
 
     def settings(self) -> dict[str, Any]:
         """The content of ``device.toml``; empty where there is none."""
@@ -144,9 +138,9 @@ class Device:
             _append(self.lines_path, data)
         return True
 
-    def write_model(self, calibrator: Calibrator) -> None:
+    def write_model(self, setup: Setup) -> None:
         """Replace ``model.json``, which people and other programs read, by the current model."""
-        setup, fitted = calibrator.setup, calibrator.best.prior.fitted or ({},) * len(AXES)
+        fitted = setup.unseen_prior.fitted or ({},) * len(AXES)
         noise = setup.noise_factor * setup.noise.white / MDPS
         freedom = np.maximum(setup.noise_prior[1], 1e-9)
         sigma = noise / np.sqrt(2 * freedom)
@@ -190,10 +184,6 @@ class Device:
         for line in lines:
             if line not in stored:
                 self.append(line)
-
-    def remove(self) -> None:
-        """Remove the folder with its content."""
-        shutil.rmtree(self.folder)
 
     @contextmanager
     def _locked(self) -> Iterator[None]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gyro_pipeline.calibrator.filter import Array
 from gyro_pipeline.conventions import MDPS
-from gyro_pipeline.quality.rest import RestDetector, alpha_spending_limits
+from gyro_pipeline.quality.rest import Mask, RestDetector, alpha_spending_limits
 
 MOTION, ATTITUDE, NOISE, ROTATION = "motion", "attitude", "noise", "rotation"
 """Alarms: a brief motion, a turn during a motion, and two signs that the device never rested."""
@@ -83,7 +83,7 @@ class RestMonitor:
         after.detector = copy(self.detector)
         moved, noisier = after.detector.update(innovations * white, blocks.variance)
         noise = after._excess_noise(innovations)
-        rate, sigma, turns = after._rotation(blocks)
+        rate, sigma, turns = after._rotation_rates(blocks)
         scattered = np.any(np.isfinite(noise), axis=1)
         alarms = (moved | noisier).any(axis=1) | scattered | turns
         if not alarms.any():
@@ -111,7 +111,7 @@ class RestMonitor:
         high = (np.cbrt(ratio) > np.cbrt(_MIN_RISE**2) + limit) & (count >= _MIN_BLOCKS)[:, None]
         return np.where(high, np.sqrt(ratio), np.nan)
 
-    def _rotation(self, blocks: Blocks) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def _rotation_rates(self, blocks: Blocks) -> tuple[Array, Array, Mask]:
         """Rates from the slope of gravity, their sigma and significance, (n,) each.
 
         Two normal components exceed z sigma with probability exp(-z^2 / 2); the share
@@ -130,7 +130,7 @@ class RestMonitor:
         measured = np.isfinite(sums).all(axis=1)
         self._count = int(count[-1]) if measured.all() else -1
         self._sums, self._gravity = sums[-1], g[-1]
-        rate, sigma = _rotation(sums, count[:, None])
+        rate, sigma = _slope_rates(sums, count[:, None])
         limit = np.sqrt(-2 * np.log(_FALSE_ROTATION / (count * (count + 1))))
         above = rate > np.maximum(limit * sigma, _MIN_ROTATION)
         return rate, sigma, above & measured & (count >= _MIN_BLOCKS)
@@ -141,7 +141,7 @@ def _running_sums(before: Array, values: Array) -> Array:
     return np.add.accumulate(np.vstack([before, values]))[1:]
 
 
-def _rotation(sums: Array, n: NDArray[np.integer]) -> tuple[Array, Array]:
+def _slope_rates(sums: Array, n: NDArray[np.integer]) -> tuple[Array, Array]:
     """Rates about horizontal axes and their standard deviations, deg/s, by least squares.
 
     Gravity turns in the axes of the device by -w x g, so w = g x slope / g^2 except for its part

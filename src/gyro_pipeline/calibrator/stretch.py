@@ -7,7 +7,7 @@ from statistics import NormalDist
 from typing import NamedTuple, SupportsIndex
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from gyro_pipeline.calibrator.device_types import DeviceType
 from gyro_pipeline.calibrator.filter import Array, Estimate, Filter
@@ -27,15 +27,19 @@ from gyro_pipeline.calibrator.reasons import VERTICAL, Reason, reason
 from gyro_pipeline.calibrator.rest import Alarm, Blocks, RestMonitor
 from gyro_pipeline.conventions import MDPS
 from gyro_pipeline.physics.mixture import log_e, log_ratios, mixture_posterior
-from gyro_pipeline.quality.rest import student_limits
-
-Mask = NDArray[np.bool_]
+from gyro_pipeline.quality.rest import Mask, student_limits
 
 CONFLICT = 120.0
 """The e-value at which the history is dropped. A right history is dropped in at most one of this
 many calibrations (Ville's inequality); half as often in simulations."""
 
 BLOCK_S = 0.5
+
+LEAST_S, LEAST_UNKNOWN_S = 1.0, 10.0
+"""Seconds at rest before a target counts as reached, with known and with unknown noise."""
+
+LONGEST_S = 3600.0
+"""The longest time at rest that is predicted as seconds left."""
 
 _MIN_BLOCK_SAMPLES = 5  # fewer do not show the noise
 _TEMPERATURE_STEP_C = 0.5  # after which the prior is computed again
@@ -51,6 +55,7 @@ class Setup:
     rate_hz: float
     history: Sequence[Calibration]  # the oldest first
     now: Circumstances
+    target_dps: float = np.inf  # infinite without a target
 
     def __post_init__(self) -> None:
         size = max(round(BLOCK_S * self.rate_hz), _MIN_BLOCK_SAMPLES)  # samples in a block
@@ -58,20 +63,13 @@ class Setup:
         # N^2 relative to the type, (3,), and its degrees of freedom: infinite where N is known, 0
         # where it is not.
         self.noise_prior = noise_of(self.history, self.device_type)
+        self.noise_known = bool(np.all(self.noise_prior[1] > 0))
+        self.least_s = LEAST_S if self.noise_known else LEAST_UNKNOWN_S
         self.noise_factor = np.sqrt(self.noise_prior[0])
         # standard deviation of a block mean
         self.white = self.noise_factor * self.noise.white / np.sqrt(self.block_s)
         # for an unknown attitude and temperature
         self.unseen_prior = prior_of(self.history, self.device_type, self.now)
-
-    def prior(self, up: Array | None, celsius: float, trust_heading: bool) -> Prior:
-        """The prior at an attitude and a temperature, with or without the declared heading."""
-        if up is None and np.isnan(celsius) and trust_heading:
-            return self.unseen_prior
-        temperature_c = celsius if np.isfinite(celsius) else None
-        same_heading = self.now.same_heading and trust_heading
-        now = replace(self.now, up=up, temperature_c=temperature_c, same_heading=same_heading)
-        return prior_of(self.history, self.device_type, now)
 
 
 class Temperature(NamedTuple):
@@ -107,7 +105,6 @@ class Stretch:
     notes: tuple[Reason, ...] = ()  # motions that were cut, conflicts
     gravity: Array = field(default_factory=lambda: np.zeros(4))  # sum over blocks, and their number
     temperature: Temperature = Temperature()
-    last_mean: Array = field(default_factory=lambda: np.zeros(3))  # of the last block
 
     @classmethod
     def start(cls, setup: Setup, start_s: float) -> "Stretch":
@@ -195,7 +192,6 @@ class Stretch:
             monitor=monitor,
             gravity=np.add.accumulate(np.vstack([self.gravity, added]))[-1],
             temperature=temperature,
-            last_mean=blocks.mean[-1],
         )
 
     def cut(self, seconds: float, motion: Reason | None) -> "Stretch":
@@ -209,12 +205,19 @@ class Stretch:
 
     def turned_deg(self, rotation: Array, gravity: Array) -> float:
         """The angle of a turn during a motion, from the integrated rates (3,) or from gravity."""
-        measured = self.up is not None and np.isfinite(gravity).all()
-        tilt = angle_deg(gravity, self.up) if measured and self.up is not None else 0.0
-        return max(float(np.linalg.norm(rotation)), tilt)
+        turn = float(np.linalg.norm(rotation))
+        if self.up is None or not np.isfinite(gravity).all():
+            return turn
+        return max(turn, angle_deg(gravity, self.up))
 
     def _with_prior(self, up: Array | None, celsius: float, trust_heading: bool) -> "Stretch":
-        prior = self.setup.prior(up, celsius, trust_heading)
+        """The stretch with the prior at an attitude and a temperature."""
+        setup, prior = self.setup, self.setup.unseen_prior
+        if up is not None or not np.isnan(celsius) or not trust_heading:
+            temperature_c = celsius if np.isfinite(celsius) else None
+            same_heading = setup.now.same_heading and trust_heading
+            now = replace(setup.now, up=up, temperature_c=temperature_c, same_heading=same_heading)
+            prior = prior_of(setup.history, setup.device_type, now)
         return replace(self, prior=prior, prior_c=celsius, trust_heading=trust_heading)
 
     def _first_conflict(
@@ -283,12 +286,16 @@ class Stretch:
     @cached_property
     def bias(self) -> Array:
         """The bias in the last block, (3,), deg/s; the settled one where the device warms up."""
-        return self._posterior(self.estimate)[0] + self.prior.slope * self._rise_c
+        return self._at_mean_temperature[0] + self.prior.slope * self._rise_c
 
     @cached_property
     def variance(self) -> Array:
         """Variance of the bias, (3,), (deg/s)^2."""
-        return self._posterior(self.estimate)[1] + (self.prior.slope_sigma * self._rise_c) ** 2
+        return self._at_mean_temperature[1] + (self.prior.slope_sigma * self._rise_c) ** 2
+
+    @cached_property
+    def _at_mean_temperature(self) -> tuple[Array, Array]:
+        return self._posterior(self.estimate)
 
     @property
     def _rise_c(self) -> float:
@@ -330,31 +337,36 @@ class Stretch:
         """Floor of the standard deviation of any average of the sensor, (3,), deg/s."""
         return np.asarray(self.setup.noise.floor_dps * np.sqrt(self.noise_scale[0]))
 
-    def reached(self, target_dps: float) -> Mask:
-        """Whether an axis is at the target, (3,); below the floor only with a history."""
-        below = (self.floor_dps > target_dps) & ~self.usable
-        return np.asarray((self.variance <= target_dps**2) & ~below)
+    @property
+    def below_floor(self) -> Mask:
+        """Whether the target is below the floor of an axis without a history, (3,)."""
+        return np.asarray((self.floor_dps > self.setup.target_dps) & ~self.usable)
 
-    def seconds_left(self, target_dps: float, most_s: float) -> Array:
-        """Seconds at rest until the target, (3,); infinite where it takes more than ``most_s``.
+    @property
+    def reached(self) -> Mask:
+        """Whether an axis is at the target, (3,)."""
+        return np.asarray((self.variance <= self.setup.target_dps**2) & ~self.below_floor)
+
+    def seconds_left(self) -> Array:
+        """Seconds at rest until the target, (3,); infinite where that takes over ``LONGEST_S``.
 
         The variances of future blocks do not depend on the data. The distance from the history and
         an unknown noise do, and are assumed to stay as they are now.
         """
-        below = (self.floor_dps > target_dps) & ~self.usable
-        seconds = np.where(self.reached(target_dps), 0.0, np.inf)
+        setup, seconds = self.setup, np.where(self.reached, 0.0, np.inf)
         start = self.estimate.start if self.blocks else np.where(self.usable, self.prior.mean, 0.0)
         (scale, freedom), following, count = self.noise_scale, self.filter, 0
-        while np.any(np.isinf(seconds) & ~below) and count * self.setup.block_s < most_s:
+        open_axes = ~self.below_floor
+        while np.any(np.isinf(seconds) & open_axes) and count * setup.block_s < LONGEST_S:
             following, stack = following.ahead(_LOOKAHEAD_BLOCKS)
             number = count + 1 + np.arange(_LOOKAHEAD_BLOCKS)[:, None]
             later = self._scaled(stack.estimate(), scale, freedom + number)
             later = later._replace(start=np.broadcast_to(start, (_LOOKAHEAD_BLOCKS, 3)))
-            reached = self._posterior(later)[1] <= target_dps**2
+            reached = self._posterior(later)[1] <= setup.target_dps**2
             first = np.where(reached.any(axis=0), count + 1 + reached.argmax(axis=0), np.inf)
-            seconds = np.minimum(seconds, first * self.setup.block_s)
+            seconds = np.minimum(seconds, first * setup.block_s)
             count += _LOOKAHEAD_BLOCKS
-        return np.where(below, np.inf, seconds)
+        return np.where(open_axes, seconds, np.inf)
 
 
 def _temperature_rise(start: float, end: float) -> float:
