@@ -9,8 +9,9 @@ import numpy as np
 import pandas as pd
 import torch
 
+from gyro_pipeline.conventions import InputError
 from gyro_pipeline.learning import fused
-from gyro_pipeline.learning.design import Design
+from gyro_pipeline.learning.design import Design, network_class
 from gyro_pipeline.learning.examples import (
     Examples,
     NetworkInput,
@@ -31,7 +32,9 @@ from gyro_pipeline.learning.trainer import (
 )
 from gyro_pipeline.parameters import Training
 
-# Measured costs, in training samples of three gyroscopes (0.8 ns).
+# Measured costs of the step in C, in training samples of three gyroscopes.
+_SAMPLE_S = 0.8e-9
+"""Seconds of a training sample."""
 _EPOCH_OVERHEAD = 800_000
 """Cost of an epoch besides its training samples, mostly validation."""
 _LARGE = 15_000_000
@@ -81,9 +84,39 @@ class TrainingJob:
     def work(self) -> float:
         """Estimated cost of the training, in samples of three gyroscopes."""
         epochs = len(self.settings.learning_rates(self.windows))
-        samples = self.windows * self.design.window * len(self.devices[0].imus)
-        epoch = samples * (1 + samples / _LARGE) + _EPOCH_OVERHEAD
+        if network_class(self.design.path) is CalibrationNetwork:
+            samples = self.windows * self.design.window * len(self.devices[0].imus)
+            epoch = samples * (1 + samples / _LARGE) + _EPOCH_OVERHEAD
+        else:
+            batch = min(self.windows, self.settings.batch_size)
+            epoch = self.windows / batch * step_s(self.design, batch) / _SAMPLE_S
         return self.recordings * _RECORDING_WORK + epochs * epoch
+
+
+_STEPS_S: dict[str, float] = {}
+"""Seconds of a training step by design and batch."""
+
+
+def step_s(design: Design, batch: int) -> float:
+    """Seconds of a training step in PyTorch on one thread, measured once in each process.
+
+    Raises:
+        InputError: A step fails.
+    """
+    key = f"{design} {batch}"
+    if key not in _STEPS_S:
+        inputs = np.zeros((batch, *design.layout.shape), np.float32)
+        targets = np.zeros((batch, design.gyroscopes), np.float32)
+        with one_thread(), torch.random.fork_rng(devices=[]):
+            engine = TorchEngine(design.build(seed=0), inputs, targets, batch)
+            try:
+                engine.epoch(np.arange(batch), 0.0)  # the first step takes longer
+                started = time.perf_counter()
+                engine.epoch(np.arange(batch), 0.0)
+            except RuntimeError as error:
+                raise InputError(f"{design}: a training step failed: {error}") from error
+        _STEPS_S[key] = time.perf_counter() - started
+    return _STEPS_S[key]
 
 
 @dataclass(frozen=True)
