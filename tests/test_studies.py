@@ -159,15 +159,6 @@ def test_the_leak_study_has_every_way_of_training_at_every_stride(base):
     assert {row.protocol for row in others} == {"by_recording", "leave_one_device_out"}
 
 
-# what a run depends on
-
-
-# only
-
-
-# run parameters
-
-
 def test_a_run_carries_its_identity_and_the_settings_that_it_depends_on(base):
     def params_of(row, study="augmentation"):
         given = base.training, base.splits, base.virtual_gyros
