@@ -15,7 +15,6 @@ from pathlib import Path
 
 import psutil
 import pytest
-from joblib.externals.loky import get_reusable_executor
 
 from gyro_pipeline import executors
 from gyro_pipeline.conventions import InputError
@@ -69,12 +68,6 @@ def here(monkeypatch):
 @pytest.fixture(autouse=True)
 def no_terminal(monkeypatch):
     monkeypatch.setattr(sys, "stderr", io.StringIO())
-
-
-@pytest.fixture(scope="module", autouse=True)
-def nothing_left_behind():
-    yield
-    get_reusable_executor().shutdown(kill_workers=True)
 
 
 def soon(condition, told):
