@@ -24,7 +24,6 @@ from gyro_pipeline.parameters import Execution
 SERIAL = Execution(executor="serial", workers=None)
 PAIR = Execution(executor="processes", workers=2)
 
-
 pytestmark = pytest.mark.slow
 
 LONG_S = 120.0
@@ -192,9 +191,6 @@ def test_workers_end_with_their_parent_and_leave_ctrl_c_to_it(program, number):
     else:
         program.kill()
     soon(lambda: not any(map(runs, family)), f"still running: {list(filter(runs, family))}")
-
-
-# on a cluster
 
 
 @pytest.fixture

@@ -95,7 +95,6 @@ SWITCH = 0.01 * np.random.default_rng(0).choice([1, 2], N)
 FLAGS = "temp (degC),sync,hundredths,status"
 WARMTH = 25 + 0.1 * np.random.default_rng(0).integers(0, 2, N)
 SWING = X + [0, 20, 0] * np.sin(2 * np.pi * S / 3)[:, None]
-DEAD = np.where(np.abs(dead := still(bias=(0.04, -0.02, 0.01))) < 0.05, 0, dead)
 LEVEL = np.array([0.3, -0.2, 0.1])
 FREED = still(bias=(0, 0, 0))
 STEPS = np.random.default_rng(0).normal(10, 0.3, N)
@@ -122,9 +121,6 @@ KINDS = {  # a header, columns, and how it ends with some options
     "16 Sensor Logger": ("time,seconds_elapsed,z,y,x", [STAMPS, S, X[:, ::-1] * RAD],
         [({}, Refused("unit")), ({"units": "rad/s"}, Kept(rate_hz=100))]),
     "23 a large swing": (f"{T},{G}", [S, SWING], [({}, Rejected("^(?!.*check the unit).*motion"))]),
-    "24 a drift that does not settle": (f"{T},{G}", [S, X + np.linspace(0, 0.2, N)[:, None]],
-        [({}, Kept(np.array(TRUTH) + 0.1, "^(?!.*warm-up)(?!.*1e.04).*drift"))]),
-    "27 a dead band": (f"{T},{G}", [S, DEAD], [({}, Rejected("dead band.*0.05"))]),
     **{f"28 blank but in {k}": (f"{T},ax (g),ay (g),az (g),{G}", [S / 2, ACC, blank(X, K % k > 0)],
         [({}, Kept(rate_hz=200 / k))]) for k in (2, 4)},
     **{f"30 a unit of something else {unit}": (f"{T},gx ({unit}),gy ({unit}),gz ({unit})", [S, X],

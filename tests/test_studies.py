@@ -102,9 +102,6 @@ def test_networks_are_refused_on_devices_that_they_cannot_have_seen(parameters):
         check_possible(parameters("base", studies=study), ["unseen_devices"])
 
 
-# the grids
-
-
 def test_augmentation_is_the_papers_grid_with_a_running_mean_for_each_window(base):
     grid = product(["dot", "sparkfun"], [3, 12], [0, 12, 24], [10.0, 30.0])
     runs = runs_of(base, "augmentation")

@@ -221,9 +221,6 @@ def test_two_at_once_fetch_it_once(server, path):
     assert len(server.asked) == 1
 
 
-# the dataset
-
-
 def array(recordings, gyroscopes, samples, seed=0):
     return np.random.default_rng(seed).normal(0, 0.05, (recordings, gyroscopes, samples))
 

@@ -109,19 +109,6 @@ def test_masked_samples_hardly_matter_and_recordings_that_a_device_lacks_are_lef
         np.testing.assert_allclose(bias, make(name).fit(training_set(fewer)).estimate(windows)[0])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["empirical_bayes", "empirical_bayes_pooled", "best_linear"])
-def test_on_an_unseen_device_nothing_beats_the_mean(simulate, judged, name, training_set):
-    """Its prior is the spread from unit to unit, here 100 times that of the noise."""
-    known = simulate(MODEL, 6, seed=3, imus=5, unit_bias=0.5)
-    unseen = simulate(MODEL, 10, seed=4, unit_bias=0.5)
-    for training in (known.sel(imu=slice(2, 5)), known.sel(imu=slice(2, 3))):
-        estimator = make(name).fit(training_set(training, device=1))
-        errors, _ = judged(estimator, unseen, 10, BIAS)
-        mean, _ = judged(RunningMean(), unseen, 10, BIAS)
-        assert np.sqrt(np.mean(errors**2) / np.mean(mean**2)) == pytest.approx(1, abs=0.01)
-
-
 def test_averages_are_those_of_numpy_and_scipy_and_need_no_fit_but_for_the_sigma(
     recordings, windows, training_set
 ):

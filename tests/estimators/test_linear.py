@@ -28,8 +28,8 @@ def rms(errors):
 
 def halves(recordings, count):
     """The first recordings, which train, and the others, which test."""
-    numbers = np.arange(recordings.sizes["recording"])
-    return recordings.isel(recording=numbers[:count]), recordings.isel(recording=numbers[count:])
+    parts = slice(count), slice(count, None)
+    return tuple(recordings.isel(recording=part) for part in parts)
 
 
 def walking(simulate, count, seed, walk_seed):

@@ -72,6 +72,8 @@ def test_the_device_comes_first_virtual_imus_last_and_a_part_is_what_an_estimato
     ]
     assert [s.tolist() for s in training.imus["real", 3].starts] == [[0, 20], [0, 20]]
     unseen = TrainingSet(training.real, training.virtual, WINDOWS, SIZE, device=9)
+    assert training.labels[0].tolist() == [1, 3, 6]
+    assert unseen.labels[0].tolist() == [2, 1, 3, 6, 4, 5]
     for one, uses, imus in (
         (training, NOTHING, []),
         (training, OWN, [2]),
@@ -83,20 +85,6 @@ def test_the_device_comes_first_virtual_imus_last_and_a_part_is_what_an_estimato
         assert [imu for _, imu, _ in places(part)] == imus
         assert {origin for origin, *_ in places(part)} <= {ORIGIN_REAL}
     assert len(training.part(ALL).imus) == 4
-
-
-def test_of_a_device_its_own_recordings_tell_and_of_an_unseen_one_all_real_ones(training):
-    real = training.real.angular_rate.to_numpy()
-    np.testing.assert_array_equal(training.rates, real[1, [0, 2, 5]])
-    numbers, means = training.labels
-    assert numbers.tolist() == [1, 3, 6]
-    np.testing.assert_allclose(means, real[1, [0, 2, 5]].mean(axis=-1), atol=1e-6)
-    assert (training.recordings(), training.recordings(TRAIN)) == (3, 2)
-
-    unseen = TrainingSet(training.real, training.virtual, WINDOWS, SIZE, device=9)
-    assert (training.seen, unseen.seen) == (True, False)
-    assert unseen.labels[0].tolist() == [2, 1, 3, 6, 4, 5]
-    assert (unseen.recordings(), unseen.recordings(TRAIN)) == (6, 5)
 
 
 def test_keys_tell_training_sets_and_recordings_apart(training):

@@ -27,7 +27,6 @@ STARTS = range(0, 801, 200)
 PARTS = ("nothing", "own", "real", "all")
 THEIRS = "a_strangers_estimators"
 
-
 pytestmark = pytest.mark.slow
 STRANGER = """
 import numpy as np
@@ -87,9 +86,6 @@ def few(make_recordings, make_world, make_study):
         return make_world(recordings, study=make_study("some", estimators))
 
     return made
-
-
-# what a run is fitted to
 
 
 def test_every_row_is_fitted_to_exactly_the_training_set_that_it_names(strange):
@@ -168,9 +164,6 @@ def test_the_leak_studys_networks_see_what_their_protocol_gives_them(world, make
             assert watched == (tested if spec.protocol == "best_epoch_on_test" else set())
 
 
-# folds, and kills between fits
-
-
 def test_folds_are_fits_of_one_run_and_a_kill_loses_only_what_was_running(few, as_stored, caplog):
     world = few(5, ["empirical_bayes", CNN])
     whole = {(fit.run.fingerprint, fit.fold): fit for fit in world.train()}
@@ -213,9 +206,6 @@ def test_of_few_recordings_what_cannot_be_fitted_is_left_out_and_named_first(few
         assert f"sparkfun {name} " in caplog.text
     fitted = {fit.run.params["estimator"] for fit in few(2, names).train()}
     assert fitted == set(names) - left_out
-
-
-# what decides that a fit is needed
 
 
 def changed(world, **changes):
@@ -310,9 +300,6 @@ def test_a_plan_comes_back_from_its_file_as_it_was(few, tmp_path):
     table.save(plan)
     assert nodes.possible_runs(table.load()) == nodes.possible_runs(plan)
     assert len(nodes.possible_runs(plan)) == 2
-
-
-# what is stored
 
 
 def test_runs_carry_what_they_are_and_an_example_of_their_windows(world, fitted):
