@@ -382,6 +382,7 @@ def test_a_sensor_that_was_turned_is_told_from_others_and_history_follows_it(
     assert scores["prior_p_x"] < 1e-6
     assert scores["prior_p_z"] > 1e-2
     assert scores["constant_rmse_dps"] == pytest.approx(scores["test_rmse_dps"])
+    assert scores["constant_accuracy_gain_pct"] == pytest.approx(scores["accuracy_gain_pct"])
     means = raw.angular_rate.sel(imu=1).mean("sample", dtype=np.float64).to_numpy()
     errors = judged["last_calibration"].artifacts[ERRORS].query("truth == 'paper' and start == 0")
     np.testing.assert_allclose(errors.error_dps, np.ravel(means[9:13] - means[10:]), atol=1e-12)

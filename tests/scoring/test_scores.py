@@ -7,9 +7,11 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from gyro_pipeline.conventions import ALL, DISJOINT, FIRST, PAPER, TRUE
+from gyro_pipeline.conventions import ALL, BEST, DISJOINT, FIRST, LAST, PAPER, TRUE
+from gyro_pipeline.scoring.scorer import read_scores
 from gyro_pipeline.scoring.scores import (
     Curve,
+    Estimate,
     SquaredErrors,
     WeightedCurve,
     beats_oracle,
@@ -42,11 +44,6 @@ def squares(values):
 def curve_of(times_s, rmse, recordings=1):
     sums = np.tile(np.square(rmse), (recordings, 1))
     return Curve(np.array(times_s, float), SquaredErrors(sums, np.ones_like(sums)))
-
-
-def scored(errors, mean_errors, curve, window_s, weights):
-    """The scores with the curve resampled alike."""
-    return score(errors, mean_errors, curve.of(weights), window_s, weights)
 
 
 def test_squared_errors_by_hand():
@@ -148,8 +145,9 @@ def test_a_rough_curve_is_made_to_fall_so_that_the_mean_saves_no_time_on_itself(
 
 
 def test_one_recording_by_hand():
-    curve = curve_of([1, 2, 5, 10, 20], [8, 5**0.5, 2, 1, 0.5])
-    scores = scored(squares([[0.6, 0.8, 0.5**0.5, 0.5**0.5]]), squares([[3, 1]]), curve, 2.0, PLAIN)
+    curve = curve_of([1, 2, 5, 10, 20], [8, 5**0.5, 2, 1, 0.5]).of(PLAIN)
+    errors, of_mean = squares([[0.6, 0.8, 0.5**0.5, 0.5**0.5]]), squares([[3, 1]])
+    scores = score(errors, of_mean, curve, 2.0, PLAIN)
     # RMSE sqrt(2 / 4) against sqrt(10 / 2); the curve falls from 1 to 0.5 between 10 and 20 s
     rmse, mean = np.sqrt(0.5), np.sqrt(5)
     time_s = 10 + 10 * (1 - rmse) / 0.5
@@ -166,7 +164,7 @@ def test_one_recording_by_hand():
     )
     assert all(estimate.lo is None and estimate.hi is None for estimate in scores.values())
     for wrong, off in ((9.0, -np.inf), (0.1, np.inf)):  # off the curve
-        scores = scored(squares([wrong]), squares([2.0]), curve, 5.0, PLAIN)
+        scores = score(squares([wrong]), squares([2.0]), curve, 5.0, PLAIN)
         assert scores["equivalent_time_s"].value == scores["time_saving_pct"].value == off
         assert scores["accuracy_gain_pct"].value == pytest.approx(100 * (1 - wrong / 2))
 
@@ -175,7 +173,8 @@ def test_intervals_hold_the_value_and_pair_the_estimator_with_the_mean():
     generator = np.random.default_rng(1)
     mean = np.exp(generator.normal(size=(25, 1)))  # errors differ much by recording
     curve = curve_of([1, 2, 5, 10], [9, 3, 1, 0.1], recordings=25)
-    scores = scored(squares(0.5 * mean), squares(mean), curve, 2.0, leave_one_out(25))
+    weights = leave_one_out(25)
+    scores = score(squares(0.5 * mean), squares(mean), curve.of(weights), 2.0, weights)
     rmse = scores["test_rmse_dps"]
     assert rmse.lo < 0.8 * rmse.value < 1.2 * rmse.value < rmse.hi
     # Half the error in every recording is half of it whichever are left out.
@@ -190,15 +189,16 @@ def test_without_a_positive_square_there_is_no_root_and_nothing_is_clipped():
     table = errors_table(*((r, 0, DISJOINT, 0.1 * r, 0.2) for r in range(1, 6)))
     negative, sure = squared_errors(table, DISJOINT, ALL), squares(np.ones((5, 1)))
     uncertain = SquaredErrors(np.array([1.0, -0.9, 1.0, -0.9, 0]), np.ones(5), exact=False)
-    curve, weights = curve_of([1, 2], [2, 1], recordings=5), leave_one_out(5)
-    scores = scored(negative, replace(sure, exact=False), curve, 1.0, weights)
+    weights = leave_one_out(5)
+    curve = curve_of([1, 2], [2, 1], recordings=5).of(weights)
+    scores = score(negative, replace(sure, exact=False), curve, 1.0, weights)
     assert set(scores) == {"test_mse_dps2"}
     mse = scores["test_mse_dps2"]
     assert mse.value == pytest.approx(np.mean([0.01, 0.04, 0.09, 0.16, 0.25]) - 0.2)
     assert mse.lo < mse.value < mse.hi
     for pair in ((uncertain, sure), (replace(sure, exact=False), uncertain)):
-        assert set(scored(*pair, curve, 1.0, weights)) == {"test_mse_dps2"}
-    assert "test_rmse_dps" in scored(sure, sure, curve, 1.0, weights)
+        assert set(score(*pair, curve, 1.0, weights)) == {"test_mse_dps2"}
+    assert "test_rmse_dps" in score(sure, sure, curve, 1.0, weights)
 
 
 def test_the_check_is_one_sided_and_counts_every_recording_once():
@@ -242,9 +242,8 @@ def test_a_prior_that_test_recordings_contradict_is_found_and_others_are_not():
     generator = np.random.default_rng(5)
     trained, tested = generator.normal(0, 1, (1000, 12, 3)), generator.normal(0, 1, (1000, 6, 3))
     chances = np.array([prior_conflict(*pair) for pair in zip(trained, tested, strict=True)])
-    np.testing.assert_allclose(
-        (chances < [[[0.01]], [[0.05]], [[0.5]]]).mean(axis=(1, 2)), [0.01, 0.05, 0.5], atol=0.015
-    )
+    for level in (0.01, 0.05, 0.5):
+        assert (chances < level).mean() == pytest.approx(level, abs=0.015)
     turned = prior_conflict(trained[0], tested[0] + [-6, 6, 0])
     assert (turned[:2] < 1e-3).all()
     assert turned[2] == chances[0, 2]
@@ -259,3 +258,32 @@ def test_coverage_counts_the_errors_within_the_stated_deviations():
     assert coverage(table, PAPER, 2) == 0.75
     assert coverage(table, TRUE, 1) == 1
     assert np.isnan(coverage(table.assign(sigma_dps=np.nan), PAPER, 1))
+
+
+def test_stored_scores_are_read_by_truth_and_epoch():
+    rows = [
+        (LAST, PAPER, ALL, "a", 1.0, 0.5, 1.5),
+        (LAST, PAPER, FIRST, "a", 2.0, None, np.nan),
+        (BEST, PAPER, ALL, "a", 3.0, None, None),
+        (LAST, TRUE, ALL, "a", 4.0, None, None),
+    ]
+    columns = ["weights", "truth", "windows", "score", "value", "lo", "hi"]
+    table = pd.DataFrame(rows, columns=columns)
+    assert read_scores(table) == {("a", ALL): Estimate(1, 0.5, 1.5), ("a", FIRST): Estimate(2)}
+    assert read_scores(table, epoch=BEST) == {("a", ALL): Estimate(3)}
+    assert read_scores(table, truth=TRUE) == {("a", ALL): Estimate(4)}
+
+
+@pytest.mark.parametrize(
+    ("gain", "ceiling", "above"),
+    [
+        ((70, 66, 74), (60, 55, 65), True),
+        ((70, 64, 74), (60, 55, 65), False),
+        ((70, 66, 74), (60, None, None), True),
+        ((70, np.nan, np.nan), (60, 55, 65), False),
+        ((70, None, None), (60, 55, 65), False),
+        ((70, 66, 74), (np.nan, np.nan, np.nan), False),
+    ],
+)
+def test_an_interval_lies_above_another_only_entirely(gain, ceiling, above):
+    assert Estimate(*gain).lies_above(Estimate(*ceiling)) is above
