@@ -62,16 +62,11 @@ def refused(project, words, pipeline="real2real", env="mine", run=None, **params
     assert not [path for path in new if "mlruns" in path.parts]
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"stuck": 0.25}, ["IMU 1 recording 7", "mine.npy recording 7", "stuck", "axis z"]),
-        ({"samples": 200}, ["0 of 7 recordings", "too short", "8 s", "quality.least_s"]),
-        ({"samples": 300}, ["window of 30 s is 750 samples", "has 300", "windows_s"]),
-    ],
-)
-def test_files(mine, changes, words):
-    refused(mine(**changes), ["memsense", *words])
+def test_files(mine):
+    words = ["memsense", "IMU 1 recording 7", "mine.npy recording 7", "stuck", "axis z"]
+    refused(mine(stuck=0.25), words)
+    words = ["memsense", "window of 30 s is 750 samples", "has 300", "windows_s"]
+    refused(mine(samples=300), words)
 
 
 def test_entries_and_parameters(mine):

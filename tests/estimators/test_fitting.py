@@ -97,12 +97,10 @@ def test_a_strangers_estimators_are_fitted_and_one_that_fails_ends_the_run_after
 @pytest.mark.slow
 def test_networks_are_trained_in_a_batch_and_all_else_in_processes(recordings, training_set):
     jobs = jobs_of(training_set(recordings), ["mean", "cnn", "cnn_shuffled"], seeds=(0, 1))
-    batched = {
-        job.key: fit for job, fit in run_fits(jobs, Execution(executor="batched", workers=2), "all")
-    }
-    alone = {
-        job.key: fit for job, fit in run_fits(jobs, Execution(executor="serial", workers=2), "all")
-    }
+    batched, alone = (
+        {job.key: fit for job, fit in run_fits(jobs, Execution(executor=name, workers=2), "all")}
+        for name in ("batched", "serial")
+    )
     assert {name: fit.engine.split()[0] for name, fit in batched.items()} == {
         job.key: "cpu" if job.estimator == "mean" else "batched" for job in jobs
     }

@@ -6,15 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gyro_pipeline.conventions import (
-    ALL_RECORDINGS,
-    HOLD_OUT,
-    ORIGIN_REAL,
-    ORIGIN_VIRTUAL,
-    TRAIN,
-    VALIDATION,
-    InputError,
-)
+from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.tables import Table
 from gyro_pipeline.estimators import estimator_class
 from gyro_pipeline.parameters import Only
@@ -101,12 +93,12 @@ def test_every_row_is_fitted_to_exactly_the_training_set_that_it_names(strange):
         real = {"nothing": 0, "own": 1}.get(part, row.real_gyros // 3)
         virtual = row.virtual_gyros // 3 if part == "all" else 0
         expected = [
-            (VALIDATION if number > 8 else TRAIN, ORIGIN_REAL, imu, number, start)
+            ("validation" if number > 8 else "train", "real", imu, number, start)
             for imu in range(1, 1 + real)
             for number in range(1, 11)
             for start in STARTS
         ] + [
-            (TRAIN, ORIGIN_VIRTUAL, imu, number, start)
+            ("train", "virtual", imu, number, start)
             for imu in range(1, 1 + virtual)
             for number in range(1, 6)
             for start in STARTS
@@ -115,7 +107,7 @@ def test_every_row_is_fitted_to_exactly_the_training_set_that_it_names(strange):
         assert (fit.estimator.size, fit.estimator.device) == (200, 1)
         # nothing of what was drawn
         assert fit.estimator.seen == {"angular_rate", "samples", "recording_mean"}
-        sources = {ORIGIN_REAL: strange.raw, ORIGIN_VIRTUAL: strange.virtual}
+        sources = {"real": strange.raw, "virtual": strange.virtual}
         for (origin, imu, number), first in fit.estimator.firsts.items():
             samples = sources[origin].angular_rate.sel(imu=imu, recording=number)
             np.testing.assert_array_equal(first, samples[:, 0])
@@ -135,8 +127,8 @@ def test_of_unseen_devices_every_fold_trains_on_all_others(strange, make_study):
     numbers = range(1, 11)  # others were made together with those that test
     assert places["without IMU 1"] == {(2, number) for number in numbers}
     assert places["without IMU 2"] == {(1, number) for number in numbers}
-    assert places[ALL_RECORDINGS] == {(imu, n) for imu in (1, 2) for n in range(1, 15)}
-    assert [fold for fold, fit in fits.items() if fit.is_model] == [ALL_RECORDINGS]
+    assert places["all recordings"] == {(imu, n) for imu in (1, 2) for n in range(1, 15)}
+    assert [fold for fold, fit in fits.items() if fit.is_model] == ["all recordings"]
 
 
 def test_the_leak_studys_networks_see_what_their_protocol_gives_them(world, make_study):
@@ -167,12 +159,12 @@ def test_the_leak_studys_networks_see_what_their_protocol_gives_them(world, make
 def test_folds_are_fits_of_one_run_and_a_kill_loses_only_what_was_running(few, as_stored, caplog):
     world = few(5, ["empirical_bayes", CNN])
     whole = {(fit.run.fingerprint, fit.fold): fit for fit in world.train()}
-    names = [*(f"fold {number}" for number in range(5)), ALL_RECORDINGS]
+    names = [*(f"fold {number}" for number in range(5)), "all recordings"]
     assert len(world.plan) == 3
     assert set(whole) == {(key, fold) for key in world.specs for fold in names}
     for fit in whole.values():
         assert (fit.run.folds, fit.run.params["folds"]) == (tuple(names), 5)
-        assert fit.is_model == (fit.fold == ALL_RECORDINGS)
+        assert fit.is_model == (fit.fold == "all recordings")
     for stop in (1, 8):
         stored = as_stored(list(whole.values())[:stop])
         caplog.clear()
@@ -254,7 +246,7 @@ def test_everything_changes_with_the_recordings_their_labels_and_with_those_that
     everything = set(varied.fingerprints)
     assert changed(varied, raw=varied.raw.assign_attrs(data_hash="of others")) == everything
     roles = varied.raw.split.to_numpy().copy()
-    roles[10] = TRAIN
+    roles[10] = "train"
     moved = varied.raw.assign_coords(split=("recording", roles))
     assert changed(varied, raw=moved) == everything
     ends = varied.raw.angular_rate.isel(sample=0, drop=True).astype(float)
@@ -288,7 +280,7 @@ def test_what_a_study_has_is_skipped_and_what_another_has_is_shared(
             assert fit.estimator.history is twin.estimator.history
         assert fit.run.study == fit.run.params["study"] == "real2real"
         assert {**fit.run.params, "study": "augmentation"} == twin.run.params
-        assert (fit.run.name, fit.run.folds, fit.is_model) == (twin.run.name, (HOLD_OUT,), True)
+        assert (fit.run.name, fit.run.folds, fit.is_model) == (twin.run.name, ("hold-out",), True)
     with pytest.raises(InputError, match=r"sparkfun: real2real needs 9 gyroscopes, .* hold 6"):
         replace(world, study=make_study("real2real", real_gyros=[9])).train()
 
