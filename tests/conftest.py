@@ -187,6 +187,19 @@ def _excepthook(monkeypatch):
 
 
 @pytest.fixture(scope="session")
+def real_file():
+    """Paths of real recordings, by name; who asks for one that is not there is skipped."""
+
+    def named(name):
+        path = Path(os.environ.get("GYRO_PIPELINE_REAL_DATA", ""), name)
+        if not path.is_file():
+            pytest.skip(f"GYRO_PIPELINE_REAL_DATA names no folder with {name}")
+        return path
+
+    return named
+
+
+@pytest.fixture(scope="session")
 def made_once(tmp_path_factory):
     """Makes a folder once for all processes that run tests: ``made_once(name, make)``."""
     own = tmp_path_factory.getbasetemp()

@@ -87,20 +87,14 @@ def datasets_of(pipelines):
     return sorted(name for name in names if not name.startswith("params:"))
 
 
-def paths(env, names):
-    """Where each dataset is stored."""
-    entries = {name: entry(name, env) for name in names}
-    keys = ("filepath", "path")
-    return {n: one[key] for n, one in entries.items() for key in keys if one.get(key)}
-
-
 @pytest.mark.parametrize("env", ["base", *ENVS])
 def test_every_dataset_has_an_entry_and_a_path_of_its_own_with_the_source(registered, env):
     assert set(registered[env]) == PIPELINES
     names = datasets_of(registered[env])
     assert [name for name in names if entry_name(env, name) is None] == []
     source = configuration(env)["globals"]["source"]
-    stored = paths(env, names)
+    entries, keys = {name: entry(name, env) for name in names}, ("filepath", "path")
+    stored = {n: one[key] for n, one in entries.items() for key in keys if one.get(key)}
     elsewhere = {path for path in stored.values() if source not in Path(path).parts}
     assert elsewhere == SHARED | ({PUBLISHED} if env == "published" else set())
     # what is read, and is there already, becomes the recordings in the end

@@ -1,6 +1,5 @@
 """The commands of the README, on the smoke environment and on the real Memsense file."""
 
-import os
 import re
 import shutil
 from collections import Counter
@@ -268,13 +267,10 @@ def test_an_estimator_of_ones_own_is_trained_on_what_rows_name_and_only_what_cha
     assert bias.stat().st_mtime_ns > before
 
 
-def test_the_real_file_has_known_errors_and_stands_beside_the_simulated_one(smoke_copy):
-    file = Path(os.environ.get("GYRO_PIPELINE_REAL_DATA", ""), "memsense_test_real.npy")
-    if not file.is_file():
-        pytest.skip(f"GYRO_PIPELINE_REAL_DATA names no folder with {file.name}")
+def test_the_real_file_has_known_errors_and_stands_beside_the_simulated_one(smoke_copy, real_file):
     project, raw = smoke_copy, smoke_copy.folder / "data/01_raw/published"
     raw.mkdir(parents=True)
-    shutil.copy(file, raw)
+    shutil.copy(real_file("memsense_test_real.npy"), raw)
     known = ["mean", "training_mean", "empirical_bayes", "best_linear"]
     studies = {"estimators": {"windows_s": [10], "estimators": known}}
     studies["real2real"] = {"estimators": ["cnn"]}

@@ -1,6 +1,5 @@
 """Against a server on this machine that misbehaves as asked."""
 
-import os
 import re
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -66,11 +65,6 @@ class Server:
     def cut(self, request):
         """Half of it, then the connection ends."""
         self.send(request, HALF)
-
-    def hang(self, request):
-        """Half of it, then silence."""
-        self.cut(request)
-        self.silent(request)
 
     def silent(self, request):
         self.test_is_over.wait(20)
@@ -199,7 +193,7 @@ def test_a_cut_connection_is_continued_from_where_it_broke_behind_redirections_t
 @pytest.mark.slow
 def test_a_later_run_goes_on_where_an_earlier_one_gave_up(server, path, monkeypatch):
     monkeypatch.setattr(download, "_TIMEOUT_S", 0.1)
-    server.faults = [server.silent, server.hang] + [server.silent] * 3
+    server.faults = [server.silent, server.cut] + [server.silent] * 3
     message = refusal(server, path)
     assert "timed out" in message
     assert f"{HALF} bytes are kept, and the next run continues from there" in message
@@ -258,10 +252,8 @@ def test_a_wrong_entry_is_refused_before_anything_is_fetched(server, tmp_path):
     assert server.asked == []
 
 
-def test_the_real_file_has_the_blob_id_that_the_environment_asks_for():
-    path = Path(os.environ.get("GYRO_PIPELINE_REAL_DATA", ""), "memsense_test_real.npy")
-    if not path.is_file():
-        pytest.skip(f"GYRO_PIPELINE_REAL_DATA does not name the folder of {path.name}")
+def test_the_real_file_has_the_blob_id_that_the_environment_asks_for(real_file):
+    path = real_file("memsense_test_real.npy")
     catalog = Path(__file__).parents[2] / "conf" / "published" / "catalog.yml"
     assert f"{path.name}, blob: {blob_id(path)}" in catalog.read_text()
 

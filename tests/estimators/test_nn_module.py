@@ -115,13 +115,11 @@ def test_a_name_says_what_is_made_and_settings_that_follow_it_change_that(traini
     assert make_estimator("cnn_shuffled", SETTINGS, 0)._shuffled
     wide = make_estimator("cnn learning_rate=1e-2 channels=6", SETTINGS, 0)
     changes = {"learning_rate": 0.01, "channels": 6}
-    assert wide.settings == settings_of("cnn learning_rate=1e-2 channels=6", SETTINGS)
     assert wide.settings == plain.settings | changes
     assert wide.job(training).design.options["channels"] == 6
     lstm = make_estimator("lstm units=5 centring=global", SETTINGS, 0)
-    assert lstm.settings == SETTINGS.schedule | {
-        **{"units": 5, "layers": 1, "block_s": 0.1, "centring": "global"}
-    }
+    options = {"units": 5, "layers": 1, "block_s": 0.1, "centring": "global"}
+    assert lstm.settings == SETTINGS.schedule | options
     assert lstm.job(training).design.options["rate_hz"] == RATE
     assert make_estimator("best_linear warm_up=true", SETTINGS, 0)._warm_up is True
     assert settings_of("best_linear", SETTINGS) == {}

@@ -1,7 +1,6 @@
 """Allan variances against published figures, and noise figures fitted to them."""
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,6 @@ from gyro_pipeline.conventions import MDPS, InputError
 from gyro_pipeline.physics import allan
 
 GOLDEN = json.loads((Path(__file__).parent / "golden" / "overlapping_allan.json").read_text())
-REAL_DATA = os.environ.get("GYRO_PIPELINE_REAL_DATA")
 RATE = 100.0
 SAMPLES = 10_000
 
@@ -106,9 +104,8 @@ def test_times_before_the_shortest_have_no_influence_and_variances_are_positive(
             allan.fit_noise(times, curve, 100.0, shortest_s=0.0)
 
 
-@pytest.mark.skipif(REAL_DATA is None, reason="GYRO_PIPELINE_REAL_DATA names no folder")
-def test_real_memsense_white_noise():
+def test_real_memsense_white_noise(real_file):
     """Of recordings (recording, axis, sample) at 250 Hz."""
-    recordings = np.load(Path(REAL_DATA) / "memsense_test_real.npy")
+    recordings = np.load(real_file("memsense_test_real.npy"))
     white = [fit_mean(recordings[:, axis], 250.0).white for axis in range(3)]
     np.testing.assert_allclose(white, np.array([5.3, 4.7, 6.0]) * MDPS, rtol=0.05)

@@ -1,8 +1,6 @@
 """What is unusual about a recording, which rows are masked, and whether it is at rest."""
 
-import os
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +14,6 @@ from gyro_pipeline.quality import inspect
 ROWS, RATE_HZ, SIGMA = 6000, 100.0, 0.05
 BIAS = np.array([0.7, -0.4, 0.15])
 SECONDS = np.arange(ROWS) / RATE_HZ
-REAL_DATA = os.environ.get("GYRO_PIPELINE_REAL_DATA")
 
 
 @pytest.fixture(scope="module")
@@ -224,8 +221,7 @@ def test_at_rest_is_kept_at_any_rate_and_length(quality, rate_hz, minutes):
         assert checks(inspected).keys() <= {"warm-up", "drift"}
 
 
-@pytest.mark.skipif(REAL_DATA is None, reason="GYRO_PIPELINE_REAL_DATA names no folder")
-def test_all_real_recordings_of_memsense_are_kept_whole(quality):
-    for rates in np.load(Path(REAL_DATA) / "memsense_test_real.npy"):
+def test_all_real_recordings_of_memsense_are_kept_whole(quality, real_file):
+    for rates in np.load(real_file("memsense_test_real.npy")):
         inspected = inspect(Log(rates.T), 250.0, quality)
         assert (inspected.outcome, inspected.start, inspected.stop) == (KEPT, 0, 13_000)
