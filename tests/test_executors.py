@@ -112,9 +112,7 @@ def test_who_stops_asking_ends_the_workers(here, tmp_path):
     results = run_jobs(jobs, here.sleeps, PAIR, "stopped")
     assert next(results)[0].name == "short"
     workers = [psutil.Process(int(path.stem)) for path in tmp_path.iterdir()]
-    began = time.monotonic()
     results.close()
-    assert time.monotonic() - began < SOON_S
     soon(lambda: not any(map(runs, workers)), "workers still run")
 
 
@@ -234,7 +232,9 @@ def test_a_cluster_gives_what_processes_give_also_where_a_worker_is_killed(here,
     assert begun.count("long") == 2
 
 
-def test_a_scheduler_that_is_killed_or_was_never_there_is_an_error(here, tmp_path, cluster):
+def test_a_scheduler_that_is_killed_or_was_never_there_is_an_error(
+    here, tmp_path, cluster, monkeypatch
+):
     scheduler, _, address = cluster
     jobs = [here.Job("long", LONG_S, str(tmp_path)), here.Job("short", 0.1, str(tmp_path))]
     results = run_jobs(jobs, here.sleeps, on(address), "cluster")
@@ -242,12 +242,9 @@ def test_a_scheduler_that_is_killed_or_was_never_there_is_an_error(here, tmp_pat
     scheduler.kill()
     with pytest.raises(InputError, match="the scheduler of the cluster is gone; start it"):
         next(results)
-    executors._LOG_EVERY_S, before = 1, executors._LOG_EVERY_S
-    try:
-        with pytest.raises(InputError, match="execution.scheduler: .*docs/cluster.md"):
-            list(run_jobs(jobs, here.sleeps, on("tcp://127.0.0.1:9"), "cluster"))
-    finally:
-        executors._LOG_EVERY_S = before
+    monkeypatch.setattr(executors, "_LOG_EVERY_S", 1)
+    with pytest.raises(InputError, match="execution.scheduler: .*docs/cluster.md"):
+        list(run_jobs(jobs, here.sleeps, on("tcp://127.0.0.1:9"), "cluster"))
 
 
 if __name__ == "__main__":

@@ -89,20 +89,6 @@ def test_one_line_is_enough(make):
     assert "rejected: IMU 1 recording 1, notes.txt: " in done.output
 
 
-def test_without_times_the_rate_is_asked_for_and_taken(make):
-    more = "  sensors: ${globals:sensors}\n  reader: {columns: [1, 2, 3]}\n"
-    more += '  pattern: "{imu}/*.csv"\n'
-    project = make("2/a.csv", "2/b.csv", "3/a.csv", catalog=ENVIRONMENT["catalog"] + more)
-    for path in (project.folder / FOLDER).rglob("*.csv"):
-        path.write_text(path.read_text().replace("time (s)", "row"))
-    refused = project.run_here("ground_truth", "mine")
-    assert refused.code == 1
-    assert "rate_hz" in refused.output
-    known = f"source: mine\nsensors: {{device: {{rate_hz: {RATE_HZ}}}}}\n"
-    (project.folder / "conf/mine/globals.yml").write_text(known)
-    check(project.run_here("ground_truth", "mine"), [(2, 1), (2, 2), (3, 1)])
-
-
 def test_documented_options_are_options_of_the_reader():
     table = (Path(__file__).parents[1] / "docs/your_data.md").read_text().split("| `reader` |")[1]
     rows = table.split("\n\n")[0].splitlines()[2:]

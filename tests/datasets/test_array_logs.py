@@ -12,9 +12,8 @@ SENSORS = {"memsense": {"imus": 2, "samples": 13000, "recording_s": 52}}
 TRAIN_TEST = {"test": "test.npy", "train": "train.npy"}
 
 
-def array_logs(folder, files=None, **options):
-    options = {"sensor": "memsense", "sensors": SENSORS, "source": "array"} | options
-    return ArrayLogs(path=str(folder), files=files or {"all": "all.npy"}, **options)
+def array_logs(folder, files=None, sensor="memsense", **options):
+    return ArrayLogs(sensor, SENSORS, "array", str(folder), files or {"all": "all.npy"}, **options)
 
 
 def made(recordings, gyroscopes, samples, seed=0):

@@ -8,11 +8,7 @@ from gyro_pipeline.conventions import BIAS, MDPS, PAPER, RECORDING_MEAN, TRUE, I
 from gyro_pipeline.estimators import DEFAULT, ESTIMATORS, estimator_class, make_estimator
 from gyro_pipeline.estimators.averages import RunningMean
 from gyro_pipeline.estimators.base import Estimator
-from gyro_pipeline.estimators.shrinkage import (
-    EmpiricalBayes,
-    LastCalibration,
-    PooledEmpiricalBayes,
-)
+from gyro_pipeline.estimators.shrinkage import EmpiricalBayes, PooledEmpiricalBayes
 from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.ceiling import oracle, running_mean_rmse
 from gyro_pipeline.physics.recording_model import constant_bias
@@ -139,7 +135,7 @@ def test_the_constant_is_the_mean_of_the_labels(recordings, labels, windows, tra
 def test_the_last_calibration_is_that_of_the_recording_before(
     recordings, labels, windows, training_set
 ):
-    estimator = LastCalibration().fit(training_set(recordings.sel(recording=[2, 7, 4])))
+    estimator = make("last_calibration").fit(training_set(recordings.sel(recording=[2, 7, 4])))
     for number, stored in {3: 2, 4: 2, 5: 4, 7: 4, 8: 7, None: 7}.items():
         bias, _ = estimator.estimate(windows[:1], recording=number)
         np.testing.assert_allclose(bias[0], labels[stored - 1])

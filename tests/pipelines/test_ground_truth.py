@@ -3,11 +3,7 @@ import pytest
 
 from gyro_pipeline.conventions import AXES
 from gyro_pipeline.parameters import GroundTruth
-from gyro_pipeline.pipelines.ground_truth.nodes import (
-    measure_allan_variance,
-    measure_bias,
-    measure_noise,
-)
+from gyro_pipeline.pipelines.ground_truth import nodes
 
 NOISE = 0.005
 RATE_HZ, SAMPLES = 20.0, 1200
@@ -21,8 +17,8 @@ def test_settling_times_and_noise_are_those_of_the_samples_and_what_is_missing_h
     drawn = 300 + np.random.default_rng(1).uniform(-3, 3, (2, 12, 3))
     recordings = make_recordings(drawn, SAMPLES, RATE_HZ, NOISE)
     recordings.angular_rate[1, 4], recordings["samples"][1, 4] = np.nan, 0
-    allan = measure_allan_variance(recordings)
-    bias = measure_bias(recordings, allan, TOLERANCE)
+    allan = nodes.measure_allan_variance(recordings)
+    bias = nodes.measure_bias(recordings, allan, TOLERANCE)
     samples = recordings.angular_rate.to_numpy().astype(np.float64)
     for row in bias.itertuples():
         rates = samples[row.imu - 1, row.recording - 1, AXES.index(row.axis)]
@@ -31,7 +27,7 @@ def test_settling_times_and_noise_are_those_of_the_samples_and_what_is_missing_h
     assert len(bias) == (2 * 12 - 1) * 3
     assert not bias.isna().any(axis=None)
     assert bias[(bias.imu == 2) & (bias.recording == 5)].empty
-    noise = measure_noise(recordings, allan, bias)
+    noise = nodes.measure_noise(recordings, allan, bias)
     assert noise[["imu", "axis"]].to_numpy().tolist() == [[i, a] for i in (1, 2) for a in AXES]
     np.testing.assert_allclose(noise.white_dps_rts, NOISE, rtol=0.08)
     np.testing.assert_allclose(noise.sample_sigma_dps, NOISE * np.sqrt(RATE_HZ), rtol=0.02)
@@ -48,9 +44,9 @@ def test_each_recording_counts_with_its_own_length_and_unmasked_samples_in_float
     uneven["samples"][:, 1], uneven["samples"][:, 2] = 800, 1000
     uneven.angular_rate[:, 1, :, 800:], uneven.angular_rate[:, 2, :, 1000:] = np.nan, np.nan
     uneven.angular_rate[0, 0, :, 400:410] = np.nan
-    allan = measure_allan_variance(uneven)
-    bias = measure_bias(uneven, allan, TOLERANCE)
-    noise = measure_noise(uneven, allan, bias).set_index(["imu", "axis"])
+    allan = nodes.measure_allan_variance(uneven)
+    bias = nodes.measure_bias(uneven, allan, TOLERANCE)
+    noise = nodes.measure_noise(uneven, allan, bias).set_index(["imu", "axis"])
     for row in bias.itertuples():
         one = uneven.angular_rate.sel(imu=row.imu, recording=row.recording, axis=row.axis)
         measured = one.to_numpy().astype(np.float64)
@@ -68,11 +64,11 @@ def test_each_recording_counts_with_its_own_length_and_unmasked_samples_in_float
 
 def test_what_is_too_short_for_a_fit_has_a_bias_and_one_warning(make_recordings, caplog):
     short = make_recordings(np.ones((2, 3, 3)), 30, RATE_HZ, NOISE).assign_coords(imu=[2, 3])
-    allan = measure_allan_variance(short)
-    bias = measure_bias(short, allan, TOLERANCE)
+    allan = nodes.measure_allan_variance(short)
+    bias = nodes.measure_bias(short, allan, TOLERANCE)
     np.testing.assert_allclose(bias.bias_dps, 1, atol=0.1)
     assert bias.standard_error_dps.isna().all()
-    noise = measure_noise(short, allan, bias)
+    noise = nodes.measure_noise(short, allan, bias)
     figures = noise[["white_dps_rts", "instability_dps", "random_walk_dps_per_rts"]]
     assert figures.isna().all(axis=None) and len(noise) == 3 * 2
     (message,) = caplog.messages
