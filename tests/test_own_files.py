@@ -27,24 +27,19 @@ device.raw_logs.files:
 }
 
 
-@pytest.fixture(scope="module")
-def make(new_project):
+@pytest.fixture
+def project(new_project):
     """A project with files of 60 s of a device at rest, in rad/s, and the environment ``mine``."""
-
-    def project(*names, **changes):
-        made, rows = new_project(), 60 * RATE_HZ
-        for seed, name in enumerate(names):
-            rates = np.deg2rad(np.random.default_rng(seed).normal(BIAS, NOISE, (rows, 3)))
-            table = np.column_stack([np.arange(rows) / RATE_HZ, rates])
-            path = made.folder / FOLDER / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            np.savetxt(path, table, "%.9g", ",", header=HEADER, comments="")
-        (made.folder / "conf/mine").mkdir()
-        for kind, text in (ENVIRONMENT | changes).items():
-            (made.folder / f"conf/mine/{kind}.yml").write_text(text)
-        return made
-
-    return project
+    made, rows = new_project(), 60 * RATE_HZ
+    (made.folder / FOLDER).mkdir(parents=True)
+    for seed, name in enumerate(("still_1.csv", "still_2.csv", "still_10.csv")):
+        rates = np.deg2rad(np.random.default_rng(seed).normal(BIAS, NOISE, (rows, 3)))
+        table = np.column_stack([np.arange(rows) / RATE_HZ, rates])
+        np.savetxt(made.folder / FOLDER / name, table, "%.9g", ",", header=HEADER, comments="")
+    (made.folder / "conf/mine").mkdir()
+    for kind, text in ENVIRONMENT.items():
+        (made.folder / f"conf/mine/{kind}.yml").write_text(text)
+    return made
 
 
 def check(done, recordings):
@@ -59,9 +54,8 @@ def check(done, recordings):
         np.testing.assert_allclose(pairs[:, 1], expected_error, rtol=0.25)
 
 
-def test_eight_lines_and_one_command_are_enough(make):
+def test_eight_lines_and_one_command_are_enough_and_without_an_environment_one_line(project):
     assert sum(len(text.splitlines()) for text in ENVIRONMENT.values()) <= 8
-    project = make("still_1.csv", "still_2.csv", "still_10.csv")
     done = project.command("--pipeline=ground_truth", "--env=mine")
     check(done, [(1, 1), (1, 2), (1, 3)])
     assert "still_1.csv is 1, still_2.csv is 2, still_10.csv is 3" in done.output
@@ -78,10 +72,6 @@ def test_eight_lines_and_one_command_are_enough(make):
         assert "Traceback" not in done.output
         assert done.output.count("error: ") == 1
         assert re.search(words, done.output, re.DOTALL)
-
-
-def test_one_line_is_enough(make):
-    project = make("still_1.csv", "still_2.csv", "still_10.csv")
     (project.folder / FOLDER / "notes.txt").write_text("still_2 is the one on the concrete floor\n")
     arguments = f"--params=logs={FOLDER},reader.units=rad/s"
     done = project.command("--pipeline=ground_truth", "--env=logs", arguments)
