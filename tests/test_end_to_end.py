@@ -112,7 +112,6 @@ def test_the_report_says_what_was_run_links_its_runs_and_compares_with_the_paper
     (experiment,) = {run.info.experiment_id for run in smoke.runs}
     for page in (html, text):
         assert "This is a smoke run, not a result." in page
-        assert ORIENTATION_NOTE in page
         assert "7 of 8 published gains on these sensors exceed" in page
         assert f"127.0.0.1:5000/#/experiments/{experiment}/runs" in page
     assert html.count("data:image/png") == len(FIGURES)
@@ -303,6 +302,7 @@ def test_the_real_file_has_known_errors_and_stands_beside_the_simulated_one(smok
     assert 88 <= estimated["best_linear"].data.metrics["coverage_95_pct"] <= 99
     # in the report of its source
     (path,) = (project.folder / "data/08_reporting").glob("published/*/tables/real2real_gen*.csv")
+    assert ORIENTATION_NOTE in (path.parents[1] / "report.md").read_text()
     measured = pd.read_csv(path, dtype={"Runs": str}).iloc[-1]  # an id may have digits only
     assert (measured["Sensor"], measured["Published S/A %"]) == ("memsense", "75/75 (6 real)")
     assert measured["Runs"] == runs["cnn"].info.run_id[:8]

@@ -31,16 +31,13 @@ def fail(error):
 
 def listed(logs, **changes):
     """A source of these, by IMU and recording; in place of a log, what its reading raises."""
-    entries = [
+    entries = []
+    for (imu, recording), log in logs.items():
         # what other processes can call as well, however pytest imported this file
-        LogEntry(
-            *(imu, recording, f"{imu}_{recording}.csv"),
-            partial(copy.copy if isinstance(log, Log) else fail, log),
-            size=len(log.samples) if isinstance(log, Log) else 0,
-            key=f"{imu} {recording} {hash(str(log))}",
-        )
-        for (imu, recording), log in logs.items()
-    ]
+        read = partial(copy.copy if isinstance(log, Log) else fail, log)
+        size = len(log.samples) if isinstance(log, Log) else 0
+        place = imu, recording, f"{imu}_{recording}.csv"
+        entries.append(LogEntry(*place, read, size=size, key=f"{place} {hash(str(log))}"))
     return replace(Logs("dot", "mine", False, RATE_HZ, entries), **changes)
 
 

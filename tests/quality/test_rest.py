@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from gyro_pipeline.quality.rest import RestDetector
+from gyro_pipeline.quality.rest import RestDetector, student_limits
 
 SIZE, SIGMA = 50, 0.05
 
@@ -57,3 +58,11 @@ def test_alarms_at_rest_are_no_more_frequent_than_asked_however_long_one_looks(s
     rng = np.random.default_rng(5)
     alarms = [np.any(detector(size, 0.05).update(*moments(rng, 600, size))) for _ in range(120)]
     assert sum(alarms) <= 12  # of 6 expected at most
+
+
+def test_limits_are_students_or_larger():
+    normal = np.array([2.0, 4.0, 6.0])
+    for freedom, most in ((3, 2), (10, 1.03), (100, 1.001)):
+        ratio = student_limits(normal, freedom) / stats.t.isf(stats.norm.sf(normal), freedom)
+        assert ratio.min() >= 1 - 1e-4
+        assert ratio.max() <= most
