@@ -136,6 +136,11 @@ def test_a_damaged_unfinished_file_is_begun_anew(tmp_path, size=5000):
         file["angular_rate"][0, 0, 0, 50] = 7.0  # as a process that is killed may leave it
     reading(tmp_path).save(listing(one))
     assert reading(tmp_path).load() == []
+    path.write_bytes(content)
+    changed = replace(one, key="of a changed source")
+    for listed, kept in ((one, [described(one)]), (changed, [])):
+        reading(tmp_path).save(listing(listed))
+        assert reading(tmp_path).load() == kept
 
 
 def test_a_process_that_is_killed_loses_the_last_second_at_most(tmp_path, monkeypatch):

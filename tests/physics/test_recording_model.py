@@ -114,3 +114,11 @@ def test_windows_outside_the_recording_and_unknown_truths_are_refused():
         models.best_linear(WHITE, 0, 100, "mean")
     with pytest.raises(InputError, match="shorter than the recording"):
         models.best_linear(WHITE, 0, SAMPLES, DISJOINT)
+
+
+def test_blocks_have_nearly_equal_lengths_and_are_200_at_most():
+    np.testing.assert_array_equal(models.block_edges(10, 3), [0, 3, 7, 10])
+    np.testing.assert_array_equal(models.block_edges(2, 10), [0, 2])
+    assert len(models.block_edges(10_000, 10)) == 201
+    samples = np.arange(10, dtype=np.float32)[None]
+    np.testing.assert_allclose(models.block_means(samples, np.array([0, 3, 7, 10])), [[1, 4.5, 8]])
