@@ -100,6 +100,18 @@ def test_other_networks_see_plain_windows_and_learn_from_all_of_them(path, sched
     assert all(parameter.grad is not None for parameter in network.parameters())
 
 
+def test_the_seed_decides_the_initial_weights_and_leaves_the_global_state_alone():
+    sizes = {"channels": 5, "kernel": 12, "stride": 5, "pool": 3, "hidden": 7}
+    design = Design(f"{HERE}.network:CalibrationNetwork", 3, 123, sizes)
+    before = torch.random.get_rng_state()
+    first, same, other = (
+        nn.utils.parameters_to_vector(design.build(s).parameters()) for s in (0, 0, 1)
+    )
+    assert torch.equal(first, same)
+    assert not torch.isclose(first, other).any()
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
 def test_a_single_gyroscope_is_estimated_from_its_own_samples(schedule):
     network = Design(OTHERS[0], 3, 100, options_of(OTHERS[0], schedule(), {})).build(0)
     windows = torch.randn((2, 3, 100))
