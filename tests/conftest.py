@@ -37,11 +37,6 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)
 
 
-def listen_to_interrupts():
-    """A shell lets what it runs in the background ignore Ctrl-C, and children inherit that."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
 @dataclass(frozen=True)
 class Done:
     """What a command left on the terminal."""
@@ -74,7 +69,8 @@ class Project:
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
-                preexec_fn=listen_to_interrupts,
+                # children inherit that a shell's background jobs ignore Ctrl-C
+                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
             )
 
     def kedro_run(self, *arguments):
@@ -120,13 +116,6 @@ class Project:
                     sys.excepthook(type(error), error, error.__traceback__)
         return Done(code, log.getvalue())
 
-    def configure(self, env, **files):
-        """Write ``conf/<env>``: ``parameters``, ``globals`` and ``catalog``."""
-        folder = self.folder / "conf" / env
-        folder.mkdir(exist_ok=True)
-        for name, content in files.items():
-            (folder / f"{name}.yml").write_text(yaml.safe_dump(content))
-
     def amend(self, env, **parameters):
         """Change some parameters of an environment."""
         path = self.folder / "conf" / env / "parameters.yml"
@@ -151,10 +140,8 @@ class Project:
         from gyro_pipeline.datasets.tracked_runs import TrackedRuns
 
         stored = {one.run_id: one for one in TrackedRuns(str(self.store)).load()}
-        network = vars(stored[run.info.run_id].load_fit(HOLD_OUT))
-        return {
-            name: value.numpy().tobytes() for name, value in network["_artifact"]["last"].items()
-        }
+        weights = vars(stored[run.info.run_id].load_fit(HOLD_OUT))["_artifact"]["last"]
+        return {name: value.numpy().tobytes() for name, value in weights.items()}
 
     def count(self, query):
         """What a counting query finds in the store; cheap enough to poll."""
@@ -197,6 +184,19 @@ def _no_settings_of_this_machine(tmp_path_factory):
 def _excepthook(monkeypatch):
     """A run sets it, also one inside this process."""
     monkeypatch.setattr(sys, "excepthook", sys.excepthook)
+
+
+@pytest.fixture(scope="session")
+def real_file():
+    """Paths of real recordings, by name; who asks for one that is not there is skipped."""
+
+    def named(name):
+        path = Path(os.environ.get("GYRO_PIPELINE_REAL_DATA", ""), name)
+        if not path.is_file():
+            pytest.skip(f"GYRO_PIPELINE_REAL_DATA names no folder with {name}")
+        return path
+
+    return named
 
 
 @pytest.fixture(scope="session")
@@ -348,16 +348,9 @@ def make_recordings():
         if split:
             coords["split"] = ("recording", np.repeat(ROLES, split))
         lengths = np.full(bias.shape[:2], samples)
-        return xr.Dataset(
-            {"angular_rate": (DIMENSIONS, rates), "samples": (DIMENSIONS[:2], lengths)},
-            coords=coords | {"axis": list(AXES)},
-            attrs={
-                "sensor": "sparkfun",
-                "source": "test",
-                "simulated": 0,
-                "rate_hz": rate_hz,
-                "data_hash": data_hash(rates, []),
-            },
-        )
+        data = {"angular_rate": (DIMENSIONS, rates), "samples": (DIMENSIONS[:2], lengths)}
+        attrs = {"sensor": "sparkfun", "source": "test", "simulated": 0, "rate_hz": rate_hz}
+        attrs["data_hash"] = data_hash(rates, [])
+        return xr.Dataset(data, coords | {"axis": list(AXES)}, attrs)
 
     return make

@@ -1,8 +1,5 @@
 """The five public DOT files, and copies of them in other formats, through the raw-logs stage."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -18,40 +15,19 @@ and 13001."""
 
 
 @pytest.fixture(scope="module")
-def folder():
-    """Of the files."""
-    named = os.environ.get("GYRO_PIPELINE_REAL_DATA")
-    if not named or not Path(named, "dot_x_stat_1.csv").is_file():
-        pytest.skip("GYRO_PIPELINE_REAL_DATA names no folder of real recordings")
-    return Path(named)
+def files(real_file):
+    return {imu: real_file(f"dot_x_stat_{imu}.csv") for imu in IMUS}
 
 
 @pytest.fixture(scope="module")
-def rows(folder):
-    """Angular rates of each IMU as its file has them, (rows, 3), parsed here."""
-    parsed = {}
-    for imu in IMUS:
-        _, *lines = (folder / f"dot_x_stat_{imu}.csv").read_text().splitlines()
-        parsed[imu] = np.array([[float(cell) for cell in line.split(",")[7:10]] for line in lines])
-    return parsed
-
-
-@pytest.fixture(scope="module")
-def ran(new_project, folder):
+def ran(new_project, files):
     """``kedro run --pipeline=ground_truth --env=dot_real``: the project, and what it said."""
     project = new_project()
     place = project.folder / "data/01_raw/dot_real"
     place.mkdir(parents=True)
-    for imu in IMUS:
-        (place / f"dot_x_stat_{imu}.csv").symlink_to(folder / f"dot_x_stat_{imu}.csv")
+    for file in files.values():
+        (place / file.name).symlink_to(file)
     return project, project.run_here("ground_truth", "dot_real")
-
-
-@pytest.fixture(scope="module")
-def bias(ran):
-    """The bias table: (imu, axis)."""
-    table = pd.read_csv(ran[0].folder / "data/03_primary/dot_real/dot/bias.csv")
-    return table.set_index(["imu", "axis"])
 
 
 def test_each_row_of_zeros_and_the_dropout_are_found_and_cut(ran):
@@ -69,8 +45,14 @@ def test_each_row_of_zeros_and_the_dropout_are_found_and_cut(ran):
     assert table.rate_hz.tolist() == [RATE_HZ] * 5
 
 
-def test_biases_and_noise_are_those_of_numpy_over_unmasked_rows_to_ten_digits(ran, bias, rows):
-    recordings = open_recordings(ran[0].folder / "data/02_intermediate/dot_real/dot/recordings.nc")
+def test_biases_and_noise_are_those_of_numpy_over_unmasked_rows_to_ten_digits(ran, files):
+    rows = {}  # angular rates of each IMU as its file has them, (rows, 3), parsed here
+    for imu, file in files.items():
+        lines = file.read_text().splitlines()[1:]
+        rows[imu] = np.array([[float(cell) for cell in line.split(",")[7:10]] for line in lines])
+    data = ran[0].folder / "data"
+    bias = pd.read_csv(data / "03_primary/dot_real/dot/bias.csv").set_index(["imu", "axis"])
+    recordings = open_recordings(data / "02_intermediate/dot_real/dot/recordings.nc")
     assert recordings.attrs["rate_hz"] == RATE_HZ
     for imu, number, samples in iterate_recordings(recordings):
         measured = ~np.isnan(samples).any(axis=0)

@@ -24,10 +24,6 @@ def test_each_way_of_training_is_one_run_made_once(new_project):
         given = {"execution": {"executor": "serial"}, "studies": {"leakage": study}}
         return project.run_here("leakage", "smoke", **given | params)
 
-    refused = run(only={"sensor": "dot"})
-    assert refused.code != 0
-    assert "only={'sensor': 'dot'} matches nothing in leakage" in refused.output
-
     done = run()
     assert done.code == 0, done.output
     runs = project.runs("leakage")
@@ -36,8 +32,7 @@ def test_each_way_of_training_is_one_run_made_once(new_project):
     fits = {way: sum(tag.startswith("fit.") for tag in one.data.tags) for way, one in ways.items()}
     assert fits == WAYS
     for (protocol, _), one in ways.items():
-        assert one.info.status == "FINISHED"
-        assert one.data.params["window_stride_s"] == "10.0"
+        assert (one.info.status, one.data.params["window_stride_s"]) == ("FINISHED", "10.0")
         assert protocol in one.info.run_name
         assert protocol in one.data.tags["mlflow.note.content"]
     leaks = [path for path in project.files(REPORT) if "leakage_" in path]

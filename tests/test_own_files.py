@@ -15,13 +15,8 @@ HEADER = "time (s),gx (rad/s),gy (rad/s),gz (rad/s)"
 FOLDER = "data/01_raw/mine"
 
 ENVIRONMENT = {
-    "globals": """\
-source: mine
-sensors: {device: {}}
-""",
-    "parameters": """\
-only: {sensor: device}
-""",
+    "globals": "source: mine\nsensors: {device: {}}\n",
+    "parameters": "only: {sensor: device}\n",
     "catalog": """\
 device.raw_logs.files:
   type: gyro_pipeline.datasets.file_logs.FileLogs
@@ -32,64 +27,41 @@ device.raw_logs.files:
 }
 
 
-def write(path, seconds=60, seed=0):
-    """A device at rest, in rad/s."""
-    rows = round(RATE_HZ * seconds)
-    rates = np.deg2rad(np.random.default_rng(seed).normal(BIAS, NOISE, (rows, 3)))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    table = np.column_stack([np.arange(rows) / RATE_HZ, rates])
-    np.savetxt(path, table, "%.9g", ",", header=HEADER, comments="")
+@pytest.fixture
+def project(new_project):
+    """A project with files of 60 s of a device at rest, in rad/s, and the environment ``mine``."""
+    made, rows = new_project(), 60 * RATE_HZ
+    (made.folder / FOLDER).mkdir(parents=True)
+    for seed, name in enumerate(("still_1.csv", "still_2.csv", "still_10.csv")):
+        rates = np.deg2rad(np.random.default_rng(seed).normal(BIAS, NOISE, (rows, 3)))
+        table = np.column_stack([np.arange(rows) / RATE_HZ, rates])
+        np.savetxt(made.folder / FOLDER / name, table, "%.9g", ",", header=HEADER, comments="")
+    (made.folder / "conf/mine").mkdir()
+    for kind, text in ENVIRONMENT.items():
+        (made.folder / f"conf/mine/{kind}.yml").write_text(text)
+    return made
 
 
-@pytest.fixture(scope="module")
-def make(new_project):
-    """A project with these files of 60 s, or of so many seconds, and the environment ``mine``."""
-
-    def project(*names, seconds=60, **changes):
-        made = new_project()
-        for seed, name in enumerate(names):
-            write(made.folder / FOLDER / name, seconds, seed)
-        (made.folder / "conf/mine").mkdir()
-        for kind, text in (ENVIRONMENT | changes).items():
-            (made.folder / f"conf/mine/{kind}.yml").write_text(text)
-        return made
-
-    return project
-
-
-def biases(project, source="mine", sensor="device"):
-    return pd.read_csv(project.folder / f"data/03_primary/{source}/{sensor}/bias.csv")
-
-
-def printed(done):
-    """The rows of the table on the terminal: IMU, recording, then value and error of each axis."""
-    rows = re.findall(r"^ +(\d+) +(\d+) +(.*±.*)$", done.output, re.MULTILINE)
-    values = [re.findall(r"(-?\d+\.\d+) ± (\d+\.\d+)", row) for *_, row in rows]
-    return {
-        (int(imu), int(number)): np.array(pairs, float)
-        for (imu, number, _), pairs in zip(rows, values, strict=True)
-    }
-
-
-def check(done, recordings, seconds=60):
+def check(done, recordings):
+    """The table on the terminal: IMU, recording, then value and error of each axis."""
     assert done.code == 0, done.output
-    shown = printed(done)
-    assert list(shown) == recordings
-    expected_error = NOISE / np.sqrt(RATE_HZ * seconds)
-    for pairs in shown.values():
+    rows = re.findall(r"^ +(\d+) +(\d+) +(.*±.*)$", done.output, re.MULTILINE)
+    assert [(int(imu), int(number)) for imu, number, _ in rows] == recordings
+    expected_error = NOISE / np.sqrt(RATE_HZ * 60)
+    for *_, row in rows:
+        pairs = np.array(re.findall(r"(-?\d+\.\d+) ± (\d+\.\d+)", row), float)
         np.testing.assert_allclose(pairs[:, 0], BIAS, rtol=0, atol=5 * expected_error)
         np.testing.assert_allclose(pairs[:, 1], expected_error, rtol=0.25)
 
 
-def test_eight_lines_and_one_command_are_enough(make):
+def test_eight_lines_and_one_command_are_enough_and_without_an_environment_one_line(project):
     assert sum(len(text.splitlines()) for text in ENVIRONMENT.values()) <= 8
-    project = make("still_1.csv", "still_2.csv", "still_10.csv")
     done = project.command("--pipeline=ground_truth", "--env=mine")
     check(done, [(1, 1), (1, 2), (1, 3)])
     assert "still_1.csv is 1, still_2.csv is 2, still_10.csv is 3" in done.output
     assert "data/03_primary/mine/device/bias.csv" in done.output
     assert "data/02_intermediate/mine/device/quality.csv" in done.output
-    assert len(biases(project)) == 3 * 3
+    assert len(pd.read_csv(project.folder / "data/03_primary/mine/device/bias.csv")) == 3 * 3
     for env, params, words in (
         ("base", {"logs": FOLDER, "only": {"sensor": "ng"}}, "logs of --params.*--env=logs"),
         ("mine", {"reader": {"units": "deg/s"}}, f"reader of --params.*not used.*{FOLDER}"),
@@ -100,41 +72,17 @@ def test_eight_lines_and_one_command_are_enough(make):
         assert "Traceback" not in done.output
         assert done.output.count("error: ") == 1
         assert re.search(words, done.output, re.DOTALL)
-
-
-def test_one_line_is_enough(make):
-    project = make("still_1.csv", "still_2.csv", "still_10.csv")
     (project.folder / FOLDER / "notes.txt").write_text("still_2 is the one on the concrete floor\n")
     arguments = f"--params=logs={FOLDER},reader.units=rad/s"
     done = project.command("--pipeline=ground_truth", "--env=logs", arguments)
     check(done, [(1, 2), (1, 3), (1, 4)])
     assert "rejected: IMU 1 recording 1, notes.txt: " in done.output
-    assert set(biases(project, "logs").sensor) == {"device"}
-
-
-def test_without_times_the_rate_is_asked_for_and_taken(make):
-    more = "  sensors: ${globals:sensors}\n  reader: {columns: [1, 2, 3]}\n"
-    more += '  pattern: "{imu}/*.csv"\n'
-    project = make("2/a.csv", "2/b.csv", "3/a.csv", catalog=ENVIRONMENT["catalog"] + more)
-    for path in (project.folder / FOLDER).rglob("*.csv"):
-        path.write_text(path.read_text().replace("time (s)", "row"))
-    refused = project.run_here("ground_truth", "mine")
-    assert refused.code == 1
-    assert "rate_hz" in refused.output
-    known = f"source: mine\nsensors: {{device: {{rate_hz: {RATE_HZ}}}}}\n"
-    (project.folder / "conf/mine/globals.yml").write_text(known)
-    check(project.run_here("ground_truth", "mine"), [(2, 1), (2, 2), (3, 1)])
-
-
-def documented_options():
-    """Of the reader, in the table of the documentation."""
-    table = (Path(__file__).parents[1] / "docs/your_data.md").read_text().split("| `reader` |")[1]
-    rows = table.split("\n\n")[0].splitlines()[2:]
-    return [found for row in rows for found in re.findall(r"`([a-z_]+: .*?)`", row)]
 
 
 def test_documented_options_are_options_of_the_reader():
-    options = documented_options()
+    table = (Path(__file__).parents[1] / "docs/your_data.md").read_text().split("| `reader` |")[1]
+    rows = table.split("\n\n")[0].splitlines()[2:]
+    options = [found for row in rows for found in re.findall(r"`([a-z_]+: .*?)`", row)]
     assert options
     for example in options:
         given = yaml.safe_load(f"{{{example}}}")

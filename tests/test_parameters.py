@@ -1,3 +1,5 @@
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 
 import pytest
@@ -37,9 +39,7 @@ def test_every_number_is_a_finite_number_of_its_own_type(loaded):
     places = numbers(given)
     assert len(places) > 200
     for place in places:
-        tree = given
-        for key in place[:-1]:
-            tree = tree[key]
+        tree = reduce(getitem, place[:-1], given)
         kept = tree[place[-1]]
         for value in (True, "1", float("inf"), float("nan"), -1e300):
             tree[place[-1]] = value
@@ -103,6 +103,7 @@ def test_what_sensors_cannot_give_stops_the_studies_that_ask_for_it_and_no_other
         ({"virtual_gyros": {"imus": 4}}, "augmentation", "24 virtual .* needed, .* makes 12"),
         ({"sensors": {"dot": {"recording_s": 20}}}, "real2real", "30 s windows needed.*, 20 s"),
         ({"only": {"sensor": "ng"}}, "augmentation", "'ng'} matches nothing in augmentation"),
+        (study("unseen_devices", estimators=["lstm"]), "unseen_devices", "lstm cannot be judged"),
     ):
         parameters = Parameters(**loaded(**changes))
         with pytest.raises(InputError, match=said):

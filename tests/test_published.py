@@ -1,8 +1,6 @@
 """The one reference file against the text of the paper, where that is at hand."""
 
-import os
 import re
-from pathlib import Path
 
 import pytest
 
@@ -16,14 +14,12 @@ RESULTS = {
 
 
 @pytest.fixture(scope="module")
-def text():
-    data = os.environ.get("GYRO_PIPELINE_REAL_DATA")
-    if not data:
-        pytest.skip("GYRO_PIPELINE_REAL_DATA is not set; the paper would lie beside that folder")
-    path = Path(data).resolve().parents[1] / "paper" / PAPER
-    if not path.is_file():
-        pytest.skip(f"no {PAPER} in paper/ two folders above GYRO_PIPELINE_REAL_DATA, {data}")
-    return path.read_text()
+def text(real_file):
+    """Of the paper, in paper/ two folders above that of the real recordings."""
+    folder = real_file("memsense_test_real.npy").parent.resolve().parents[1] / "paper"
+    if not (folder / PAPER).is_file():
+        pytest.skip(f"there is no {PAPER} in {folder}")
+    return (folder / PAPER).read_text()
 
 
 @pytest.fixture(scope="module")

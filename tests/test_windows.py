@@ -2,49 +2,43 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from gyro_pipeline import windows
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.windows import (
-    cut_windows,
-    describe_losses,
-    usable_starts,
-    usable_windows,
-    window_size,
-)
 
 
 def test_masked_samples_are_the_mean_of_their_window_which_is_dropped_if_it_lost_too_many():
     samples = np.random.default_rng(0).normal(3, 1, (2, 40)).astype(np.float32)
     samples[:, [5, 20, 21]] = np.nan
     masked = np.isnan(samples[0])
-    assert usable_starts(masked, 10).tolist() == [0, 10, 30]
-    assert usable_starts(masked, 10, largest_masked_share=0.2).tolist() == [0, 10, 20, 30]
-    windows = cut_windows(samples, 10)
-    assert windows.shape == (2, 3, 10)
+    assert windows.usable_starts(masked, 10).tolist() == [0, 10, 30]
+    assert windows.usable_starts(masked, 10, largest_masked_share=0.2).tolist() == [0, 10, 20, 30]
+    cut = windows.cut_windows(samples, 10)
+    assert cut.shape == (2, 3, 10)
     whole = [samples[:, 10:20], samples[:, 30:40]]
-    np.testing.assert_array_equal(windows[:, 1:], np.stack(whole, axis=1))
+    np.testing.assert_array_equal(cut[:, 1:], np.stack(whole, axis=1))
     means = np.nanmean(samples[:, :10], axis=1)
-    np.testing.assert_allclose(windows[:, 0, 5], means, rtol=1e-6)
-    named = cut_windows(samples, 10, np.array([12, 6, 25]))  # the first lost two
+    np.testing.assert_allclose(cut[:, 0, 5], means, rtol=1e-6)
+    named = windows.cut_windows(samples, 10, np.array([12, 6, 25]))  # the first lost two
     np.testing.assert_array_equal(named, np.stack([samples[:, 6:16], samples[:, 25:35]], axis=1))
 
 
 def test_the_papers_windows_are_non_overlapping_slices_from_the_start(parameters):
     for sensor, size, count in (("sparkfun", 1494, 8), ("dot", 1083, 12), ("memsense", 2500, 5)):
         entry = parameters("base").sensors[sensor]
-        assert window_size(10, entry.rate_hz, entry.samples, sensor) == size
-        whole = cut_windows(np.zeros((3, entry.samples), np.float32), size)
+        assert windows.window_size(10, entry.rate_hz, entry.samples, sensor) == size
+        whole = windows.cut_windows(np.zeros((3, entry.samples), np.float32), size)
         assert whole.shape == (3, count, size)
     samples = np.arange(2 * 3 * 23).reshape(2, 3, 23)
-    windows = cut_windows(samples, 5)
-    assert windows.shape == (2, 3, 4, 5)
+    cut = windows.cut_windows(samples, 5)
+    assert cut.shape == (2, 3, 4, 5)
     for k in range(4):
-        np.testing.assert_array_equal(windows[:, :, k], samples[:, :, 5 * k : 5 * k + 5])
-    assert np.shares_memory(windows, samples)
+        np.testing.assert_array_equal(cut[:, :, k], samples[:, :, 5 * k : 5 * k + 5])
+    assert np.shares_memory(cut, samples)
     message = r"memsense: a window of 52.01 s is 13002 samples at 250 Hz, .* 13000 \(52 s\)"
     with pytest.raises(InputError, match=message):
-        window_size(52.01, 250.0, 13000, "memsense")
+        windows.window_size(52.01, 250.0, 13000, "memsense")
     with pytest.raises(InputError, match="memsense: a window of 0.001 s is 0 samples"):
-        window_size(0.001, 250.0, 13000, "memsense")
+        windows.window_size(0.001, 250.0, 13000, "memsense")
 
 
 def test_a_table_has_the_windows_that_are_usable_at_any_stride_and_others_are_said():
@@ -54,12 +48,12 @@ def test_a_table_has_the_windows_that_are_usable_at_any_stride_and_others_are_sa
         return rows.assign(masked=[np.array(numbers, int) for numbers in masked])
 
     lost = contents([], [5, 6], [], range(0, 40, 5))
-    found = usable_windows(lost, 40, 10, 15)
+    found = windows.usable_windows(lost, 40, 10, 15)
     expected = [(1, 1, s) for s in (0, 15, 30)] + [(1, 5, s) for s in (15, 30)]
     expected += [(2, 1, s) for s in (0, 15, 30)]
     assert list(found.itertuples(index=False, name=None)) == expected
-    assert not describe_losses(contents([], [5], [], []), 40, 10)
-    said = describe_losses(contents([], [5, 6, 25, 26], [30, 31], range(0, 40, 5)), 45, 10)
+    assert not windows.describe_losses(contents([], [5], [], []), 40, 10)
+    said = windows.describe_losses(contents([], [5, 6, 25, 26], [30, 31], range(0, 40, 5)), 45, 10)
     assert said.startswith("7 of 16 lost more than 10% of their samples and are left out")
     assert "the first one used of IMU 1 recording 5 is window 2" in said
     assert "none is left of IMU 2 recording 5, so it trains no network and tests none" in said

@@ -1,4 +1,3 @@
-import os
 import pickle
 from itertools import chain, permutations
 
@@ -13,9 +12,8 @@ SENSORS = {"memsense": {"imus": 2, "samples": 13000, "recording_s": 52}}
 TRAIN_TEST = {"test": "test.npy", "train": "train.npy"}
 
 
-def array_logs(folder, files=None, **options):
-    options = {"sensor": "memsense", "sensors": SENSORS, "source": "array"} | options
-    return ArrayLogs(path=str(folder), files=files or {"all": "all.npy"}, **options)
+def array_logs(folder, files=None, sensor="memsense", **options):
+    return ArrayLogs(sensor, SENSORS, "array", str(folder), files or {"all": "all.npy"}, **options)
 
 
 def made(recordings, gyroscopes, samples, seed=0):
@@ -118,14 +116,3 @@ def test_damaged_files_and_pickles_are_refused_by_name_and_nothing_is_unpickled(
         assert message.startswith("memsense all.npy: expected a plain numeric .npy file")
         assert message.endswith(f"which are never loaded; replace or delete {file}")
     assert not (tmp_path / "sprung").exists()
-
-
-def test_the_real_memsense_file_gives_the_known_running_mean():
-    folder = os.environ.get("GYRO_PIPELINE_REAL_DATA")
-    if not folder:
-        pytest.skip("GYRO_PIPELINE_REAL_DATA does not name the folder of memsense_test_real.npy")
-    entries = array_logs(folder, {"all": "memsense_test_real.npy"}).load().entries
-    samples = np.stack([entry.read().samples for entry in entries])
-    assert samples.shape == (11, 13000, 3)
-    error = samples[:, :2500].mean(axis=1) - samples.mean(axis=1)
-    assert np.sqrt(np.mean(error**2)) == pytest.approx(0.0015854, abs=5e-8)

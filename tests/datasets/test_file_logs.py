@@ -12,9 +12,8 @@ from gyro_pipeline.datasets.file_logs import FileLogs
 SENSORS = {"dot": {"imus": 5, "samples": 1200, "recording_s": 10}}
 
 
-def file_logs(folder, pattern, **options):
-    options = {"sensor": "dot", "sensors": SENSORS, "source": "mine"} | options
-    return FileLogs(path=str(folder), pattern=pattern, **options)
+def file_logs(folder, pattern, sensors=SENSORS, **options):
+    return FileLogs("dot", "mine", str(folder), sensors, pattern, **options)
 
 
 def put(folder, *names):

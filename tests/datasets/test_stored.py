@@ -32,20 +32,18 @@ def stored(request, tmp_path):
     return dataset, data, dataset._filepath
 
 
-def damages(path):
-    """The file with a changed bit and cut short, and its record gone and spoiled."""
-    content, record = path.read_bytes(), path.with_name(f"{path.name}.made.json")
-    middle = len(content) // 2
-    flipped = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
-    yield lambda: path.write_bytes(flipped)
-    yield lambda: path.write_bytes(content[:-1])
-    yield record.unlink
-    yield lambda: record.write_text("{")
-
-
 def test_what_is_not_what_was_written_is_refused_and_can_be_made_again(stored):
+    """A changed bit, a byte less, and a record that is gone or spoiled."""
     dataset, data, path = stored
-    for damage in damages(path):
+    content, record = path.read_bytes(), path.with_name(f"{path.name}.made.json")
+    flipped = bytearray(content)
+    flipped[len(content) // 2] ^= 1
+    for damage in (
+        lambda: path.write_bytes(flipped),
+        lambda: path.write_bytes(content[:-1]),
+        record.unlink,
+        lambda: record.write_text("{"),
+    ):
         digest = dataset.state()
         damage()
         assert dataset.state() is None

@@ -27,9 +27,50 @@ from gyro_pipeline.tracking import EvaluatedRun, FittedRun, RunIdentity
 STARTED_MS, ENDED_MS = 1_700_000_000_000, 1_700_000_060_000
 NAME = "dot constant 3+0 10 s seed 0"
 MODEL = "hold-out"
+WINDOWS = np.random.default_rng(0).normal(0, 0.05, (2, 3, 40))
+PARAMS = {
+    **{"study": "real2real", "sensor": "dot", "source": "simulated", "real_gyros": 3},
+    **{"virtual_gyros": 0, "window_s": 10.0, "seed": 0, "estimator": "constant"},
+}
 
+sys.path.insert(0, str(Path(__file__).with_name("outside")))
+Constant = import_module("constant").Constant
+Unwritable = import_module("constant").Unwritable
 
 pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def store(tmp_path, made_once):
+    """An MLflow store without runs; making one takes seconds."""
+    empty = made_once("store", lambda folder: run_store.make_store(folder / "mlflow.db"))
+    return Path(shutil.copy(empty / "mlflow.db", tmp_path))
+
+
+def tracked(store, source="simulated", **only):
+    return TrackedRuns(str(store), source, **only)
+
+
+def fitted(tags=None, fold=MODEL, folds=(MODEL,), estimator=None, **changes):
+    given = PARAMS | changes
+    name, key = f"dot constant 3+0 10 s seed {given['seed']}", f"f00d{given['seed']}"
+    note = "It was trained on this and tested on that."
+    run = RunIdentity(given["study"], key, given, tags or {}, folds, name, note)
+    dataset = {"name": "dot", "digest": "abc", "source": "simulated", "recordings": "83"}
+    made = estimator or Constant(), STARTED_MS, ENDED_MS, fold == MODEL, WINDOWS, dataset
+    return FittedRun(run, fold, *made)
+
+
+def history(epochs):
+    epoch = np.arange(1, epochs + 1)
+    return pd.DataFrame({"epoch": epoch, "train_loss": 1 / epoch, "val_loss": 0.5 + 1 / epoch})
+
+
+def statuses(store):
+    """Status of every run of the study by its name, as MLflow itself has it."""
+    client = MlflowClient(f"sqlite:///{store}")
+    experiment = client.get_experiment_by_name("real2real").experiment_id
+    return {run.info.run_name: run.info.status for run in client.search_runs([experiment])}
 
 
 def test_a_fitted_run_waits_for_its_evaluation_and_has_what_a_user_of_mlflow_looks_for(store):
@@ -53,54 +94,6 @@ def test_a_fitted_run_waits_for_its_evaluation_and_has_what_a_user_of_mlflow_loo
     assert (dataset.dataset.name, dataset.dataset.digest) == ("dot", "abc")
     (model,) = shown.outputs.model_outputs
     assert client.get_logged_model(model.model_id).status == "READY"
-
-
-WINDOWS = np.random.default_rng(0).normal(0, 0.05, (2, 3, 40))
-
-
-sys.path.insert(0, str(Path(__file__).with_name("outside")))
-Constant = import_module("constant").Constant
-Unwritable = import_module("constant").Unwritable
-
-
-@pytest.fixture
-def store(tmp_path, made_once):
-    """An MLflow store without runs; making one takes seconds."""
-    empty = made_once("store", lambda folder: run_store.make_store(folder / "mlflow.db"))
-    return Path(shutil.copy(empty / "mlflow.db", tmp_path))
-
-
-PARAMS = {
-    **{"study": "real2real", "sensor": "dot", "source": "simulated", "real_gyros": 3},
-    **{"virtual_gyros": 0, "window_s": 10.0, "seed": 0, "estimator": "constant"},
-}
-
-
-def tracked(store, source="simulated", **only):
-    return TrackedRuns(str(store), source, **only)
-
-
-def fitted(tags=None, fold=MODEL, folds=(MODEL,), estimator=None, started_ms=STARTED_MS, **changes):
-    given = PARAMS | changes
-    name = f"dot constant 3+0 10 s seed {given['seed']}"
-    note = "It was trained on this and tested on that."
-    key = f"f00d{given['seed']}"
-    run = RunIdentity(given["study"], key, given, tags or {}, folds, name, note)
-    dataset = {"name": "dot", "digest": "abc", "source": "simulated", "recordings": "83"}
-    made = estimator or Constant(), started_ms, ENDED_MS, fold == MODEL, WINDOWS, dataset
-    return FittedRun(run, fold, *made)
-
-
-def history(epochs):
-    epoch = np.arange(1, epochs + 1)
-    return pd.DataFrame({"epoch": epoch, "train_loss": 1 / epoch, "val_loss": 0.5 + 1 / epoch})
-
-
-def statuses(store, study="real2real"):
-    """Status of every run of a study by its name, as MLflow itself has it."""
-    client = MlflowClient(f"sqlite:///{store}")
-    experiment = client.get_experiment_by_name(study).experiment_id
-    return {run.info.run_name: run.info.status for run in client.search_runs([experiment])}
 
 
 def test_the_model_of_a_run_is_loaded_and_applied_to_windows(store, monkeypatch):
@@ -152,17 +145,15 @@ def test_the_model_of_a_class_from_outside_the_package_brings_its_code(
 
 
 def test_loading_narrows_to_study_sensor_and_source_also_where_the_store_answers_in_pages(store):
-    everything = [
-        *(("augmentation", "dot", "simulated"), ("real2real", "dot", "simulated")),
-        ("real2real", "ng", "published"),
-    ]
-    for study, sensor, source in everything:
-        tracked(store).save(fitted(study=study, sensor=sensor, source=source))
+    names = ("study", "sensor", "source")
+    everything = [("augmentation", "dot", "simulated"), ("real2real", "dot", "simulated")]
+    everything.append(("real2real", "ng", "published"))
+    for one in everything:
+        tracked(store).save(fitted(**dict(zip(names, one, strict=True))))
 
     def found(**only):
         runs = tracked(store, **only)
         runs._client.search_runs = partial(runs._client.search_runs, max_results=1)
-        names = ("study", "sensor", "source")
         return sorted(tuple(run.params[name] for name in names) for run in runs.load())
 
     assert found() == everything[:2]
@@ -185,10 +176,9 @@ def test_an_evaluated_run_is_finished_and_keeps_what_it_had(store):
         runs.save(EvaluatedRun(waiting.run_id, shown, {"evaluated_with": judged_with}, artifacts))
     (run,) = tracked(store).load()
     assert run.finished
-    assert run.run_id == waiting.run_id
+    assert (run.run_id, run.fingerprint) == (waiting.run_id, "f00d0")
     assert run.metrics == dict(waiting.metrics) | metrics
     assert run.tags["evaluated_with"] == "x1"
-    assert run.fingerprint == "f00d0"
     pd.testing.assert_frame_equal(run.load("errors.parquet"), errors)
     pd.testing.assert_frame_equal(run.load("history.csv"), history(3))
     info = MlflowClient(f"sqlite:///{store}").get_run(run.run_id).info
@@ -347,10 +337,9 @@ def evaluated(store, seed=0, trained=False):
     if not trained:
         runs.save(fitted(estimator=Constant(seed, history(3)), seed=seed))
     run = next(run for run in runs.load() if run.params["seed"] == str(seed))
-    table = pd.DataFrame({"error_dps": [1e-3, seed * 1e-3]})
-    artifacts = {"errors.parquet": table, "scores.csv": table}
-    given = {"evaluated_with": "x"}
-    runs.save(EvaluatedRun(run.run_id, {"rmse_mdps": 1.0 + seed}, given, artifacts))
+    artifacts = dict.fromkeys(("errors.parquet", "scores.csv"), pd.DataFrame({"error_dps": [seed]}))
+    given = {"rmse_mdps": 1.0 + seed}, {"evaluated_with": "x"}, artifacts
+    runs.save(EvaluatedRun(run.run_id, *given))
     return run.run_id
 
 
@@ -366,7 +355,8 @@ def flip(path):
 )
 def test_a_damaged_artifact_sets_its_run_back_and_no_other(store, name, damage, again, caplog):
     run_id, other = evaluated(store), evaluated(store, seed=1)
-    (path,) = (path for path in store.parent.rglob(name) if is_of(path, run_id, store))
+    (model,) = MlflowClient(f"sqlite:///{store}").get_run(run_id).outputs.model_outputs
+    (path,) = (p for p in store.parent.rglob(name) if {run_id, model.model_id} & {*p.parts})
     damage(path)
     runs = {run.run_id: run for run in tracked(store).load()}
     broken = runs[run_id]
@@ -378,11 +368,6 @@ def test_a_damaged_artifact_sets_its_run_back_and_no_other(store, name, damage, 
     assert broken.trained == (again == "evaluated")
     assert evaluated(store, trained=broken.trained) == run_id
     assert all(run.finished for run in tracked(store).load())
-
-
-def is_of(path, run_id, store):
-    model = MlflowClient(f"sqlite:///{store}").get_run(run_id).outputs.model_outputs[0].model_id
-    return run_id in path.parts or model in path.parts
 
 
 def test_an_artifact_that_is_damaged_after_its_run_was_loaded_is_refused(store):
@@ -424,21 +409,12 @@ def test_what_two_projects_train_at_once_is_stored_once(store, monkeypatch, tmp_
     one, other = tracked(tmp_path / "one.db"), tracked(tmp_path / "other.db")
     folds = ("fold 0", MODEL)
     for runs in (one, other):
-        runs.save(fitted(fold="fold 0", folds=folds, started_ms=STARTED_MS))
+        runs.save(fitted(fold="fold 0", folds=folds))
         running = MlflowClient().search_runs(["1"], "attributes.status = 'RUNNING'")
-        client = MlflowClient()
-        client.set_tag(running[0].info.run_id, "process", "elsewhere 1 1 99999999999")
+        MlflowClient().set_tag(running[0].info.run_id, "process", "elsewhere 1 1 99999999999")
     for runs in (one, other):
         runs.save(fitted(folds=folds))
     assert len(one.load()) == 1
-
-
-def test_a_server_that_does_not_answer_is_told_at_once(tmp_path, monkeypatch):
-    runs = tracked(tmp_path / "mlflow.db")
-    runs.check_reachable()
-    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:9")
-    with pytest.raises(InputError, match="http://127.0.0.1:9: .* does not answer"):
-        tracked(tmp_path / "mlflow.db").check_reachable()
 
 
 def test_fits_that_a_server_does_not_take_are_stored_once_it_answers(
@@ -446,10 +422,13 @@ def test_fits_that_a_server_does_not_take_are_stored_once_it_answers(
 ):
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{store}")
     runs, folds = tracked(tmp_path / "mlflow.db", study="real2real"), ("fold 0", "fold 1", MODEL)
+    runs.check_reachable()
     runs.save(fitted(fold="fold 0", folds=folds))
     with monkeypatch.context() as away:
         away.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:9")
         server = tracked(tmp_path / "mlflow.db", study="real2real")
+        with pytest.raises(InputError, match="http://127.0.0.1:9: .* does not answer"):
+            server.check_reachable()
         server.save(fitted(fold="fold 1", folds=folds))
         server.save(fitted(folds=folds))
         assert caplog.text.count("does not answer; fits are kept in") == 1
@@ -462,13 +441,11 @@ def test_fits_that_a_server_does_not_take_are_stored_once_it_answers(
 
 
 def test_a_link_opens_the_runs_of_a_study_best_first(store):
-    everywhere = TrackedRuns(str(store), study="real2real")
-    assert run_link([everywhere]) is None
-    tracked(store).save(fitted())
-    sensors = [tracked(store, study="real2real", sensor=sensor) for sensor in ("dot", "ng")]
+    runs = tracked(store, study="real2real", sensor="dot")
+    assert run_link([runs]) is None
+    runs.save(fitted())
     address = "http://127.0.0.1:5000/#/experiments/1/runs?workflowType=machine_learning"
-    assert run_link([everywhere, *sensors]) == f"{address}&viewStateShareKey=runs_simulated"
-    assert run_link(sensors[:1]) == f"{address}&viewStateShareKey=runs_simulated_dot"
+    assert run_link([runs]) == f"{address}&viewStateShareKey=runs_simulated_dot"
     tags = MlflowClient(f"sqlite:///{store}").get_experiment("1").tags
     view = json.loads(tags["mlflow.sharedViewState.runs_simulated_dot"])
     wanted = "tags.layout = '3' and params.source = 'simulated' and params.sensor = 'dot'"

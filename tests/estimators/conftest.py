@@ -1,8 +1,5 @@
 """Simulated recordings of one or more IMUs, and what an estimator makes of their windows."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -18,13 +15,10 @@ from gyro_pipeline.physics.noise import simulate_noise, warm_up
 
 def labelled(rates, rate_hz):
     """(imu, recording, axis, sample) in the layout of the conventions."""
-    coords = {
-        "imu": np.arange(1, 1 + rates.shape[0]),
-        "recording": np.arange(1, 1 + rates.shape[1]),
-        "axis": list(AXES),
-    }
+    imus, count, _, samples = rates.shape
+    coords = {"imu": range(1, 1 + imus), "recording": range(1, 1 + count), "axis": list(AXES)}
     attrs = {"sensor": "test", "source": "test", "simulated": 0, "rate_hz": rate_hz}
-    lengths = np.full(rates.shape[:2], rates.shape[-1])
+    lengths = np.full((imus, count), samples)
     data = {"angular_rate": (DIMENSIONS, rates), "samples": (DIMENSIONS[:2], lengths)}
     return xr.Dataset(data, coords, attrs)
 
@@ -47,14 +41,9 @@ def simulate():
     def make(model, count, seed=0, imus=1, unit_bias=0.5):
         generator, noise = np.random.default_rng(seed), model.noise
         shape = (imus, count, len(AXES))
-        rates = simulate_noise(
-            generator,
-            (*shape, model.samples),
-            model.rate_hz,
-            noise.white,
-            flicker_dps=noise.instability,
-            random_walk_dps_rts=noise.random_walk,
-        ).astype(np.float64)
+        given = (*shape, model.samples), model.rate_hz, noise.white
+        colour = {"flicker_dps": noise.instability, "random_walk_dps_rts": noise.random_walk}
+        rates = simulate_noise(generator, *given, **colour).astype(np.float64)
         drawn = generator.multivariate_normal(model.mean, model.covariance, shape)
         unit = generator.uniform(-unit_bias, unit_bias, (imus, 1, len(AXES)))
         bias = unit + drawn[..., 0]
@@ -120,9 +109,6 @@ def judged():
 
 
 @pytest.fixture(scope="session")
-def memsense():
+def memsense(real_file):
     """The public Memsense recordings."""
-    folder = os.environ.get("GYRO_PIPELINE_REAL_DATA")
-    if folder is None:
-        pytest.skip("GYRO_PIPELINE_REAL_DATA, the folder of the real recordings, is not set")
-    return labelled(np.load(Path(folder) / "memsense_test_real.npy")[None], 250.0)
+    return labelled(np.load(real_file("memsense_test_real.npy"))[None], 250.0)

@@ -1,11 +1,9 @@
 """The examples of docs/extending.md; that of a network is in pipelines/test_own_network.py."""
 
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 import yaml
 
 from gyro_pipeline.estimators import make_estimator
@@ -19,20 +17,13 @@ def example(heading, kind):
     return re.search(rf"```{kind}\n(.*?)```", section, re.DOTALL)[1]
 
 
-@pytest.fixture
-def my_estimators(tmp_path, monkeypatch):
+def test_the_estimator_is_halfway_between_window_and_training_recordings(
+    tmp_path, monkeypatch, make_recordings, training_set, parameters
+):
     (tmp_path / "my_estimators.py").write_text(example("An estimator", "python"))
     monkeypatch.syspath_prepend(tmp_path)
-    yield
-    sys.modules.pop("my_estimators", None)
-
-
-def test_the_estimator_is_halfway_between_window_and_training_recordings(
-    my_estimators, make_recordings, training_set, parameters
-):
-    (_, name) = yaml.safe_load(example("An estimator", "yaml"))["studies"]["augmentation"][
-        "estimators"
-    ]
+    studies = yaml.safe_load(example("An estimator", "yaml"))["studies"]
+    (_, name) = studies["augmentation"]["estimators"]
     bias = np.full((1, 4, 3), [0.1, -0.2, 0.3])
     recordings = make_recordings(bias, samples=500, rate_hz=10.0, noise_dps_rts=1e-4)
     fitted = make_estimator(name, parameters().training, 0).fit(training_set(recordings))

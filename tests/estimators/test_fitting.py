@@ -5,7 +5,7 @@ import pytest
 from joblib.externals.loky import get_reusable_executor
 
 from gyro_pipeline.conventions import MDPS, InputError
-from gyro_pipeline.estimators import estimator_class, make_estimator
+from gyro_pipeline.estimators import estimator_class
 from gyro_pipeline.estimators.fitting import FitJob, run_fits
 from gyro_pipeline.parameters import Execution, Training
 from gyro_pipeline.physics.allan import NoiseFigures
@@ -52,10 +52,6 @@ def stranger(tmp_path_factory):
         yield "a_strangers_file:Half"
 
 
-def execution(executor):
-    return Execution(executor=executor, workers=2)
-
-
 def jobs_of(training, names, seeds=(0,)):
     return [
         FitJob(f"{name} {seed}", f"run {name}", "hold-out", name, SETTINGS, seed, training)
@@ -85,7 +81,7 @@ def test_a_strangers_estimators_are_fitted_and_one_that_fails_ends_the_run_after
 ):
     failing = stranger.replace("Half", "Failing")
     jobs = jobs_of(training_set(recordings), [failing, stranger, "mean"])
-    found, fits = {}, run_fits(jobs, execution(executor), "all")
+    found, fits = {}, run_fits(jobs, Execution(executor=executor, workers=2), "all")
     with pytest.raises(InputError, match=f"run {failing}, hold-out: .*the sky fell.* .1 f"):
         for job, fit in fits:
             found[job.estimator] = fit
@@ -98,24 +94,13 @@ def test_a_strangers_estimators_are_fitted_and_one_that_fails_ends_the_run_after
     assert all(fit.started <= fit.ended for fit in found.values())
 
 
-def test_too_few_recordings_are_refused_and_enough_are_not(recordings, training_set):
-    name, fewest = "best_linear", 3
-    assert estimator_class(name).fewest_recordings == fewest
-    enough = training_set(recordings.isel(recording=slice(fewest)))
-    make_estimator(name, SETTINGS, 0).fit(enough)
-    too_few = training_set(recordings.isel(recording=slice(fewest - 1)))
-    told = (
-        f"run {name}, hold-out: cannot be fitted: expected at least {fewest} .* got {fewest - 1} "
-    )
-    with pytest.raises(InputError, match=told):
-        list(run_fits(jobs_of(too_few, [name]), execution("serial"), "all"))
-
-
 @pytest.mark.slow
 def test_networks_are_trained_in_a_batch_and_all_else_in_processes(recordings, training_set):
     jobs = jobs_of(training_set(recordings), ["mean", "cnn", "cnn_shuffled"], seeds=(0, 1))
-    batched = {job.key: fit for job, fit in run_fits(jobs, execution("batched"), "all")}
-    alone = {job.key: fit for job, fit in run_fits(jobs, execution("serial"), "all")}
+    batched, alone = (
+        {job.key: fit for job, fit in run_fits(jobs, Execution(executor=name, workers=2), "all")}
+        for name in ("batched", "serial")
+    )
     assert {name: fit.estimator.engine.split()[0] for name, fit in batched.items()} == {
         job.key: "cpu" if job.estimator == "mean" else "batched" for job in jobs
     }

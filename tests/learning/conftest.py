@@ -5,6 +5,7 @@ import pytest
 import torch
 import xarray as xr
 
+from gyro_pipeline.learning.examples import NetworkInput
 from gyro_pipeline.parameters import Training
 
 
@@ -43,5 +44,18 @@ def recorded():
         dims = ("imu", "recording", "axis", "sample")
         labels = xr.DataArray(bias, dims=dims[:-1], coords=coords)
         return xr.DataArray(rates.astype(np.float32), dims=dims, coords=coords), labels
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def device():
+    """Recordings of IMUs side by side, with all windows that do not overlap or with some."""
+
+    def made(rates, labels, imus, numbers, size, starts=None):
+        biases = labels.sel(imu=list(imus), recording=list(numbers))
+        biases = biases.transpose("recording", "imu", "axis").to_numpy().reshape(len(numbers), -1)
+        every = np.arange(0, rates.sizes["sample"] - size + 1, size)
+        return NetworkInput(rates, imus, tuple(numbers), biases, starts or (every,) * len(numbers))
 
     return made

@@ -63,11 +63,6 @@ def examples(a, n=150, seed=1):
     return pack(windows.astype(np.float32), a), targets
 
 
-def orders(n, epochs):
-    generator = np.random.default_rng(2)
-    return [generator.permutation(n) for _ in range(epochs)]
-
-
 def plain_loop(of, inputs, targets, batch_size, epochs, rate):
     """PyTorch's steps on the network itself; the mean loss of each epoch."""
     x, y = torch.from_numpy(inputs), torch.from_numpy(targets)
@@ -91,7 +86,8 @@ def plain_loop(of, inputs, targets, batch_size, epochs, rate):
 def test_fifty_steps_are_those_of_pytorch(training):
     a, batch_size = TRAININGS[training]
     inputs, targets = examples(a)
-    epochs = orders(150, 17 if batch_size == 64 else 5)  # 51 or 50 steps, the last ones smaller
+    generator, count = np.random.default_rng(2), 17 if batch_size == 64 else 5
+    epochs = [generator.permutation(150) for _ in range(count)]  # 51 or 50 steps, some smaller
     ours, theirs = network(a), network(a)
     engine = FusedEngine(ours, inputs, targets, batch_size)
     losses = [engine.epoch(order, 1e-4) for order in epochs]
@@ -149,12 +145,6 @@ def refusal(caplog):
     return record.getMessage()
 
 
-def program(path, *lines):
-    path.write_text("\n".join(["#!/bin/sh", *lines]))
-    path.chmod(0o755)
-    return str(path)
-
-
 def test_without_a_compiler_it_is_said_once_and_training_goes_on(monkeypatch, caplog, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CC", raising=False)
@@ -170,7 +160,9 @@ def test_a_source_that_does_not_compile_or_cannot_be_kept_is_no_error(
     monkeypatch, caplog, tmp_path
 ):
     broken = 'case "$*" in *-dM*) exit 0;; esac; echo "error: what is a vector" >&2; exit 1'
-    monkeypatch.setenv("CC", program(tmp_path / "cc", broken))
+    (tmp_path / "cc").write_text(f"#!/bin/sh\n{broken}\n")
+    (tmp_path / "cc").chmod(0o755)
+    monkeypatch.setenv("CC", str(tmp_path / "cc"))
     monkeypatch.setenv("GYRO_PIPELINE_CACHE", str(tmp_path / "cache"))
     assert "error: what is a vector" in refusal(caplog)
     assert list((tmp_path / "cache").iterdir()) == []

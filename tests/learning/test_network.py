@@ -92,10 +92,8 @@ def test_other_networks_see_plain_windows_and_learn_from_all_of_them(path, sched
     design.layout.write(windows.numpy().transpose(1, 0, 2), plain)
     np.testing.assert_array_equal(plain, windows.numpy())
     network = design.build(seed=1)
-    assert all(
-        torch.equal(a, b)
-        for a, b in zip(network.parameters(), design.build(1).parameters(), strict=True)
-    )
+    twins = zip(network.parameters(), design.build(1).parameters(), strict=True)
+    assert all(torch.equal(one, twin) for one, twin in twins)
     windows.requires_grad_()
     network(windows).sum().backward()
     assert (windows.grad.abs().amax(dim=2) > 0).all()  # each window and gyroscope

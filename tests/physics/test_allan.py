@@ -1,42 +1,33 @@
 """Allan variances against published figures, and noise figures fitted to them."""
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from gyro_pipeline.conventions import MDPS, InputError
-from gyro_pipeline.physics.allan import (
-    FLICKER_FLOOR,
-    SHORTEST_FIT_SAMPLES,
-    allan_variance,
-    averaging_times_s,
-    fit_noise,
-    mean_variance,
-)
+from gyro_pipeline.physics import allan
 
 GOLDEN = json.loads((Path(__file__).parent / "golden" / "overlapping_allan.json").read_text())
-REAL_DATA = os.environ.get("GYRO_PIPELINE_REAL_DATA")
 RATE = 100.0
 SAMPLES = 10_000
 
 
 def variance_of(samples, rate, times):
-    return allan_variance(samples, rate, times)[0]
+    return allan.allan_variance(samples, rate, times)[0]
 
 
 def mean_of(recordings, rate, times):
-    each = [allan_variance(samples, rate, times) for samples in recordings]
-    return mean_variance(*map(np.stack, zip(*each, strict=True)))
+    each = [allan.allan_variance(samples, rate, times) for samples in recordings]
+    return allan.mean_variance(*map(np.stack, zip(*each, strict=True)))
 
 
 def fit_mean(recordings, rate):
     length = recordings.shape[-1]
-    times = averaging_times_s(length, rate)
+    times = allan.averaging_times_s(length, rate)
     variance = mean_of(recordings, rate, times)
-    return fit_noise(times, variance, length / rate, SHORTEST_FIT_SAMPLES / rate)
+    return allan.fit_noise(times, variance, length / rate, allan.SHORTEST_FIT_SAMPLES / rate)
 
 
 def test_nist_sp1065_thousand_points():
@@ -51,7 +42,7 @@ def test_nist_sp1065_thousand_points():
 
 def test_averaging_times_are_whole_samples_up_to_a_fifth_and_all_usable(rate=13000 / 87):
     for n_samples in (60, 130, 13_000):
-        times = averaging_times_s(n_samples, rate)
+        times = allan.averaging_times_s(n_samples, rate)
         factors = np.rint(times * rate)
         np.testing.assert_allclose(times * rate, factors, rtol=1e-12)
         assert np.all(np.diff(factors) >= 1)
@@ -61,16 +52,18 @@ def test_averaging_times_are_whole_samples_up_to_a_fifth_and_all_usable(rate=130
         assert np.all(variance_of(noise, rate, times) > 0)
     for time in (0.0, 0.004, 0.015):
         with pytest.raises(InputError, match="multiples of the sample period"):
-            allan_variance(np.zeros(1000), RATE, np.array([0.02, time]))
+            allan.allan_variance(np.zeros(1000), RATE, np.array([0.02, time]))
 
 
 def test_masked_samples_part_stretches_that_are_pooled_by_their_counts():
     samples = np.random.default_rng(6).normal(size=400)
     samples[150:170] = np.nan
     factors = np.array([1, 8, 90, 200])
-    variance, counts = allan_variance(samples, 1.0, factors)
-    first, second = (allan_variance(part, 1.0, factors) for part in (samples[:150], samples[170:]))
-    expected = mean_variance(np.stack([first[0], second[0]]), np.stack([first[1], second[1]]))
+    variance, counts = allan.allan_variance(samples, 1.0, factors)
+    first, second = (
+        allan.allan_variance(part, 1.0, factors) for part in (samples[:150], samples[170:])
+    )
+    expected = allan.mean_variance(np.stack([first[0], second[0]]), np.stack([first[1], second[1]]))
     np.testing.assert_allclose(variance[:3], expected[:3], rtol=1e-13)
     assert np.isnan(first[0][2])  # too short
     assert counts.tolist() == [150 - 1 + 230 - 1, 150 - 15 + 230 - 15, 230 - 179, 0]
@@ -79,7 +72,7 @@ def test_masked_samples_part_stretches_that_are_pooled_by_their_counts():
 def test_white_noise_falls_with_slope_minus_one_half_and_gives_its_n():
     sigma = 0.05
     recordings = np.random.default_rng(8).normal(0, sigma, (40, SAMPLES))
-    times = averaging_times_s(SAMPLES, RATE)
+    times = allan.averaging_times_s(SAMPLES, RATE)
     deviation = np.sqrt(mean_of(recordings, RATE, times))
     assert np.polyfit(np.log(times), np.log(deviation), 1)[0] == pytest.approx(-0.5, abs=0.02)
     fitted = fit_mean(recordings, RATE)
@@ -93,27 +86,26 @@ def test_white_noise_falls_with_slope_minus_one_half_and_gives_its_n():
 def test_an_exact_curve_gives_its_three_terms_back():
     times = np.geomspace(0.1, 20, 15)
     n, b, k = 5 * MDPS, 3 * MDPS, 1 * MDPS
-    curve = n**2 / times + FLICKER_FLOOR * b**2 + k**2 * times / 3
-    fitted = fit_noise(times, curve, 100.0, shortest_s=0.1)
-    assert np.sqrt(FLICKER_FLOOR) == pytest.approx(0.664, abs=5e-4)  # IEEE Std 952
+    curve = n**2 / times + allan.FLICKER_FLOOR * b**2 + k**2 * times / 3
+    fitted = allan.fit_noise(times, curve, 100.0, shortest_s=0.1)
+    assert np.sqrt(allan.FLICKER_FLOOR) == pytest.approx(0.664, abs=5e-4)  # IEEE Std 952
     assert (fitted.white, fitted.instability, fitted.random_walk) == pytest.approx((n, b, k))
 
 
 def test_times_before_the_shortest_have_no_influence_and_variances_are_positive():
-    times = averaging_times_s(SAMPLES, RATE)
+    times = allan.averaging_times_s(SAMPLES, RATE)
     curve = 1e-4 / times
     curve[times < 0.08] *= 3
-    assert fit_noise(times, curve, 100.0, shortest_s=0.08).white == pytest.approx(0.01)
-    assert fit_noise(times, curve, 100.0, shortest_s=0.0).white > 0.011
+    assert allan.fit_noise(times, curve, 100.0, shortest_s=0.08).white == pytest.approx(0.01)
+    assert allan.fit_noise(times, curve, 100.0, shortest_s=0.0).white > 0.011
     for value in (0.0, np.nan):
         curve[2:] = value
         with pytest.raises(InputError, match="positive Allan variance"):
-            fit_noise(times, curve, 100.0, shortest_s=0.0)
+            allan.fit_noise(times, curve, 100.0, shortest_s=0.0)
 
 
-@pytest.mark.skipif(REAL_DATA is None, reason="GYRO_PIPELINE_REAL_DATA names no folder")
-def test_real_memsense_white_noise():
+def test_real_memsense_white_noise(real_file):
     """Of recordings (recording, axis, sample) at 250 Hz."""
-    recordings = np.load(Path(REAL_DATA) / "memsense_test_real.npy")
+    recordings = np.load(real_file("memsense_test_real.npy"))
     white = [fit_mean(recordings[:, axis], 250.0).white for axis in range(3)]
     np.testing.assert_allclose(white, np.array([5.3, 4.7, 6.0]) * MDPS, rtol=0.05)

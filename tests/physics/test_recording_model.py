@@ -5,25 +5,16 @@ import pytest
 from scipy.linalg import block_diag
 
 from gyro_pipeline.conventions import DISJOINT, MDPS, PAPER, TRUE, InputError
+from gyro_pipeline.physics import recording_model as models
 from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.ceiling import ceiling_rmse, oracle, running_mean_rmse
 from gyro_pipeline.physics.noise import simulate_noise
-from gyro_pipeline.physics.recording_model import (
-    RecordingModel,
-    best_linear,
-    block_edges,
-    block_means,
-    constant_bias,
-    joint_squares,
-    mean_squares,
-    noise_covariances,
-)
 
 RATE, SAMPLES = 20.0, 1200
 N, B, K, TAU = 5 * MDPS, 3 * MDPS, 0.3 * MDPS, 1 * MDPS
-WHITE = constant_bias(SAMPLES, RATE, NoiseFigures(N, 0, 0), 0.02, TAU)
-COLOURED = constant_bias(SAMPLES, RATE, NoiseFigures(N, B, K), 0.02, TAU)
-WARMING = RecordingModel(
+WHITE = models.constant_bias(SAMPLES, RATE, NoiseFigures(N, 0, 0), 0.02, TAU)
+COLOURED = models.constant_bias(SAMPLES, RATE, NoiseFigures(N, B, K), 0.02, TAU)
+WARMING = models.RecordingModel(
     SAMPLES,
     RATE,
     NoiseFigures(N, B, K),
@@ -45,7 +36,7 @@ def test_covariances_are_those_of_the_simulated_noise(part):
         np.random.default_rng(part), (count, SAMPLES), RATE, levels[0], **names
     ).astype(np.float64)
     means = np.stack([noise[:, a:b].mean(axis=1) for a, b in zip(edges, edges[1:], strict=False)])
-    expected = noise_covariances(np.array(edges), SAMPLES, RATE)[part]
+    expected = models.noise_covariances(np.array(edges), SAMPLES, RATE)[part]
     deviation = np.sqrt((np.outer(*2 * [np.diag(expected)]) + expected**2) / count)
     assert (np.abs(means @ means.T / count - expected) < 4.5 * deviation).all()
 
@@ -55,7 +46,7 @@ def test_covariances_are_those_of_the_simulated_noise(part):
 def test_weights_are_those_of_the_dense_solution_on_all_blocks(name, start, truth):
     """Everything outside the window in one block each changes nothing."""
     model, size = MODELS[name], 200
-    line = best_linear(model, start, size, truth)
+    line = models.best_linear(model, start, size, truth)
     edges = np.arange(0, SAMPLES + 1, 10)
     inside = (edges[:-1] >= start) & (edges[1:] <= start + size)
     profile, noise = model.profiles(edges), model.noise_covariance(edges)
@@ -79,24 +70,24 @@ def test_weights_are_those_of_the_dense_solution_on_all_blocks(name, start, trut
 @pytest.mark.parametrize("truth", TRUTHS)
 def test_on_white_noise_it_is_the_oracle_of_the_closed_form(truth, start=700):
     size, recording_s = 200, SAMPLES / RATE
-    best, mean = mean_squares(WHITE, start, size, truth)
+    best, mean = models.mean_squares(WHITE, start, size, truth)
     window_s = size / RATE
     assert np.sqrt(best) == pytest.approx(ceiling_rmse(N, TAU, window_s, recording_s, truth))
     assert np.sqrt(mean) == pytest.approx(running_mean_rmse(N, window_s, recording_s, truth))
     windows = np.random.default_rng(1).normal(0.02, N, (5, size))
     expected = oracle(windows.mean(axis=1), 0.02, TAU, N, window_s, recording_s, truth)
-    np.testing.assert_allclose(best_linear(WHITE, start, size, truth)(windows), expected)
+    np.testing.assert_allclose(models.best_linear(WHITE, start, size, truth)(windows), expected)
     assert WHITE.averaging_variance() == pytest.approx(N**2 / recording_s)
 
 
 @pytest.mark.parametrize("truth", [PAPER, TRUE])
 def test_jointly_over_axes_it_is_the_dense_solution_of_all_of_them(truth):
     """Biases correlated over axes, one of which warms up as well."""
-    models = [COLOURED, WARMING, WHITE]
+    axes = [COLOURED, WARMING, WHITE]
     prior = TAU**2 * (0.8 + 0.2 * np.eye(3))
     edges = np.arange(0, SAMPLES + 1, 10)
     inside = np.tile((edges[:-1] >= 200) & (edges[1:] <= 400), 3)
-    noise = block_diag(*[model.noise_covariance(edges) for model in models])
+    noise = block_diag(*[model.noise_covariance(edges) for model in axes])
     decay = np.zeros_like(noise)
     own = slice(120, 240)
     decay[own, own] = np.outer(*2 * [WARMING.profiles(edges)[:, 1]]) * WARMING.covariance[1, 1]
@@ -107,9 +98,10 @@ def test_jointly_over_axes_it_is_the_dense_solution_of_all_of_them(truth):
         shared, variance = np.kron(prior, np.ones((1, 120))), prior
     seen = np.linalg.solve(joint[np.ix_(inside, inside)], shared[:, inside].T)
     expected = np.trace(variance - shared[:, inside] @ seen) / 3
-    found = joint_squares(models, 200, 200, truth, np.stack([prior, np.diag(np.diag(prior))]))
+    priors = np.stack([prior, np.diag(np.diag(prior))])
+    found = models.joint_squares(axes, 200, 200, truth, priors)
     assert found[0] == pytest.approx(expected, rel=1e-9)
-    alone = [mean_squares(one, 200, 200, truth)[0] for one in models]
+    alone = [models.mean_squares(one, 200, 200, truth)[0] for one in axes]
     assert found[1] == pytest.approx(np.mean(alone))
     assert found[0] < found[1]
 
@@ -117,16 +109,16 @@ def test_jointly_over_axes_it_is_the_dense_solution_of_all_of_them(truth):
 def test_windows_outside_the_recording_and_unknown_truths_are_refused():
     for start, size in ((-1, 10), (1150, 51), (0, 0)):
         with pytest.raises(InputError, match="inside a recording of 1200 samples"):
-            best_linear(WHITE, start, size, PAPER)
+            models.best_linear(WHITE, start, size, PAPER)
     with pytest.raises(InputError, match="got 'mean'"):
-        best_linear(WHITE, 0, 100, "mean")
+        models.best_linear(WHITE, 0, 100, "mean")
     with pytest.raises(InputError, match="shorter than the recording"):
-        best_linear(WHITE, 0, SAMPLES, DISJOINT)
+        models.best_linear(WHITE, 0, SAMPLES, DISJOINT)
 
 
 def test_blocks_have_nearly_equal_lengths_and_are_200_at_most():
-    np.testing.assert_array_equal(block_edges(10, 3), [0, 3, 7, 10])
-    np.testing.assert_array_equal(block_edges(2, 10), [0, 2])
-    assert len(block_edges(10_000, 10)) == 201
+    np.testing.assert_array_equal(models.block_edges(10, 3), [0, 3, 7, 10])
+    np.testing.assert_array_equal(models.block_edges(2, 10), [0, 2])
+    assert len(models.block_edges(10_000, 10)) == 201
     samples = np.arange(10, dtype=np.float32)[None]
-    np.testing.assert_allclose(block_means(samples, np.array([0, 3, 7, 10])), [[1, 4.5, 8]])
+    np.testing.assert_allclose(models.block_means(samples, np.array([0, 3, 7, 10])), [[1, 4.5, 8]])

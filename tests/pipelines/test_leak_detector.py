@@ -4,9 +4,7 @@ A network trained on shuffled labels can only learn the mean of the training lab
 better than that constant on test recordings, information about them has reached it.
 """
 
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,8 +16,6 @@ from gyro_pipeline.pipelines.reporting.leakage import pool_leakage
 from gyro_pipeline.studies import CNN, CNN_SHUFFLED
 
 pytestmark = pytest.mark.slow
-
-REAL_FILE = "memsense_test_real.npy"
 
 
 @pytest.fixture(scope="module")
@@ -89,14 +85,12 @@ def test_leaks_look_better_than_a_split_by_recording_and_the_oracle_finds_the_la
 
 
 def test_on_the_real_file_shuffled_labels_are_no_better_than_the_constant(
-    parameters, read_logs, tmp_path, leak_study
+    parameters, read_logs, tmp_path, leak_study, real_file
 ):
-    folder = os.environ.get("GYRO_PIPELINE_REAL_DATA")
-    if not folder or not Path(folder, REAL_FILE).is_file():
-        pytest.skip(f"GYRO_PIPELINE_REAL_DATA names no folder with {REAL_FILE}")
-    p = parameters("base")
+    p, file = parameters("base"), real_file("memsense_test_real.npy")
     sensors = {name: one.model_dump() for name, one in p.sensors.items()}
-    logs = ArrayLogs("memsense", sensors, "published", folder, {"all": REAL_FILE}).load()
+    given = "memsense", sensors, "published", str(file.parent), {"all": file.name}
+    logs = ArrayLogs(*given).load()
     recordings, _ = read_logs(logs, p.quality, tmp_path)
     recordings = recordings.assign_attrs(sensor="sparkfun")  # whose grid the study has
     found = leak_study(recordings)

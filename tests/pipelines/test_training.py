@@ -5,28 +5,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
-from gyro_pipeline.conventions import (
-    ALL_RECORDINGS,
-    HOLD_OUT,
-    ORIGIN_REAL,
-    ORIGIN_VIRTUAL,
-    TRAIN,
-    VALIDATION,
-    InputError,
-)
+from gyro_pipeline.conventions import InputError
 from gyro_pipeline.datasets.tables import Table
 from gyro_pipeline.estimators import estimator_class
-from gyro_pipeline.parameters import Execution, Only
+from gyro_pipeline.parameters import Only
 from gyro_pipeline.pipelines.training import nodes
 from gyro_pipeline.pipelines.training.nodes import TrainingSets
-from gyro_pipeline.studies import CNN, CNN_SHUFFLED, LEFT_OUT, MEAN, run_spec, study_rows
+from gyro_pipeline.studies import CNN, LEFT_OUT, MEAN, run_spec, study_rows
 from gyro_pipeline.tracking import FINGERPRINT
 
 STARTS = range(0, 801, 200)
 PARTS = ("nothing", "own", "real", "all")
-
+THEIRS = "a_strangers_estimators"
 
 pytestmark = pytest.mark.slow
 STRANGER = """
@@ -65,21 +56,16 @@ class Nothing(All):
 
 
 @pytest.fixture(scope="module")
-def stranger(tmp_path_factory):
-    """A file outside of the package, and the names of its estimators."""
+def strange(world, make_study, tmp_path_factory):
+    """A study of the estimators of a file outside of the package."""
     folder = tmp_path_factory.mktemp("elsewhere")
-    path = folder / "a_strangers_estimators.py"
-    path.write_text(STRANGER)
+    (folder / f"{THEIRS}.py").write_text(STRANGER)
+    names = [f"{THEIRS}:{part.title()}" for part in PARTS]
+    study = make_study("some", names, real_gyros=[3, 6], virtual_gyros=[0, 6])
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(folder)
-        yield path, [f"{path.stem}:{part.title()}" for part in PARTS]
-    sys.modules.pop(path.stem, None)
-
-
-@pytest.fixture(scope="module")
-def strange(world, make_study, stranger):
-    study = make_study("some", stranger[1], real_gyros=[3, 6], virtual_gyros=[0, 6])
-    return replace(world, study=study)
+        yield replace(world, study=study)
+    sys.modules.pop(THEIRS, None)
 
 
 @pytest.fixture(scope="module")
@@ -94,33 +80,25 @@ def few(make_recordings, make_world, make_study):
     return made
 
 
-def by_row(world):
-    """Each row of a study that is no running mean, with the fingerprint of its run."""
-    rows = study_rows(world.study, "sparkfun", "test", world.windows_s, world.seeds, world.only)
-    runs = {spec: key for key, spec in world.specs.items()}
-    return [(row, runs[run_spec(row, False)]) for row in rows if row.estimator != MEAN]
-
-
-# what a run is fitted to
-
-
 def test_every_row_is_fitted_to_exactly_the_training_set_that_it_names(strange):
     drawn = strange.raw.assign(true_bias=strange.raw.angular_rate.isel(sample=0, drop=True))
     fits = {fit.run.fingerprint: fit for fit in replace(strange, raw=drawn).train()}
     assert len(fits) == 1 + 1 + 1 + 2 + 4  # the running mean; rows of the same part are one run
-    rows = by_row(strange)
+    given = strange.study, "sparkfun", "test", strange.windows_s, strange.seeds, strange.only
+    rows = [row for row in study_rows(*given) if row.estimator != MEAN]
     assert len(rows) == 4 * 4
-    for row, key in rows:
-        part, fit = row.estimator.rpartition(":")[2].lower(), fits[key]
+    runs = {spec: key for key, spec in strange.specs.items()}
+    for row in rows:
+        part, fit = row.estimator.rpartition(":")[2].lower(), fits[runs[run_spec(row, False)]]
         real = {"nothing": 0, "own": 1}.get(part, row.real_gyros // 3)
         virtual = row.virtual_gyros // 3 if part == "all" else 0
         expected = [
-            (VALIDATION if number > 8 else TRAIN, ORIGIN_REAL, imu, number, start)
+            ("validation" if number > 8 else "train", "real", imu, number, start)
             for imu in range(1, 1 + real)
             for number in range(1, 11)
             for start in STARTS
         ] + [
-            (TRAIN, ORIGIN_VIRTUAL, imu, number, start)
+            ("train", "virtual", imu, number, start)
             for imu in range(1, 1 + virtual)
             for number in range(1, 6)
             for start in STARTS
@@ -129,7 +107,7 @@ def test_every_row_is_fitted_to_exactly_the_training_set_that_it_names(strange):
         assert (fit.estimator.size, fit.estimator.device) == (200, 1)
         # nothing of what was drawn
         assert fit.estimator.seen == {"angular_rate", "samples", "recording_mean"}
-        sources = {ORIGIN_REAL: strange.raw, ORIGIN_VIRTUAL: strange.virtual}
+        sources = {"real": strange.raw, "virtual": strange.virtual}
         for (origin, imu, number), first in fit.estimator.firsts.items():
             samples = sources[origin].angular_rate.sel(imu=imu, recording=number)
             np.testing.assert_array_equal(first, samples[:, 0])
@@ -138,8 +116,8 @@ def test_every_row_is_fitted_to_exactly_the_training_set_that_it_names(strange):
         assert (params["real_gyros"], params["virtual_gyros"]) == (3 * real, 3 * virtual)
 
 
-def test_of_unseen_devices_every_fold_trains_on_all_others(strange, stranger, make_study):
-    study = make_study("some", [stranger[1][1]], real_gyros=[3])
+def test_of_unseen_devices_every_fold_trains_on_all_others(strange, make_study):
+    study = make_study("some", [f"{THEIRS}:Own"], real_gyros=[3])
     unseen = replace(strange, study=study.model_copy(update={"protocol": "leave_one_device_out"}))
     fits = {fit.fold: fit for fit in unseen.train() if fit.run.params["estimator"] != MEAN}
     places = {
@@ -149,35 +127,8 @@ def test_of_unseen_devices_every_fold_trains_on_all_others(strange, stranger, ma
     numbers = range(1, 11)  # others were made together with those that test
     assert places["without IMU 1"] == {(2, number) for number in numbers}
     assert places["without IMU 2"] == {(1, number) for number in numbers}
-    assert places[ALL_RECORDINGS] == {(imu, n) for imu in (1, 2) for n in range(1, 15)}
-    assert [fold for fold, fit in fits.items() if fit.is_model] == [ALL_RECORDINGS]
-
-
-def test_side_by_side_imus_are_one_input_and_shuffled_labels_are_of_the_same_recordings(
-    world, make_study
-):
-    """Bias by bias, from what the network is handed."""
-    study = make_study("some", [CNN, CNN_SHUFFLED], method=1, real_gyros=[6])
-    side = replace(world, study=study)
-    means = side.raw.angular_rate.mean("sample", dtype=np.float64)
-    expected = means.sel(recording=range(1, 9)).transpose("recording", "imu", "axis")
-    sets = TrainingSets(side.windows, side.recordings, None)
-    jobs = {
-        spec.estimator: nodes.make_estimator(spec.estimator, side.training, 0).job(
-            sets.of(spec)[HOLD_OUT]
-        )
-        for spec in side.specs.values()
-        if spec.estimator != MEAN
-    }
-    for name, job in jobs.items():
-        (device,) = job.devices
-        assert (device.imus, device.numbers) == ((1, 2), tuple(range(1, 9)))
-        assert (job.validation.imus, job.validation.numbers) == ((1, 2), (9, 10))
-        same = np.allclose(device.biases, expected.to_numpy().reshape(8, 6), rtol=1e-12)
-        assert same == (name == CNN)
-        np.testing.assert_allclose(
-            np.sort(device.biases, axis=0), np.sort(expected.to_numpy().reshape(8, 6), axis=0)
-        )
+    assert places["all recordings"] == {(imu, n) for imu in (1, 2) for n in range(1, 15)}
+    assert [fold for fold, fit in fits.items() if fit.is_model] == ["all recordings"]
 
 
 def test_the_leak_studys_networks_see_what_their_protocol_gives_them(world, make_study):
@@ -205,18 +156,15 @@ def test_the_leak_studys_networks_see_what_their_protocol_gives_them(world, make
             assert watched == (tested if spec.protocol == "best_epoch_on_test" else set())
 
 
-# folds, and kills between fits
-
-
 def test_folds_are_fits_of_one_run_and_a_kill_loses_only_what_was_running(few, as_stored, caplog):
     world = few(5, ["empirical_bayes", CNN])
     whole = {(fit.run.fingerprint, fit.fold): fit for fit in world.train()}
-    names = [*(f"fold {number}" for number in range(5)), ALL_RECORDINGS]
+    names = [*(f"fold {number}" for number in range(5)), "all recordings"]
     assert len(world.plan) == 3
     assert set(whole) == {(key, fold) for key in world.specs for fold in names}
     for fit in whole.values():
         assert (fit.run.folds, fit.run.params["folds"]) == (tuple(names), 5)
-        assert fit.is_model == (fit.fold == ALL_RECORDINGS)
+        assert fit.is_model == (fit.fold == "all recordings")
     for stop in (1, 8):
         stored = as_stored(list(whole.values())[:stop])
         caplog.clear()
@@ -252,9 +200,6 @@ def test_of_few_recordings_what_cannot_be_fitted_is_left_out_and_named_first(few
     assert fitted == set(names) - left_out
 
 
-# what decides that a fit is needed
-
-
 def changed(world, **changes):
     """Runs whose fingerprints a change of the world changes."""
     before, after = world.fingerprints, replace(world, **changes).fingerprints
@@ -279,16 +224,29 @@ def test_a_fingerprint_knows_no_study_and_changes_with_no_narrowing(varied, make
     assert len(set(varied.fingerprints.values())) == len(varied.fingerprints) == 1 + 1 + 1 + 2 + 4
 
 
-def test_networks_alone_change_with_a_hyper_parameter(varied):
-    found = changed(varied, training=varied.training.model_copy(update={"hidden": 5}))
-    assert found == {key for key in varied.fingerprints if key[0] == CNN}
+@pytest.mark.parametrize(
+    ("group", "change", "affected"),
+    [
+        ("training", {"hidden": 5}, lambda key: key[0] == CNN),
+        ("virtual_gyros", {"seed": 1}, lambda key: key[2]),
+        ("splits", {"training_windows": "first"}, lambda key: key[1]),
+        ("splits", {"fold_validation_recordings": 1}, lambda key: False),  # this is a hold-out
+    ],
+)
+def test_a_setting_changes_the_runs_that_depend_on_it_and_no_others(
+    varied, group, change, affected
+):
+    """Reports find runs by fingerprint, so that the others are found whatever they carry."""
+    settings = getattr(varied, group).model_copy(update=change)
+    expected = {key for key in varied.fingerprints if affected(key)}
+    assert changed(varied, **{group: settings}) == expected
 
 
 def test_everything_changes_with_the_recordings_their_labels_and_with_those_that_test(varied):
     everything = set(varied.fingerprints)
     assert changed(varied, raw=varied.raw.assign_attrs(data_hash="of others")) == everything
     roles = varied.raw.split.to_numpy().copy()
-    roles[10] = TRAIN
+    roles[10] = "train"
     moved = varied.raw.assign_coords(split=("recording", roles))
     assert changed(varied, raw=moved) == everything
     ends = varied.raw.angular_rate.isel(sample=0, drop=True).astype(float)
@@ -311,36 +269,20 @@ def test_what_a_study_has_is_skipped_and_what_another_has_is_shared(
     other = replace(world, study=make_study("real2real", real_gyros=[3, 6]))
     with caplog.at_level("INFO", "gyro_pipeline"):
         shared = other.train(tracked=stored)
-    assert "3 runs planned, 0 skipped (made before), 3 shared with another study, 0 to fit" in (
-        caplog.text
-    )
-    by_key = {fit.run.fingerprint: fit for fit in fitted}
+    told = "3 runs planned, 0 skipped (made before), 3 shared with another study, 0 to fit"
+    assert told in caplog.text
+    twins = {fit.run.fingerprint: fit for fit in fitted}
     assert {fit.run.fingerprint for fit in shared} == set(other.specs)
     for fit in shared:
-        twin = by_key[fit.run.fingerprint]
+        twin = twins[fit.run.fingerprint]
         if fit.run.params["estimator"] == CNN:
             assert bits(fit) == bits(twin)
             assert fit.estimator.losses is twin.estimator.losses
         assert fit.run.study == fit.run.params["study"] == "real2real"
         assert {**fit.run.params, "study": "augmentation"} == twin.run.params
-        assert (fit.run.name, fit.run.folds, fit.is_model) == (twin.run.name, (HOLD_OUT,), True)
+        assert (fit.run.name, fit.run.folds, fit.is_model) == (twin.run.name, ("hold-out",), True)
     with pytest.raises(InputError, match=r"sparkfun: real2real needs 9 gyroscopes, .* hold 6"):
         replace(world, study=make_study("real2real", real_gyros=[9])).train()
-
-
-def test_runs_with_virtual_gyroscopes_alone_change_with_them(varied):
-    found = changed(varied, virtual_gyros=varied.virtual_gyros.model_copy(update={"seed": 1}))
-    assert found == {key for key in varied.fingerprints if key[2]}
-
-
-def test_a_setting_of_the_splits_changes_the_runs_whose_windows_it_changes(varied):
-    """Reports find runs by fingerprint, so that the others are found whatever they carry."""
-    for setting, expected in (
-        ({"training_windows": "first"}, {key for key in varied.fingerprints if key[1]}),
-        ({"fold_validation_recordings": 1}, set()),  # this is a hold-out
-    ):
-        splits = varied.splits.model_copy(update=setting)
-        assert changed(varied, splits=splits) == expected
 
 
 def test_a_plan_comes_back_from_its_file_as_it_was(few, tmp_path):
@@ -350,9 +292,6 @@ def test_a_plan_comes_back_from_its_file_as_it_was(few, tmp_path):
     table.save(plan)
     assert nodes.possible_runs(table.load()) == nodes.possible_runs(plan)
     assert len(nodes.possible_runs(plan)) == 2
-
-
-# what is stored
 
 
 def test_runs_carry_what_they_are_and_an_example_of_their_windows(world, fitted):
@@ -365,18 +304,3 @@ def test_runs_carry_what_they_are_and_an_example_of_their_windows(world, fitted)
         assert f"{spec.real_gyros}+{spec.virtual_gyros} 10 s" in fit.run.name
         assert fit.example.shape == (1, 3, 200)
         assert np.isfinite(fit.estimator.estimate(fit.example)[0]).all()
-
-
-def test_training_all_at_once_gives_the_same_runs(world, fitted):
-    """The same identities, and weights that differ by rounding."""
-    at_once = world.train(execution=Execution(executor="batched", workers=1))
-    found = {fit.run.fingerprint: fit for fit in at_once}
-    assert len(found) == len(fitted)
-    for fit in fitted:
-        twin = found[fit.run.fingerprint]
-        assert twin.run == fit.run
-        if fit.run.params["estimator"] == CNN:
-            assert twin.estimator.engine.startswith("batched c")  # pu or uda
-            for name, weights in fit.estimator._artifact["last"].items():
-                got = twin.estimator._artifact["last"][name]
-                torch.testing.assert_close(got, weights, rtol=0, atol=1e-5)

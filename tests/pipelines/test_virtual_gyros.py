@@ -69,10 +69,8 @@ def test_the_seed_and_the_sensor_decide_and_the_layout_is_that_of_recordings(vir
     expected = virtual.angular_rate.to_numpy().astype(np.float64).mean(axis=-1)
     np.testing.assert_allclose(virtual.recording_mean, expected, rtol=1e-12)
     xr.testing.assert_identical(synthesise(real, bias, SETTINGS), virtual)
-    others = [
-        synthesise(real, bias, SETTINGS.model_copy(update={"seed": 1})),
-        synthesise(real.assign_attrs(sensor="dot"), bias, SETTINGS),
-    ]
+    others = [synthesise(real, bias, SETTINGS.model_copy(update={"seed": 1}))]
+    others.append(synthesise(real.assign_attrs(sensor="dot"), bias, SETTINGS))
     assert len({one.data_hash for one in [virtual, *others]}) == 3
     for other in others:
         assert not np.allclose(other.recording_mean, virtual.recording_mean, atol=0.01)

@@ -2,16 +2,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from gyro_pipeline.conventions import (
-    ALL_RECORDINGS,
-    HOLD_OUT,
-    ORIGIN_REAL,
-    ORIGIN_VIRTUAL,
-    TEST,
-    TRAIN,
-    VALIDATION,
-    InputError,
-)
+from gyro_pipeline.conventions import InputError
 from gyro_pipeline.parameters import Only
 from gyro_pipeline.pipelines.ground_truth.nodes import measure_allan_variance
 from gyro_pipeline.pipelines.virtual_gyros.nodes import synthesise
@@ -21,7 +12,6 @@ from gyro_pipeline.pipelines.windowed_splits.protocols import check_table
 from gyro_pipeline.splits import split_recordings
 
 RATE_HZ = 20.0
-
 
 pytestmark = pytest.mark.slow
 
@@ -34,15 +24,15 @@ def test_the_seed_chooses_validation_recordings_and_the_source_or_its_order_thos
         for seed in ({"split_seed": 1}, {"split_seed": 2})
     )
     validation = [
-        {n for n, role in roles.items() if role == VALIDATION} for roles in (first, other)
+        {n for n, role in roles.items() if role == "validation"} for roles in (first, other)
     ]
     assert validation[0] != validation[1]
-    assert all(first[n] == other[n] == TEST for n in range(80, 100))
-    given = dict.fromkeys(range(1, 31), TRAIN) | {1: TEST, 5: TEST, 7: TEST}
+    assert all(first[n] == other[n] == "test" for n in range(80, 100))
+    given = dict.fromkeys(range(1, 31), "train") | {1: "test", 5: "test", 7: "test"}
     without_7 = [n for n in range(1, 31) if n not in (3, 7)]
     roles = split_recordings(range(1, 31), without_7, parameters("base").splits, given)
-    assert [n for n, role in roles.items() if role == TEST] == [1, 5, 7]  # of no tested IMU
-    assert roles[3] == TRAIN
+    assert [n for n, role in roles.items() if role == "test"] == [1, 5, 7]  # of no tested IMU
+    assert roles[3] == "train"
 
 
 def test_the_papers_split_of_100_recordings_and_its_windows(make, table_of, make_bias, parameters):
@@ -52,16 +42,16 @@ def test_the_papers_split_of_100_recordings_and_its_windows(make, table_of, make
     virtual = synthesise(recordings, bias, p.virtual_gyros)
     for training_windows, starts in (("all", [0, 200, 400]), (5.0, [*range(0, 401, 100)])):
         table = table_of(recordings, virtual, splits={"training_windows": training_windows})
-        assert sorted(table[table.role == TRAIN].start.unique()) == starts
-        assert sorted(table[table.role == TEST].start.unique()) == [0, 200, 400]
-    drawn, real = (table[table.origin == origin] for origin in (ORIGIN_VIRTUAL, ORIGIN_REAL))
-    assert numbers(real, TEST) == list(range(81, 101))
-    assert (len(numbers(real, VALIDATION)), len(numbers(real, TRAIN))) == (8, 72)
-    assert numbers(real, TRAIN, imu=2) == numbers(real, TRAIN)
-    assert numbers(real, TEST, imu=2) == []
-    assert table.fold.unique().tolist() == [HOLD_OUT]
+        assert sorted(table[table.role == "train"].start.unique()) == starts
+        assert sorted(table[table.role == "test"].start.unique()) == [0, 200, 400]
+    drawn, real = (table[table.origin == origin] for origin in ("virtual", "real"))
+    assert numbers(real, "test") == list(range(81, 101))
+    assert (len(numbers(real, "validation")), len(numbers(real, "train"))) == (8, 72)
+    assert numbers(real, "train", imu=2) == numbers(real, "train")
+    assert numbers(real, "test", imu=2) == []
+    assert table.fold.unique().tolist() == ["hold-out"]
     # virtual recordings train, and come from recordings that train
-    assert set(drawn.role) == {TRAIN}
+    assert set(drawn.role) == {"train"}
     assert sorted(drawn.recording.unique()) == [1, 2, 3]
     leaking = virtual.assign_attrs(drawn_from=np.array([1, 90]))
     with pytest.raises(InputError, match="were drawn from recordings 90, which test"):
@@ -101,12 +91,9 @@ def table_of(parameters, make_study, make_quality):
     return made
 
 
-def numbers(table, role, fold=HOLD_OUT, imu=1):
+def numbers(table, role, fold="hold-out", imu=1):
     rows = table[(table.fold == fold) & (table.role == role) & (table.imu == imu)]
     return sorted(rows.recording.unique().tolist())
-
-
-# which recordings
 
 
 @pytest.mark.parametrize(("count", "folds", "validation"), [(4, 4, 0), (21, 5, 2)])
@@ -115,13 +102,13 @@ def test_few_recordings_make_a_k_fold_that_tests_each_once(
 ):
     table = table_of(make(count))
     names = [f"fold {fold}" for fold in range(folds)]
-    assert table.fold.unique().tolist() == [*names, ALL_RECORDINGS]
-    tested = [number for fold in names for number in numbers(table, TEST, fold)]
+    assert table.fold.unique().tolist() == [*names, "all recordings"]
+    tested = [number for fold in names for number in numbers(table, "test", fold)]
     assert sorted(tested) == list(range(1, 1 + count))
-    assert {len(numbers(table, VALIDATION, fold)) for fold in names} == {validation}
-    of_model = table[table.fold == ALL_RECORDINGS]
-    assert set(of_model.role) == {TRAIN, VALIDATION}
-    assert len(numbers(of_model, VALIDATION, ALL_RECORDINGS)) == 2
+    assert {len(numbers(table, "validation", fold)) for fold in names} == {validation}
+    of_model = table[table.fold == "all recordings"]
+    assert set(of_model.role) == {"train", "validation"}
+    assert len(numbers(of_model, "validation", "all recordings")) == 2
     assert of_model.recording.nunique() == count
 
 
@@ -130,55 +117,40 @@ def test_what_is_lost_moves_no_recording_to_another_fold(make, table_of, caplog)
     recordings.angular_rate[0, 1, :, 10:50] = np.nan  # the first window of recording 2
     recordings["samples"][0, 2], recordings.angular_rate[0, 2] = 0, np.nan  # only IMU 2 has it
     table = table_of(recordings, splits={"training_windows": "first"})
-    assert "lost more than 10% of their samples and are left out; the first one used of " in (
-        caplog.text
-    )
-    assert table.fold.unique().tolist() == [*(f"fold {fold}" for fold in range(4)), ALL_RECORDINGS]
-    for fold, tested in enumerate((1, 2, 4, 5)):
-        assert numbers(table, TEST, f"fold {fold}") == [tested]
-        train = numbers(table, TRAIN, f"fold {fold}") + numbers(table, VALIDATION, f"fold {fold}")
+    assert "lost more than 10% of their samples and are left out; the first one used" in caplog.text
+    folds = [f"fold {fold}" for fold in range(4)]
+    assert table.fold.unique().tolist() == [*folds, "all recordings"]
+    for fold, tested in zip(folds, (1, 2, 4, 5), strict=True):
+        assert numbers(table, "test", fold) == [tested]
+        train = numbers(table, "train", fold) + numbers(table, "validation", fold)
         assert sorted(train) == [n for n in (1, 2, 4, 5) if n != tested]
-        assert 3 in numbers(table, TRAIN, f"fold {fold}", imu=2)
-    trained = table[(table.role != TEST) & (table.imu == 1)].groupby("recording").start.unique()
+        assert 3 in numbers(table, "train", fold, imu=2)
+    trained = table[(table.role != "test") & (table.imu == 1)].groupby("recording").start.unique()
     assert {n: [*starts] for n, starts in trained.items()} == {1: [0], 2: [200], 4: [0], 5: [0]}
-    tests = table[(table.role == TEST) & (table.recording == 2)]
+    tests = table[(table.role == "test") & (table.recording == 2)]
     assert tests.start.tolist() == [200, 400]
 
 
 def test_every_device_in_turn_is_unseen(make, table_of):
     table = table_of(make(100, imus=3), protocol="leave_one_device_out")
-    folds = [*(f"without IMU {imu}" for imu in (1, 2, 3)), ALL_RECORDINGS]
+    folds = [*(f"without IMU {imu}" for imu in (1, 2, 3)), "all recordings"]
     assert table.fold.unique().tolist() == folds
-    assert numbers(table, TEST, "without IMU 2", imu=2) == list(range(81, 101))
+    assert numbers(table, "test", "without IMU 2", imu=2) == list(range(81, 101))
     for imu in (1, 3):
-        assert numbers(table, TRAIN, "without IMU 2", imu) == list(range(1, 81))
+        assert numbers(table, "train", "without IMU 2", imu) == list(range(1, 81))
     few = table_of(make(3), protocol="leave_one_device_out")
-    assert numbers(few, TEST, "without IMU 1") == [1, 2, 3]
-    assert numbers(few, TRAIN, "without IMU 1", imu=2) == [1, 2, 3]
+    assert numbers(few, "test", "without IMU 1") == [1, 2, 3]
+    assert numbers(few, "train", "without IMU 1", imu=2) == [1, 2, 3]
     with pytest.raises(InputError, match="expected at least 2 IMUs, got 1; bring recordings"):
         table_of(make(3, imus=1), protocol="leave_one_device_out")
-
-
-# which windows
 
 
 @pytest.mark.parametrize("protocol", ["k_fold", "window_split", "best_epoch_on_test"])
 def test_the_leak_studys_windows_test_once_each(make, table_of, protocol):
     table = table_of(make(100), protocol=protocol, recordings=6, folds=3, strides_s=[5.0])
-    tests = table[table.role == TEST]
+    tests = table[table.role == "test"]
     assert len(tests) == len(tests.drop_duplicates(["recording", "start"])) == 6 * 5
     assert set(tests.imu) == {1}
-    for fold, rows in table.groupby("fold", observed=True):
-        train, test = (set(rows.recording[rows.role == role]) for role in (TRAIN, TEST))
-        assert bool(train & test) == (protocol == "window_split"), fold
-        if protocol == "best_epoch_on_test":
-            places = [
-                rows[rows.role == role][["recording", "start"]] for role in (VALIDATION, TEST)
-            ]
-            assert places[0].to_numpy().tolist() == places[1].to_numpy().tolist()
-
-
-# what is refused
 
 
 def test_a_copy_with_another_role_is_refused(make, table_of):
@@ -207,14 +179,14 @@ def test_a_hum_and_a_drift_that_recordings_share_make_no_copies():
 @pytest.mark.parametrize(
     ("apart", "row", "message"),
     [
-        ("recording", (TEST, "real", 1, 1), r"recording 1 .*test \(IMU 1\), train \(IMU 2, 1\)"),
-        ("recording", (VALIDATION, "real", 2, 2), r"recording 2 .*test \(IMU 1\), validation"),
-        ("imu", (TEST, "real", 2, 3), r"imu 2 has more than one role"),
+        ("recording", ("test", "real", 1, 1), r"recording 1 .*test \(IMU 1\), train \(IMU 2, 1\)"),
+        ("recording", ("validation", "real", 2, 2), r"recording 2 .*test \(IMU 1\), validation"),
+        ("imu", ("test", "real", 2, 3), r"imu 2 has more than one role"),
     ],
 )
 def test_what_has_two_roles_in_a_fold_is_refused(apart, row, message):
-    given = [(TRAIN, "real", 2, 1), (TEST, "real", 1, 2)]
-    given += [(TRAIN, "real", 1, 1), (TRAIN, "virtual", 1, 2)] if apart == "recording" else []
+    given = [("train", "real", 2, 1), ("test", "real", 1, 2)]
+    given += [("train", "real", 1, 1), ("train", "virtual", 1, 2)] if apart == "recording" else []
     rows = [("a fold", *one) for one in given]
     contents = pd.DataFrame(columns=["imu", "recording", "copies"])
 
@@ -223,7 +195,7 @@ def test_what_has_two_roles_in_a_fold_is_refused(apart, row, message):
         check_table(pd.DataFrame(rows, columns=columns), apart, contents, [1])
 
     check(rows)
-    check([*rows, ("another fold", TRAIN, "real", 1, 3), ("another fold", TEST, "real", 2, 1)])
+    check([*rows, ("another fold", "train", "real", 1, 3), ("another fold", "test", "real", 2, 1)])
     with pytest.raises(InputError, match=f"a fold: {message}"):
         check([*rows, ("a fold", *row)])
 
@@ -238,9 +210,6 @@ def test_without_a_window_that_tests_a_study_says_so(make, table_of):
         table_of(make(4), windows_s=[60.0])
     with pytest.raises(InputError, match="stride of 0.01 s is less than half a sample"):
         table_of(make(4), strides_s=[0.01])
-
-
-# one length
 
 
 def test_recordings_are_cut_to_the_length_that_keeps_most(

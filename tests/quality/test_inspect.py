@@ -1,8 +1,6 @@
 """What is unusual about a recording, which rows are masked, and whether it is at rest."""
 
-import os
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +14,6 @@ from gyro_pipeline.quality import inspect
 ROWS, RATE_HZ, SIGMA = 6000, 100.0, 0.05
 BIAS = np.array([0.7, -0.4, 0.15])
 SECONDS = np.arange(ROWS) / RATE_HZ
-REAL_DATA = os.environ.get("GYRO_PIPELINE_REAL_DATA")
 
 
 @pytest.fixture(scope="module")
@@ -42,29 +39,23 @@ def decay(size, constant_s):
     return size * np.exp(-SECONDS / constant_s)[:, None]
 
 
-def add(rows, rates, axis=slice(None)):
+def add(rows, rates):
     """A disturbance of some rows."""
+    return put(rows, lambda x: x[rows] + rates)
 
-    def disturb(x):
-        x[rows, axis] += rates
+
+def put(place, values):
+    """Other values at a place, or what a function makes of the recording."""
+
+    def change(x):
+        x[place] = values(x) if callable(values) else values
         return x
 
-    return disturb
+    return change
 
 
-def held(x):
-    x[100:400, 1] = x[100, 1]
-    return x
-
-
-def thrice(x):
-    x[:600] = np.repeat(x[:200], 3, axis=0)
-    return x
-
-
-def louder(x):
-    x[:3000] += x[:3000] - BIAS
-    return x
+def rounded(step):
+    return lambda x: step * np.round(x / step)
 
 
 def touched(x):
@@ -73,41 +64,22 @@ def touched(x):
     return x
 
 
-def rounded(step):
-    return lambda x: step * np.round(x / step)
-
-
 def held_in_turn(x):
     return np.stack([x[np.maximum((ROW - 3 * i) // 10 * 10 + 3 * i, 0), i] for i in range(3)], 1)
 
 
-def blanked(x):
-    """A twentieth of the rows as zeros, about biases of two sigma."""
-    x = (x - BIAS) + [0.1, -0.1, 0.1]
-    x[RANDOM.random(ROWS) < 0.05] = 0
-    return x
-
-
-def zeroed(x):
-    x[700] = 0
-    return x
-
-
-def near_zero(cut):
-    return lambda x: cut(x - BIAS + [0.04, -0.02, 0.01])
-
-
-def cut_to(step):
-    return near_zero(lambda x: step * np.trunc(x / step))
-
-
-def coded(x, value=-0.6):
-    x[SOME, 1] = value
-    return x
+def near_zero(change, bias=(0.04, -0.02, 0.01)):
+    return lambda x: change(x - BIAS + bias)
 
 
 ROW, RANDOM = np.arange(ROWS), np.random.default_rng(3)
-FEW, SOME = RANDOM.random(ROWS) < 0.02, RANDOM.random(ROWS) < 0.1
+FEW, SOME, LOST = (RANDOM.random(ROWS) < share for share in (0.02, 0.1, 0.05))
+HELD = put((slice(100, 400), 1), lambda x: x[100, 1])
+THRICE = put(slice(600), lambda x: np.repeat(x[:200], 3, axis=0))
+LOUDER = put(slice(3000), lambda x: 2 * x[:3000] - BIAS)
+BLANKED = near_zero(put(LOST, 0), (0.1, -0.1, 0.1))
+TRUNCATED = near_zero(lambda x: 0.035 * np.trunc(x / 0.035))
+CODED = put((SOME, 1), -0.46)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +87,7 @@ FEW, SOME = RANDOM.random(ROWS) < 0.02, RANDOM.random(ROWS) < 0.1
     [
         (lambda x: x, {}, []),
         (add(700, np.nan), {"non-finite values": REPAIRED}, ["axes x, y, z, row 700, "]),
-        (held, {"stuck values": REPAIRED}, ["axis y, rows 100 to 399"]),
+        (HELD, {"stuck values": REPAIRED}, ["axis y, rows 100 to 399"]),
         (add(77, [0, 9 * SIGMA, 0]), {"spikes": REPAIRED}, ["axis y, row 77, masked"]),
         (add(FEW, [0, 20 * SIGMA, 0]), {"spikes": REPAIRED}, ["axis y"]),
         (add(slice(500, 504), [8, -5, 2]), {"shocks": REPAIRED}, ["rows 450 to 553"]),
@@ -127,17 +99,17 @@ FEW, SOME = RANDOM.random(ROWS) < 0.02, RANDOM.random(ROWS) < 0.1
          "too short": REJECTED}, ["and 14 more", "quality.least_share"]),
         (touched, {"motion": REJECTED}, ["axis y, rows 9", ", rows 29", ", rows 49"]),
         (add(slice(2500, None), [0.5, 0, 0]), {"motion": REJECTED}, ["axis x, rows 0 to 2499"]),
-        (louder, {"motion": REJECTED}, ["the noise rises"]),
+        (LOUDER, {"motion": REJECTED}, ["the noise rises"]),
         (lambda x: np.minimum(x, BIAS + 2 * SIGMA), {"saturation": REJECTED}, ["cut off at 0.8 "]),
-        (blanked, {"dropouts": REPAIRED}, ["zero on all axes, row"]),
-        (near_zero(zeroed), {"dropouts": REPAIRED}, ["zero on all axes, row 700, masked"]),
-        (cut_to(0.035), {"dead band": REJECTED}, ["axis y, counts cut to zero?"]),
-        (coded, {"saturation": REJECTED}, ["axis y is cut off at -0.6 deg/s"]),
-        (lambda x: coded(rounded(0.01)(x), -0.46), {"frequent value": REJECTED}, ["at -0.46 deg"]),
+        (BLANKED, {"dropouts": REPAIRED}, ["zero on all axes, row"]),
+        (near_zero(put(700, 0)), {"dropouts": REPAIRED}, ["zero on all axes, row 700, masked"]),
+        (TRUNCATED, {"dead band": REJECTED}, ["axis y, counts cut to zero?"]),
+        (put((SOME, 1), -0.6), {"saturation": REJECTED}, ["axis y is cut off at -0.6 deg/s"]),
+        (lambda x: CODED(rounded(0.01)(x)), {"frequent value": REJECTED}, ["at -0.46 deg"]),
         (lambda x: np.round(rounded(0.0091)(x), 2), {}, []),
         (rounded(1.3 * SIGMA), {"coarse quantisation": KEPT}, []),
         (rounded(3 * SIGMA), {"coarse quantisation": REJECTED}, ["quality.largest_step"]),
-        (thrice, {"repeated rows": KEPT}, ["6.7%"]),
+        (THRICE, {"repeated rows": KEPT}, ["6.7%"]),
         (held_in_turn, {"repeated values": REJECTED}, ["axis x repeats 90%", "axis z repeats 90%"]),
         (lambda x: x[:, [1, 1, 2]], {"equal axes": REJECTED}, ["axes x and y", "`columns`"]),
         (lambda x: x * 20, {"noise level": REJECTED}, ["quality.largest_noise_dps"]),
@@ -249,8 +221,7 @@ def test_at_rest_is_kept_at_any_rate_and_length(quality, rate_hz, minutes):
         assert checks(inspected).keys() <= {"warm-up", "drift"}
 
 
-@pytest.mark.skipif(REAL_DATA is None, reason="GYRO_PIPELINE_REAL_DATA names no folder")
-def test_all_real_recordings_of_memsense_are_kept_whole(quality):
-    for rates in np.load(Path(REAL_DATA) / "memsense_test_real.npy"):
+def test_all_real_recordings_of_memsense_are_kept_whole(quality, real_file):
+    for rates in np.load(real_file("memsense_test_real.npy")):
         inspected = inspect(Log(rates.T), 250.0, quality)
         assert (inspected.outcome, inspected.start, inspected.stop) == (KEPT, 0, 13_000)

@@ -110,6 +110,8 @@ REFUSED = [
     (lambda path: None, "cannot be read: No such file"),
     (zipped("log.csv"), r"a zip archive \(log.csv\); unpack it"),
     (zipped("[Content_Types].xml", "xl/workbook.xml"), "an Excel workbook"),
+    (b"RDX3\nX\n\x00\x00", "write.csv"),
+    (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"),
     (b"<!DOCTYPE html>\n<html>", "a web page; download the file itself"),
     (written(lambda b: pd.DataFrame({"x": T}).to_parquet(b))[:700], "copy the file again"),
     (written(scipy.io.savemat, {"x": np.ones((50, 3))})[:700], "copy the file again"),

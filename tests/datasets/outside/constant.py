@@ -11,8 +11,8 @@ class Constant(Estimator):
 
     recommended = True
 
-    def __init__(self, bias=0.0, history=None):
-        self.bias, self.history = bias, history
+    def __init__(self, bias=0.0, losses=None):
+        self.bias, self.losses = bias, losses
 
     def _estimate(self, windows):
         return self.bias + windows.start_s[:, np.newaxis], 0.5
