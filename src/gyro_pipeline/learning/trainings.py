@@ -60,7 +60,7 @@ def run_trainings(
         try:
             results: Sequence[TrainedNetwork | Exception] = train_batch(batch, device, title)
         except Exception as error:  # one network's error, or a lack of memory, must not stop others
-            logger.info("%s: trained one by one: %r", title, error)
+            logger.info("%s: trained one by one: %s", title, error)
             results = [_attempt(job) for job in batch]
         for job, trained in zip(batch, results, strict=True):
             yield numbers[id(job)], trained
