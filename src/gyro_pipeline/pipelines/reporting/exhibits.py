@@ -58,7 +58,14 @@ class Exhibit:
     title: str  # a few words
     caption: str  # explanation for a reader who has not read the paper
     content: "pd.DataFrame | Figure"
-    shown: Sequence[str] | None = None  # columns of the table that the page shows, all by default
+    page_columns: Sequence[str] | None = None  # of the table, which the page shows; None for all
+
+    @property
+    def page_table(self) -> pd.DataFrame | None:
+        """The table as the page shows it; None for a figure."""
+        if not isinstance(self.content, pd.DataFrame):
+            return None
+        return self.content if self.page_columns is None else self.content[[*self.page_columns]]
 
 
 @dataclass(frozen=True)
@@ -236,7 +243,8 @@ def remark(row: pd.Series) -> str | None:
             notes.append(f"beyond its ceiling in {windows} windows")
         elif gain > limit:
             notes.append(f"by chance above its ceiling in {windows} windows")
-    notes += [row["prior_conflict"]] * bool(pd.notna(row.get("prior_conflict")))
+    if pd.notna(row.get("prior_conflict")):
+        notes.append(row["prior_conflict"])
     return "; ".join(notes) or None
 
 

@@ -286,7 +286,7 @@ def saving_against_turn_on_spread(material: Material) -> Exhibit | None:
     size = (9.5, 1.2 + 3 * high)
     with panels(title, size, (high, wide), sharex=True, sharey=True) as (figure, axes):
         for ax, claim in zip(axes, claims, strict=False):
-            _draw_savings(ax, rows[rows.sensor == claim.sensor].sort_values("real_gyros"), claim)
+            _draw_savings(ax, where(rows, sensor=claim.sensor).sort_values("real_gyros"), claim)
         for ax in axes[::wide]:
             ax.set_ylabel("time saving S, all windows [%]")
         for ax in axes[-wide:]:
@@ -383,13 +383,12 @@ def estimators(material: Material, study: str, sensor: str) -> Exhibit | None:
 
 def _draw_estimators(left: Axes, right: Axes, rows: pd.DataFrame) -> None:
     means = where(rows, estimator=MEAN).set_index("window_s").sort_index()
-    names = [in_full(row, rows) for _, row in rows.iterrows()]
-    estimators_by_name = dict(zip(names, rows.estimator, strict=True))
-    for number, (name, estimator) in enumerate(estimators_by_name.items()):
-        results = rows[[other == name for other in names]].drop_duplicates("window_s")
+    named = rows.assign(name=[in_full(row, rows) for _, row in rows.iterrows()])
+    groups = named.drop_duplicates(["name", "window_s"]).groupby("name", sort=False)
+    for number, (name, results) in enumerate(groups):
         rmse = results.set_index("window_s").test_rmse_dps.sort_index()
-        look = estimator_look(estimator, bool(results.recommended.any()))
-        shift = 1 + 0.015 * (number - len(estimators_by_name) / 2)
+        look = estimator_look(results.estimator.iloc[0], bool(results.recommended.any()))
+        shift = 1 + 0.015 * (number - groups.ngroups / 2)
         ratio = rmse / means.test_rmse_dps.reindex(rmse.index)
         for ax, values in ((left, rmse / MDPS), (right, ratio)):
             ax.plot(values.index * shift, values, label=name, **look)
@@ -418,7 +417,7 @@ def leakage_against_stride(material: Material) -> Exhibit | None:
     sensors = list(dict.fromkeys(material.leaks.sensor))
     with panels(None, (9.5, 1.2 + 4.4 * len(sensors)), (len(sensors), 1)) as (figure, axes):
         for ax, sensor in zip(axes, sensors, strict=True):
-            _draw_leaks(ax, material, material.leaks[material.leaks.sensor == sensor])
+            _draw_leaks(ax, material, where(material.leaks, sensor=sensor))
     caption = (
         "Windows whose starts differ by a whole number of hops of the network look almost the same "
         "to it. Split at random, they are near-duplicates that can be learned by heart."
@@ -431,8 +430,7 @@ def _draw_leaks(ax: Axes, material: Material, results: pd.DataFrame) -> None:
     first, strides = results.iloc[0], np.sort(results.window_stride_s.unique())
     styles = [*zip(COLOURS, MARKERS, strict=True)]
     for i, ((leak, estimator), name) in enumerate(LEAK_VARIANTS.items()):
-        rows = results[(results.leak == leak) & (results.estimator == estimator)]
-        rows = rows.sort_values("window_stride_s")
+        rows = where(results, leak=leak, estimator=estimator).sort_values("window_stride_s")
         gain, lo, hi = (rows[f"accuracy_gain_pct{end}"] for end in ("", "_lo", "_hi"))
         ax.errorbar(
             np.searchsorted(strides, rows.window_stride_s) + 0.09 * (i - len(LEAK_VARIANTS) // 2),

@@ -165,12 +165,14 @@ def _ranked(window_s: float, networks: pd.DataFrame) -> str:
 def _matched(material: Material) -> str:
     """The number of published gains within the intervals of our results."""
     rows = [(claim, material.result(claim, CNN)) for claim in material.claims]
-    both = [(claim, row) for claim, row in rows if not row.empty]
-    if not both:
+    pairs = [(claim, row) for claim, row in rows if not row.empty]
+    if not pairs:
         return ""
-    inside = sum(row[f"{_GAIN}_lo"] <= c.accuracy_gain_pct <= row[f"{_GAIN}_hi"] for c, row in both)
+    inside = sum(
+        row[f"{_GAIN}_lo"] <= claim.accuracy_gain_pct <= row[f"{_GAIN}_hi"] for claim, row in pairs
+    )
     return (
-        f"{len(both)} published results have a training set that was run here; {inside} of them "
+        f"{len(pairs)} published results have a training set that was run here; {inside} of them "
         "are within the 95 % interval of ours, over all windows."
     )
 

@@ -56,8 +56,11 @@ def write_report(
         "tables": _tables(material),
         "files": _files(material),
     }
-    exhibits = {part: [one for one in some if one is not None] for part, some in possible.items()}
-    shown = [exhibit for part in exhibits.values() for exhibit in part]
+    exhibits = {
+        part: [exhibit for exhibit in candidates if exhibit is not None]
+        for part, candidates in possible.items()
+    }
+    contents = [(exhibit.name, exhibit.content) for part in exhibits.values() for exhibit in part]
     page = _page().render(
         exhibits,
         material=material,
@@ -71,8 +74,8 @@ def write_report(
         runs=_runs(material),
     )
     return (
-        {item.name: item.content for item in shown if isinstance(item.content, pd.DataFrame)},
-        {item.name: item.content for item in shown if not isinstance(item.content, pd.DataFrame)},
+        {name: content for name, content in contents if isinstance(content, pd.DataFrame)},
+        {name: content for name, content in contents if not isinstance(content, pd.DataFrame)},
         page,
     )
 
@@ -156,10 +159,9 @@ def _comparisons(material: Material) -> list[tuple[str, str]]:
 
 def _explained(estimators: Iterable[str]) -> list[tuple[str, str]]:
     """Name and description of each estimator in the report, those of the first figure first."""
-    first = [MEAN, CNN, CONSTANT, DEFAULT]
-    shown = {*estimators} - {CNN_BEST}
-    names = [name for name in (*first, *ESTIMATORS, *sorted(shown)) if name in shown]
-    return [(label(name), _description(name)) for name in dict.fromkeys(names)]
+    present = {*estimators} - {CNN_BEST}
+    order = dict.fromkeys([MEAN, CNN, CONSTANT, DEFAULT, *ESTIMATORS, *sorted(present)])
+    return [(label(name), _description(name)) for name in order if name in present]
 
 
 def _description(name: str) -> str:
@@ -231,8 +233,8 @@ def _missing(
         command = f"kedro run{'' if study.default else f' --pipeline={name}'}{env}"
         results = f"{lacking} of {len(rows)} results of {name}" if begun else f"the study {name}"
         makes.setdefault(command, []).append(results)
-    table = [{"Command": command, "Makes": ", ".join(names)} for command, names in makes.items()]
-    return pd.DataFrame(table, columns=["Command", "Makes"])
+    table = {"Command": [*makes], "Makes": [", ".join(names) for names in makes.values()]}
+    return pd.DataFrame(table)
 
 
 def _runs(material: Material) -> list[dict[str, Any]]:
@@ -257,8 +259,4 @@ def _page() -> Any:
         autoescape=False,  # of HTML: what is rendered is Markdown, escaped by the filter below
     )
     environment.filters |= {"md": escape, "pipes": pipe_table}
-    environment.filters["seen"] = lambda exhibit: (
-        exhibit.content if exhibit.shown is None else exhibit.content[[*exhibit.shown]]
-    )
-    environment.tests["table"] = lambda exhibit: isinstance(exhibit.content, pd.DataFrame)
     return environment.get_template("report.md.j2")

@@ -203,7 +203,7 @@ class Cell:
         return row | {
             **{name: scores.get((name, ALL), MISSING).value for name in OTHERS},
             **{
-                name: next(filter(None, (r.tags.get(name) for r in runs)), None)
+                name: next((run.tags[name] for run in runs if run.tags.get(name)), None)
                 for name in WARNINGS
             },
             "simulated": tags["simulated"] == "1",
@@ -249,9 +249,9 @@ class Cell:
         for count in PAIRED_COUNTS if spec.estimator == CNN else ():
             without: dict[str, Any] = {count: 0}
             similar = [
-                (getattr(other, count), others)
-                for other, others, _ in self._rows
-                if others and replace(other, **without) == replace(spec, **without)
+                (getattr(row_spec, count), row_runs)
+                for row_spec, row_runs, _ in self._rows
+                if row_runs and replace(row_spec, **without) == replace(spec, **without)
             ]
             fewest, base_runs = min(similar, key=lambda pair: pair[0])
             if getattr(spec, count) > fewest:

@@ -108,8 +108,8 @@ def _draw_allan(ax: Axes, lines: Any, row: pd.Series) -> None:
 
 def running_average(material: Material, ground_truth: GroundTruth) -> Exhibit | None:
     """Running average of one gyroscope until it has converged (paper, section II)."""
-    lines = _shown_lines(material)
-    if lines is None:
+    lines = _example_lines(material)
+    if lines.empty:
         return None
     mean, settled = (where(lines, figure=name) for name in ("running average", "bias"))
     settled_s, bias = float(settled.x.iloc[0]), float(settled.y.iloc[0]) / MDPS
@@ -130,8 +130,8 @@ def running_average(material: Material, ground_truth: GroundTruth) -> Exhibit | 
 
 def calibrated_signal(material: Material) -> Exhibit | None:
     """Raw and calibrated signal of the same gyroscope (paper, section II, second figure)."""
-    lines = _shown_lines(material)
-    if lines is None:
+    lines = _example_lines(material)
+    if lines.empty:
         return None
     raw, mean, settled = (
         where(lines, figure=name) for name in ("signal", "running average", "bias")
@@ -155,8 +155,8 @@ def calibrated_signal(material: Material) -> Exhibit | None:
 
 def mg_convergence(material: Material, ground_truth: GroundTruth) -> Exhibit | None:
     """Running average over several gyroscopes (paper, section III-A, figure of MG convergence)."""
-    lines = _shown_lines(material)
-    if lines is None:
+    lines = _example_lines(material)
+    if lines.empty:
         return None
     tolerance = ground_truth.tolerance_mdps
     together = {count: where(lines, figure=f"convergence {count}") for count in GYROSCOPES}
@@ -184,13 +184,11 @@ def mg_convergence(material: Material, ground_truth: GroundTruth) -> Exhibit | N
     return Exhibit("mg_convergence", title, caption, figure)
 
 
-def _shown_lines(material: Material) -> pd.DataFrame | None:
-    """The lines of SparkFun or, without it, of the first sensor; None without signals."""
-    if material.signals.empty:
-        return None
-    sensors = material.signals.sensor.unique().tolist()
-    shown = "sparkfun" if "sparkfun" in sensors else sensors[0]
-    return where(material.signals, sensor=shown)
+def _example_lines(material: Material) -> pd.DataFrame:
+    """The lines of SparkFun or, without it, of the first sensor."""
+    lines = where(material.signals, sensor="sparkfun")
+    first = material.signals.sensor.head(1)
+    return lines if len(lines) else material.signals[material.signals.sensor.isin(first)]
 
 
 @contextmanager

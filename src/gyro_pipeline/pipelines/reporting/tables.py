@@ -75,10 +75,10 @@ def paper_results(material: Material, table: str) -> Exhibit | None:
         return None
     claims = material.published.of_table(table)
     results = pd.DataFrame(_result_row(material, claim) for claim in claims)
-    shown = ["Sensor", "Gyroscopes", "Published S/A %", "S %", "A %", "Constant A %", _BEST_A]
-    shown += ["Ceiling A %", *[_ORACLE_A] * material.simulated, "Paper's way A %", _WARM_UP]
-    shown += ["Note"] if results["Note"].notna().any() else []
-    return Exhibit(f"{study}_{table}", PAPER_TABLES[table], _SUMMARY, results, shown)
+    columns = ["Sensor", "Gyroscopes", "Published S/A %", "S %", "A %", "Constant A %", _BEST_A]
+    columns += ["Ceiling A %", *[_ORACLE_A] * material.simulated, "Paper's way A %", _WARM_UP]
+    columns += ["Note"] if results["Note"].notna().any() else []
+    return Exhibit(f"{study}_{table}", PAPER_TABLES[table], _SUMMARY, results, columns)
 
 
 def trained_on_first_windows(material: Material) -> Exhibit | None:
@@ -213,8 +213,8 @@ def results_table(material: Material, study: str) -> Exhibit:
 
 
 def _scaled(rows: pd.DataFrame, name: str, digits: int, unit: float = 1.0) -> pd.Series:
-    values = rows[name] if name in rows else pd.Series(np.nan, rows.index)
-    return (values.astype(float) / unit).round(digits) + 0.0  # no "-0"
+    values = rows.get(name, pd.Series(np.nan, rows.index)).astype(float)
+    return (values / unit).round(digits) + 0.0  # no "-0"
 
 
 def comparison(material: Material, study: str) -> Exhibit | None:
@@ -280,13 +280,13 @@ def ratios(material: Material, study: str, sensor: str) -> Exhibit | None:
     table: dict[str, dict[str, str]] = {}
     for window_s, group in rows.sort_values("window_s").groupby("window_s"):
         mean = where(group, estimator=MEAN).iloc[0]
-        shown = {"running mean, RMSE in mdps": f"{mean.test_rmse_dps / MDPS:.3f}"}
+        texts = {"running mean, RMSE in mdps": f"{mean.test_rmse_dps / MDPS:.3f}"}
         for _, row in group[group.estimator != MEAN].iterrows():
-            shown[in_full(row, rows)] = _ratio(row, "accuracy_gain_pct")
-        shown["ceiling"] = _ratio(mean, "ceiling_accuracy_gain_pct")
+            texts[in_full(row, rows)] = _ratio(row, "accuracy_gain_pct")
+        texts["ceiling"] = _ratio(mean, "ceiling_accuracy_gain_pct")
         if pd.notna(mean.get("oracle_accuracy_gain_pct")):
-            shown[_ORACLE] = _ratio(mean, "oracle_accuracy_gain_pct")
-        table[f"{float(str(window_s)):g} s"] = shown
+            texts[_ORACLE] = _ratio(mean, "oracle_accuracy_gain_pct")
+        table[f"{float(str(window_s)):g} s"] = texts
     errors = pd.DataFrame(table)
     last = [name for name in ("ceiling", _ORACLE) if name in errors.index]
     errors = errors.reindex([*errors.index.drop(last), *last]).fillna("–")
@@ -390,9 +390,9 @@ def sensor_specifications(material: Material) -> Exhibit | None:
         "seconds scatters by N/√t. B is the bias instability. Paper, section IV-A."
     )
     hidden = ("Source", "Datasheet noise density mdps/√Hz", "Section")
-    shown = [name for name in table.columns.astype(str) if name not in hidden]
+    columns = [name for name in table.columns.astype(str) if name not in hidden]
     name, title = "sensor_specifications", "Sensors: datasheets and recordings"
-    return Exhibit(name, title, caption, table, shown)
+    return Exhibit(name, title, caption, table, columns)
 
 
 def _rates(rates_hz: tuple[float, float]) -> str:
@@ -424,14 +424,14 @@ def dataset_hours(material: Material) -> Exhibit | None:
         "Training recordings count for every gyroscope, test recordings for the three of IMU 1. "
         "In a k-fold each recording does both, and counts once in the total. Paper, section IV-A."
     )
-    shown = ["Dataset", "Sensor", "Gyroscopes", "Training recordings", "Test recordings", "T s"]
-    shown += ["Total h", "Paper's total h", "Note"]
-    return Exhibit("dataset_hours", "Hours of the datasets", caption, table, shown)
+    columns = ["Dataset", "Sensor", "Gyroscopes", "Training recordings", "Test recordings", "T s"]
+    columns += ["Total h", "Paper's total h", "Note"]
+    return Exhibit("dataset_hours", "Hours of the datasets", caption, table, columns)
 
 
 def _hours(material: Material, claim: PublishedHours) -> dict[str, Any]:
     row = material.described.get(claim.sensor, pd.Series())
-    prefix = "virtual_" * claim.virtual
+    prefix = "virtual_" if claim.virtual else ""
     head = {"Dataset": str(claim.dataset), "Sensor": claim.sensor}
     tail = {
         "Paper's train h": claim.train_h,
@@ -448,7 +448,7 @@ def _hours(material: Material, claim: PublishedHours) -> dict[str, Any]:
     slowest_hz, fastest_hz = material.sheets[claim.sensor].rate_hz
     fast, slow = total / fastest_hz, total / slowest_hz
     return head | {
-        "Source": "virtual, from " * claim.virtual + material.source_name,
+        "Source": f"{'virtual, from ' if claim.virtual else ''}{material.source_name}",
         "Gyroscopes": int(row[f"{prefix}gyroscopes"]),
         "Training recordings": int(row[f"{prefix}train_recordings"]),
         "Test recordings": int(row[f"{prefix}test_recordings"]),
@@ -500,14 +500,14 @@ def leakage_results(material: Material) -> Exhibit | None:
         "suffices to pass the ceiling, not that anybody had one. S and A are over the test windows "
         "of each way of training, in percent, with 95 % intervals of A over recordings."
     )
-    shown = ["Sensor", "Window stride s", *(f"{name} S/A %" for name in LEAK_VARIANTS.values())]
-    shown += ["Constant A %", "Ceiling S/A %", "Published S/A %"]
+    columns = ["Sensor", "Window stride s", *(f"{name} S/A %" for name in LEAK_VARIANTS.values())]
+    columns += ["Constant A %", "Ceiling S/A %", "Published S/A %"]
     title = "Trained with leaks on purpose: S and A"
-    return Exhibit("leakage_results", title, caption, table, shown)
+    return Exhibit("leakage_results", title, caption, table, columns)
 
 
 def _leak_row(material: Material, ways: pd.DataFrame) -> dict[str, Any]:
-    first = ways.iloc[0]
+    first, texts = ways.iloc[0], ways.apply(_saving_and_gain, axis=1, kind="")
     claim = published_claim(material, first)
     shuffled = ways[ways.index.get_level_values("estimator") == CNN_SHUFFLED]
     p_values = ways.beats_oracle_p.dropna()
@@ -518,12 +518,7 @@ def _leak_row(material: Material, ways: pd.DataFrame) -> dict[str, Any]:
         "Window stride s": first.window_stride_s,
         "Windows": first.windows,
         "Recordings": first.recordings,
-        **{
-            f"{name} S/A %": _saving_and_gain(ways.loc[[way]].iloc[0], "")
-            if way in ways.index
-            else None
-            for way, name in LEAK_VARIANTS.items()
-        },
+        **{f"{name} S/A %": texts.get(way) for way, name in LEAK_VARIANTS.items()},
         "Constant A %": percent(first.constant_accuracy_gain_pct),
         "Ceiling S/A %": _saving_and_gain(first, "ceiling_"),
         "Published S/A %": claim and _published(claim),
