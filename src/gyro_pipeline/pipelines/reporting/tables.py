@@ -8,7 +8,7 @@ import pandas as pd
 
 from gyro_pipeline.conventions import ALL, AXES, DISJOINT, FIRST, MDPS, PAPER, TRUE
 from gyro_pipeline.estimators import DEFAULT, ESTIMATORS, ORIENTATION_NOTE
-from gyro_pipeline.parameters import PublishedHours, PublishedResult
+from gyro_pipeline.parameters import PublishedHours, PublishedResult, PublishedSpecification
 from gyro_pipeline.pipelines.reporting.exhibits import (
     BEATS_ORACLE_P,
     LEAK_VARIANTS,
@@ -364,7 +364,9 @@ def sensor_specifications(material: Material) -> Exhibit | None:
     """Datasheet values beside measured ones (section IV-A, table of specifications)."""
     if material.sensors.empty:
         return None
-    sheets = pd.DataFrame(map(dict, material.published.specifications)).set_index("sensor")
+    fields = [*PublishedSpecification.model_fields]
+    sheets = pd.DataFrame(map(dict, material.published.specifications), columns=fields)
+    sheets = sheets.set_index("sensor")
     rows = sheets.add_prefix("sheet_").join(material.sensors.set_index("sensor"), how="outer")
     rows = rows.reindex([*dict.fromkeys([*sheets.index, *material.sensors.sensor])])
     density = rows.sheet_noise_density_mdps_rthz.astype(float)
