@@ -383,10 +383,10 @@ def estimators(material: Material, study: str, sensor: str) -> Exhibit | None:
 
 def _draw_estimators(left: Axes, right: Axes, rows: pd.DataFrame) -> None:
     means = where(rows, estimator=MEAN).set_index("window_s").sort_index()
-    named = rows.assign(name=[in_full(row, rows) for _, row in rows.iterrows()])
-    groups = named.drop_duplicates(["name", "window_s"]).groupby("name", sort=False)
+    names = pd.Series([in_full(row, rows) for _, row in rows.iterrows()], rows.index)
+    groups = rows.groupby(names, sort=False)
     for number, (name, results) in enumerate(groups):
-        rmse = results.set_index("window_s").test_rmse_dps.sort_index()
+        rmse = results.drop_duplicates("window_s").set_index("window_s").test_rmse_dps.sort_index()
         look = estimator_look(results.estimator.iloc[0], bool(results.recommended.any()))
         shift = 1 + 0.015 * (number - groups.ngroups / 2)
         ratio = rmse / means.test_rmse_dps.reindex(rmse.index)
