@@ -219,18 +219,13 @@ def to_latex(table: pd.DataFrame) -> str:
 
     Long texts are broken into lines.
     """
-    rows = [list(table.columns.map(str))]
-    rows += [[plain(value) for value in row] for row in table.itertuples(index=False, name=None)]
-    long = [max(map(len, column)) > _LONGEST for column in zip(*rows, strict=True)]
-    numeric = [pd.api.types.is_numeric_dtype(dtype) for dtype in table.dtypes]
-    alignment = "".join(
-        _WRAPPED if wrapped else "r" if right else "l"
-        for wrapped, right in zip(long, numeric, strict=True)
-    )
-    head, *body = [" & ".join(_latex(cell) for cell in row) + r" \\" for row in rows]
-    begin = rf"\begin{{tabular}}{{{alignment}}}"
-    lines = [begin, r"\toprule", head, r"\midrule", *body, r"\bottomrule", r"\end{tabular}"]
-    return "\n".join(lines) + "\n"
+    texts, formats = table.map(plain).reset_index(drop=True), ""
+    for name, values in table.items():
+        long = max(map(len, [str(name), *texts[name]])) > _LONGEST
+        numeric = pd.api.types.is_numeric_dtype(values)
+        formats += _WRAPPED if long else "r" if numeric else "l"
+    texts = texts.map(_latex).rename(columns=lambda name: _latex(str(name)))
+    return texts.to_latex(index=False, escape=False, column_format=formats)
 
 
 def _latex(text: str) -> str:

@@ -1,12 +1,13 @@
 """The data that a report is made from, and the tables and figures that it consists of."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from gyro_pipeline.conventions import ALL, AXES, FIRST, LEAVE_ONE_DEVICE_OUT, MDPS
 from gyro_pipeline.parameters import Published, PublishedResult, PublishedSpecification
@@ -48,8 +49,6 @@ STUDIES_OF = {
 TIME_CONSTANTS_S = (5.0, 10.0, 20.0, 30.0, 60.0)
 """Time constants for which the amplitude of a warm-up is computed."""
 
-_KEYS = ["sensor", "real_gyros", "virtual_gyros", "window_s"]
-
 
 @dataclass(frozen=True)
 class Exhibit:
@@ -59,7 +58,14 @@ class Exhibit:
     title: str  # a few words
     caption: str  # explanation for a reader who has not read the paper
     content: "pd.DataFrame | Figure"
-    shown: Sequence[str] | None = None  # columns of the table that the page shows, all by default
+    page_columns: Sequence[str] | None = None  # of the table, which the page shows; None for all
+
+    @property
+    def page_table(self) -> pd.DataFrame | None:
+        """The table as the page shows it; None for a figure."""
+        if not isinstance(self.content, pd.DataFrame):
+            return None
+        return self.content if self.page_columns is None else self.content[[*self.page_columns]]
 
 
 @dataclass(frozen=True)
@@ -94,14 +100,6 @@ class Material:
         kind = "simulated" if self.simulated else "measured"
         return self.source if kind in self.source else f"{self.source} ({kind})"
 
-    def of(self, study: str, **columns: Any) -> pd.DataFrame:
-        """Results of a study with the given values of columns."""
-        return _where(self.results, study=study, **columns)
-
-    def finished_of(self, study: str, **columns: Any) -> pd.DataFrame:
-        """Finished results of a study with the given values of columns."""
-        return _where(self.finished, study=study, **columns)
-
     @cached_property
     def sheets(self) -> dict[str, PublishedSpecification]:
         """What the paper states of each sensor."""
@@ -124,16 +122,10 @@ class Material:
     def warm_up_needed_mdps(self, claim: PublishedResult) -> list[float]:
         """Amplitudes of a warm-up with which the ceiling in first windows is a published gain.
 
-        Args:
-            claim: The published result, with T from the paper, N and the turn-on spread from the
-                recordings.
-
-        Returns:
-            An amplitude for each of :data:`TIME_CONSTANTS_S`; empty without recordings.
+        There is one for each of :data:`TIME_CONSTANTS_S`, or none without recordings. T is that of
+        the paper, N and the turn-on spread are those of the recordings.
         """
-        row = self.described.get(claim.sensor)
-        if row is None:
-            return []
+        row = self.described.get(claim.sensor, pd.Series())
         noise, spread = (
             row.reindex([f"{name}_{axis}" for axis in AXES]).to_numpy(float)
             for name in ("white_dps_rts", "spread_dps")
@@ -142,14 +134,15 @@ class Material:
         needed = amplitude_needed(claim.accuracy_gain_pct / 100, noise, spread, *times) / MDPS
         return [] if np.isnan(needed).any() else needed.tolist()
 
-    def warm_up_allowed_mdps(self, sensor: str) -> list[float]:
-        """The largest warm-up that recordings of a sensor allow, for each of ``WARM_UPS_S``.
+    @cached_property
+    def warm_ups_allowed_mdps(self) -> dict[str, list[float]]:
+        """By the name of a sensor, the largest warm-up that it allows for each of ``WARM_UPS_S``.
 
-        The bounds are those of the worst axis, from 95 % intervals; empty if they are unknown.
+        The bounds are those of the worst axis, from 95 % intervals. Sensors without are left out.
         """
-        row = self.described[sensor]
-        bounds = row.reindex([f"warm_up_bound_dps_{time_s:g}" for time_s in WARM_UPS_S]) / MDPS
-        return [] if bounds.isna().any() else bounds.astype(float).tolist()
+        keys = [f"warm_up_bound_dps_{time_s:g}" for time_s in WARM_UPS_S]
+        bounds = self.sensors.set_index("sensor").reindex(columns=keys).dropna() / MDPS
+        return {self.sensor_name(str(sensor)): [*row] for sensor, *row in bounds.itertuples()}
 
     @property
     def claims(self) -> list[PublishedResult]:
@@ -157,33 +150,32 @@ class Material:
         sensors = {*self.results.sensor, *self.sensors.sensor}
         return [row for row in self.published.results if row.sensor in sensors]
 
-    def result(
-        self, claim: PublishedResult, estimator: str, study: str | None = None
-    ) -> pd.Series | None:
-        """Our result for a published one; None if there is none.
+    def result(self, claim: PublishedResult, estimator: str, study: str | None = None) -> pd.Series:
+        """Our result for a published one, by default of the study that makes the paper's table.
 
         Where the study has fewer real gyroscopes, such as on the public file of a single IMU, the
-        result with the most of them is taken.
-
-        Args:
-            claim: The published result.
-            estimator: Name of the estimator.
-            study: Study to take it from instead of the one that makes the paper's table.
+        result with the most of them is taken. It is empty if there is none.
         """
-        same = {name: getattr(claim, name) for name in ("sensor", "virtual_gyros", "window_s")}
-        rows = self.of(study or STUDIES_OF[claim.table], estimator=estimator, **same)
-        rows = rows[rows.real_gyros <= claim.real_gyros].sort_values("real_gyros")
-        row = rows.iloc[-1] if len(rows) else None
-        return None if row is None or pd.notna(row.status) else row
+        rows = self._same(claim, estimator, study)
+        rows = rows[rows.real_gyros <= claim.real_gyros].sort_values("real_gyros")[-1:]
+        finished = rows[rows.status.isna()]
+        return pd.Series() if finished.empty else finished.iloc[0]
 
     def status(self, claim: PublishedResult) -> str:
         """Why there is no result of ours for a published one."""
-        same = {name: getattr(claim, name) for name in _KEYS}
-        rows = self.of(STUDIES_OF[claim.table], estimator=CNN, **same)
+        rows = where(self._same(claim, CNN), real_gyros=claim.real_gyros)
         return str(rows.status.iloc[0]) if len(rows) else "not part of this run"
 
+    def _same(
+        self, claim: PublishedResult, estimator: str, study: str | None = None
+    ) -> pd.DataFrame:
+        """Results for the sensor, virtual gyroscopes and window of a published one."""
+        same = {name: getattr(claim, name) for name in ("sensor", "virtual_gyros", "window_s")}
+        study = study or STUDIES_OF[claim.table]
+        return where(self.results, study=study, estimator=estimator, **same)
 
-def _where(rows: pd.DataFrame, **columns: Any) -> pd.DataFrame:
+
+def where(rows: pd.DataFrame, **columns: Any) -> pd.DataFrame:
     """The rows with the given values of columns."""
     for name, value in columns.items():
         rows = rows[rows[name] == value]
@@ -195,16 +187,13 @@ def label(estimator: str) -> str:
     return _LABELS.get(estimator, estimator.replace("_", " "))
 
 
-def ends(
-    row: Mapping[str, Any] | pd.Series | None, name: str, windows: str = ALL
-) -> tuple[float, ...]:
+def ends(row: pd.Series, name: str, windows: str = ALL) -> NDArray[np.float64]:
     """A score over first or all windows and the ends of its interval; NaN if missing."""
     key = column(name, windows)
-    values = [None if row is None else row.get(key + end) for end in ("", "_lo", "_hi")]
-    return tuple(np.nan if value is None else float(value) for value in values)
+    return row.reindex([key, f"{key}_lo", f"{key}_hi"]).to_numpy(float)
 
 
-def interval(row: Any, name: str, windows: str = ALL) -> str:
+def interval(row: pd.Series, name: str, windows: str = ALL) -> str:
     """A score in percent with its 95 % interval."""
     return bracketed(ends(row, name, windows), percent)
 
@@ -236,7 +225,7 @@ def from_to(values: Iterable[float], text: Callable[[float], str] = two_digits) 
     return low if low == high else f"{low} to {high}"
 
 
-def beyond_ceiling(row: Any, windows: str = ALL) -> bool:
+def beyond_ceiling(row: pd.Series, windows: str = ALL) -> bool:
     """Whether the entire interval of an accuracy gain lies above the ceiling's."""
     gain, ceiling = (
         Estimate(*ends(row, f"{kind}accuracy_gain_pct", windows)) for kind in ("", "ceiling_")
@@ -244,7 +233,7 @@ def beyond_ceiling(row: Any, windows: str = ALL) -> bool:
     return gain.lies_above(ceiling)
 
 
-def remark(row: Any) -> str | None:
+def remark(row: pd.Series) -> str | None:
     """A remark on an accuracy gain, such as one beyond its ceiling; None if there is none."""
     notes = []
     for windows in (ALL, FIRST):
@@ -254,7 +243,8 @@ def remark(row: Any) -> str | None:
             notes.append(f"beyond its ceiling in {windows} windows")
         elif gain > limit:
             notes.append(f"by chance above its ceiling in {windows} windows")
-    notes += [row["prior_conflict"]] * bool(pd.notna(row.get("prior_conflict")))
+    if pd.notna(row.get("prior_conflict")):
+        notes.append(row["prior_conflict"])
     return "; ".join(notes) or None
 
 
@@ -264,7 +254,7 @@ def gyroscopes(row: Any) -> str:
     return f"{row.real_gyros:.0f} real{virtual}"
 
 
-def split(row: Any) -> str:
+def split(row: pd.Series) -> str:
     """The split of the recordings, in words."""
     if pd.isna(row.get("folds")):
         return "–"

@@ -1,6 +1,7 @@
 """The figures of results: a function for each, with its caption."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from gyro_pipeline.pipelines.reporting.exhibits import (
     ends,
     gyroscopes,
     label,
+    where,
 )
 from gyro_pipeline.pipelines.reporting.results import column
 from gyro_pipeline.pipelines.reporting.style import (
@@ -36,7 +38,6 @@ from gyro_pipeline.pipelines.reporting.style import (
 from gyro_pipeline.pipelines.reporting.tables import in_full, published_claim
 from gyro_pipeline.studies import CNN, CONSTANT, MEAN
 
-_WINDOWS = {ALL: "all windows (main result)", FIRST: "first window (the paper's way)"}
 _TICKS_S = (1, 2, 5, 10, 20, 30, 60, 100)
 _SHIFT = 0.11  # relative distance between the points of a window, which stand side by side
 _MIN_SPAN = 2.5  # ratio of the ends of an axis of errors
@@ -57,21 +58,19 @@ _ON_CURVE = (
 def forest(material: Material) -> Exhibit | None:
     """Published accuracy gains beside ours with intervals, a row for each."""
     claims = material.claims
-    if not any(material.result(claim, CNN) is not None for claim in claims):
+    if all(material.result(claim, CNN).empty for claim in claims):
         return None
     names = [f"{material.sensor_name(claim.sensor)}, {gyroscopes(claim)}" for claim in claims]
-
-    def draw(ax: Axes, windows: str) -> None:
-        for row, claim in enumerate(claims):
-            _draw_claim(ax, material, claim, row, windows)
-        ax.axvline(0, color="black", lw=1)
-        ax.set(xlim=_GAINS_PCT, xlabel="accuracy gain A [%]")
-        ax.grid(False, axis="y")
-        ax.set_yticks(range(len(claims)), names)
-        ax.set_ylim(len(claims) - 0.5, -0.5)
-
     title = f"Published and ours, windows of 10 s; {material.source_name}"
-    figure = _two_panels(draw, title, (10.5, 1.9 + 0.42 * len(claims)), columns=6)
+    with _two_panels(title, (10.5, 1.9 + 0.42 * len(claims)), columns=6) as (figure, axes):
+        for windows, ax in axes.items():
+            for row, claim in enumerate(claims):
+                _draw_claim(ax, material, claim, row, windows)
+            ax.axvline(0, color="black", lw=1)
+            ax.set(xlim=_GAINS_PCT, xlabel="accuracy gain A [%]")
+            ax.grid(False, axis="y")
+            ax.set_yticks(range(len(claims)), names)
+            ax.set_ylim(len(claims) - 0.5, -0.5)
     caption = (
         "A row for each published result. A, the accuracy gain, says how much smaller the error is "
         "than that of the mean of the same window: 0 is the running mean, 100 no error. Bars are "
@@ -83,15 +82,15 @@ def forest(material: Material) -> Exhibit | None:
     return Exhibit("forest", "The paper's ten rows and ours", caption, figure)
 
 
+@contextmanager
 def _two_panels(
-    draw: Callable[[Axes, str], None], title: str, size: tuple[float, float], columns: int
-) -> Figure:
-    """A figure with a panel for all windows and one for first windows."""
-    with panels(title, size, (1, 2), columns, sharey=True) as (figure, axes):
-        for ax, windows in zip(axes, (ALL, FIRST), strict=True):
-            draw(ax, windows)
-            ax.set_title(_WINDOWS[windows])
-    return figure
+    title: str, size: tuple[float, float], columns: int
+) -> Iterator[tuple[Figure, dict[str, Axes]]]:
+    """A figure with a panel for all windows and one for first windows, which are its keys."""
+    with panels(title, size, (1, 2), columns, sharey=True) as (figure, (left, right)):
+        left.set_title("all windows (main result)")
+        right.set_title("first window (the paper's way)")
+        yield figure, {ALL: left, FIRST: right}
 
 
 def _draw_claim(
@@ -107,7 +106,7 @@ def _draw_claim(
         value, lo, hi = ends(material.result(claim, name), gain, windows)
         if np.isnan(value):
             continue
-        shown, outside = np.clip(value, _GAINS_PCT[0] + 2, None), value < _GAINS_PCT[0]
+        shown, outside = max(value, _GAINS_PCT[0] + 2), value < _GAINS_PCT[0]
         ax.errorbar(
             [shown], [row + shift],
             xerr=None if outside else reach([value], [lo], [hi]),
@@ -115,7 +114,7 @@ def _draw_claim(
             label=label(name),
         )  # fmt: skip
     network = material.result(claim, CNN)
-    if network is None:
+    if network.empty:
         ax.text(2, row, material.status(claim), color="grey", va="center", fontsize=8)
     limit, lo, hi = ends(network, f"ceiling_{gain}", windows)
     if not np.isnan(limit):
@@ -133,7 +132,7 @@ def _draw_claim(
 
 def augmentation(material: Material, sensor: str, real: int) -> Exhibit | None:
     """Real and virtual gyroscopes of SparkFun or DOT (paper, sections IV-E and IV-F, figures)."""
-    rows = material.of("augmentation", sensor=sensor)
+    rows = where(material.finished, study="augmentation", sensor=sensor)
     rows = rows[(rows.real_gyros == real) | (rows.estimator == MEAN)]
     claims = material.published.of_networks(sensor, real_gyros=real)
     title = f"{material.sensor_name(sensor)}: {real} real gyroscopes and virtual ones"
@@ -143,7 +142,7 @@ def augmentation(material: Material, sensor: str, real: int) -> Exhibit | None:
 
 def input_channels(material: Material) -> Exhibit | None:
     """Method 1, more gyroscopes as input channels (paper, section IV-C, figure)."""
-    rows = material.of("input_channels", sensor="sparkfun")
+    rows = where(material.finished, study="input_channels", sensor="sparkfun")
     title = "Method 1: more gyroscopes as input channels"
     words = ("input_channels_input_channels", title, "IV-C")
     return _on_curve(material, rows, [], "real_gyros", words)
@@ -151,7 +150,7 @@ def input_channels(material: Material) -> Exhibit | None:
 
 def training_data(material: Material) -> Exhibit | None:
     """Method 2, more gyroscopes as training data (paper, section IV-D, first figure)."""
-    rows = material.of("real2real", sensor="sparkfun")
+    rows = where(material.finished, study="real2real", sensor="sparkfun")
     claims = material.published.of_networks("sparkfun", virtual_gyros=0)
     words = ("real2real_training_data", "Method 2: more gyroscopes as training data", "IV-D")
     return _on_curve(material, rows, claims, "real_gyros", words)
@@ -166,25 +165,18 @@ def _on_curve(
 ) -> Exhibit | None:
     """RMSE of the running mean against its length, and of the networks at theirs.
 
-    Args:
-        material: Has the curve.
-        rows: Results of one sensor; unfinished ones have no point.
-        claims: Published results for the same networks.
-        by: The count in which the networks differ, ``real_gyros`` or ``virtual_gyros``.
-        words: Name, title and section of the paper.
+    Networks of a study on a sensor differ in the count ``by``, ``real_gyros`` or ``virtual_gyros``.
+    ``words`` are the name, the title and the section of the paper.
     """
-    rows = rows[rows.status.isna()]
-    if rows[rows.estimator == CNN].empty:
+    if where(rows, estimator=CNN).empty:
         return None
     name, title, section = words
-    first = rows.iloc[0]
-    curves = material.curves
-    curves = curves[(curves.study == first.study) & (curves.sensor == first.sensor)]
-
-    def draw(ax: Axes, windows: str) -> None:
-        _draw_curve(ax, rows, curves[curves.windows == windows], windows, claims, by)
-
-    figure = _two_panels(draw, f"{title}; {material.source_name}", (9.5, 4.8), columns=3)
+    study, sensor = rows[["study", "sensor"]].iloc[0]
+    curves = where(material.curves, study=study, sensor=sensor)
+    heading = f"{title}; {material.source_name}"
+    with _two_panels(heading, (9.5, 4.8), columns=3) as (figure, axes):
+        for windows, ax in axes.items():
+            _draw_curve(ax, rows, where(curves, windows=windows), windows, claims, by)
     return Exhibit(name, title, f"{_ON_CURVE} Paper, section {section}.", figure)
 
 
@@ -198,10 +190,10 @@ def _draw_curve(  # noqa: PLR0917 - contents of a panel
 ) -> None:
     kind = by.removesuffix("_gyros")
     ax.plot(curve.time_s, curve.rmse_dps / MDPS, color="black", lw=1.2, label="running mean")
-    limits = results[results.estimator == MEAN].sort_values("window_s")
+    limits = where(results, estimator=MEAN).sort_values("window_s")
     bars = limits[column("ceiling_rmse_dps", windows)] / MDPS
     ax.plot(limits.window_s, bars, "_", color=CEILING, ms=30, mew=2, label="ceiling")
-    networks = results[results.estimator == CNN]
+    networks = where(results, estimator=CNN)
     sizes = sorted(networks[by].unique())
     for i, size in enumerate(sizes):
         rows = networks[networks[by] == size]
@@ -241,16 +233,15 @@ def _time_axis(ax: Axes, recording_s: float) -> None:
 def gyroscopes_10s(material: Material) -> Exhibit | None:
     """RMSE at 10 s against the number of gyroscopes (paper, section IV-D, second figure)."""
     claims = material.published.of_networks("sparkfun", virtual_gyros=0)
-    rows = material.finished_of("real2real", sensor="sparkfun", estimator=CNN)
+    rows = where(material.finished, study="real2real", sensor="sparkfun", estimator=CNN)
     rows = rows[rows.window_s == claims[0].window_s] if claims else rows[:0]
     if rows.empty:
         return None
-
-    def draw(ax: Axes, windows: str) -> None:
-        _draw_bars(ax, rows.sort_values("real_gyros"), claims, windows)
-
     title = "Method 2: error at 10 s against the number of gyroscopes"
-    figure = _two_panels(draw, f"{title}; {material.source_name}", (9.5, 4.2), columns=4)
+    heading = f"{title}; {material.source_name}"
+    with _two_panels(heading, (9.5, 4.2), columns=4) as (figure, axes):
+        for windows, ax in axes.items():
+            _draw_bars(ax, rows.sort_values("real_gyros"), claims, windows)
     caption = "Left: all windows, the main result. Right: the paper's way. Lower is better."
     caption += " Paper, section IV-D."
     return Exhibit("real2real_gyroscopes_10s", title, caption, figure)
@@ -267,10 +258,9 @@ def _draw_bars(
     ax.axhline(mean, color="black", lw=1.5, label="model-based: running mean")
     limit = float(networks[column("ceiling_rmse_dps", windows)].iloc[0]) / MDPS
     ax.axhline(limit, color=CEILING, ls="--", lw=1.5, label="ceiling")
-    gains = {claim.real_gyros: claim.accuracy_gain_pct for claim in claims}
-    published = [i for i, gyros in enumerate(networks.real_gyros) if gyros in gains]
-    errors = [mean * (1 - gains[networks.real_gyros.iloc[i]] / 100) for i in published]
-    ax.plot(published, errors, "D", color=COLOURS[1], ms=9, mfc="none", mew=1.8, label="published")
+    gains_pct = {claim.real_gyros: claim.accuracy_gain_pct for claim in claims}
+    errors = mean * (1 - networks.real_gyros.map(gains_pct) / 100)
+    ax.plot(x, errors, "D", color=COLOURS[1], ms=9, mfc="none", mew=1.8, label="published")
     ax.set_xticks(x, networks.real_gyros.astype(str).tolist())
     ax.set(xlabel="gyroscopes in the training set", ylabel=_ERROR if windows == ALL else None)
     ax.set_axisbelow(True)
@@ -286,7 +276,7 @@ def saving_against_turn_on_spread(material: Material) -> Exhibit | None:
     The curve of a sensor is the ceiling with its N and T and the same spread on all axes. A network
     stands at the spread that gives its ceiling: that of the sensor, if its axes share one.
     """
-    rows = material.finished_of("real2real", estimator=CNN)
+    rows = where(material.finished, study="real2real", estimator=CNN)
     claims = material.published.of_table("generalization")
     rows = rows[rows.window_s.isin([claim.window_s for claim in claims])]
     claims = [claim for claim in claims if (rows.sensor == claim.sensor).any()]
@@ -296,7 +286,7 @@ def saving_against_turn_on_spread(material: Material) -> Exhibit | None:
     size = (9.5, 1.2 + 3 * high)
     with panels(title, size, (high, wide), sharex=True, sharey=True) as (figure, axes):
         for ax, claim in zip(axes, claims, strict=False):
-            _draw_savings(ax, rows[rows.sensor == claim.sensor].sort_values("real_gyros"), claim)
+            _draw_savings(ax, where(rows, sensor=claim.sensor).sort_values("real_gyros"), claim)
         for ax in axes[::wide]:
             ax.set_ylabel("time saving S, all windows [%]")
         for ax in axes[-wide:]:
@@ -320,7 +310,7 @@ def equal_spread(row: pd.Series, bound: str = "") -> float:
         bound: ``_lo`` or ``_hi`` for an end of the ceiling gain's interval; tau falls with it.
 
     Returns:
-        The spread, deg/s; 0 where the ceiling is that of a known bias.
+        deg/s; 0 where the ceiling is that of a known bias.
     """
     rho = 1 - row[column("ceiling_accuracy_gain_pct", FIRST) + bound] / 100
     r = row.window_s / row.recording_s
@@ -375,7 +365,7 @@ def _draw_saving(ax: Axes, row: pd.Series, shift: float, colour: str, marker: st
 
 def estimators(material: Material, study: str, sensor: str) -> Exhibit | None:
     """RMSE of all estimators of a study against the window length, with the ceiling."""
-    rows = material.finished_of(study, sensor=sensor)
+    rows = where(material.finished, study=study, sensor=sensor)
     if rows.empty:
         return None
     title = f"{material.sensor_name(sensor)}, {study.replace('_', ' ')}: error against window"
@@ -392,14 +382,13 @@ def estimators(material: Material, study: str, sensor: str) -> Exhibit | None:
 
 
 def _draw_estimators(left: Axes, right: Axes, rows: pd.DataFrame) -> None:
-    means = rows[rows.estimator == MEAN].set_index("window_s").sort_index()
-    names = [in_full(row, rows) for _, row in rows.iterrows()]
-    estimators_by_name = dict(zip(names, rows.estimator, strict=True))
-    for number, (name, estimator) in enumerate(estimators_by_name.items()):
-        results = rows[[other == name for other in names]].drop_duplicates("window_s")
-        rmse = results.set_index("window_s").test_rmse_dps.sort_index()
-        look = estimator_look(estimator, bool(results.recommended.any()))
-        shift = 1 + 0.015 * (number - len(estimators_by_name) / 2)
+    means = where(rows, estimator=MEAN).set_index("window_s").sort_index()
+    names = pd.Series([in_full(row, rows) for _, row in rows.iterrows()], rows.index)
+    groups = rows.groupby(names, sort=False)
+    for number, (name, results) in enumerate(groups):
+        rmse = results.drop_duplicates("window_s").set_index("window_s").test_rmse_dps.sort_index()
+        look = estimator_look(results.estimator.iloc[0], bool(results.recommended.any()))
+        shift = 1 + 0.015 * (number - groups.ngroups / 2)
         ratio = rmse / means.test_rmse_dps.reindex(rmse.index)
         for ax, values in ((left, rmse / MDPS), (right, ratio)):
             ax.plot(values.index * shift, values, label=name, **look)
@@ -428,7 +417,7 @@ def leakage_against_stride(material: Material) -> Exhibit | None:
     sensors = list(dict.fromkeys(material.leaks.sensor))
     with panels(None, (9.5, 1.2 + 4.4 * len(sensors)), (len(sensors), 1)) as (figure, axes):
         for ax, sensor in zip(axes, sensors, strict=True):
-            _draw_leaks(ax, material, material.leaks[material.leaks.sensor == sensor])
+            _draw_leaks(ax, material, where(material.leaks, sensor=sensor))
     caption = (
         "Windows whose starts differ by a whole number of hops of the network look almost the same "
         "to it. Split at random, they are near-duplicates that can be learned by heart."
@@ -441,8 +430,7 @@ def _draw_leaks(ax: Axes, material: Material, results: pd.DataFrame) -> None:
     first, strides = results.iloc[0], np.sort(results.window_stride_s.unique())
     styles = [*zip(COLOURS, MARKERS, strict=True)]
     for i, ((leak, estimator), name) in enumerate(LEAK_VARIANTS.items()):
-        rows = results[(results.leak == leak) & (results.estimator == estimator)]
-        rows = rows.sort_values("window_stride_s")
+        rows = where(results, leak=leak, estimator=estimator).sort_values("window_stride_s")
         gain, lo, hi = (rows[f"accuracy_gain_pct{end}"] for end in ("", "_lo", "_hi"))
         ax.errorbar(
             np.searchsorted(strides, rows.window_stride_s) + 0.09 * (i - len(LEAK_VARIANTS) // 2),

@@ -11,8 +11,10 @@ from gyro_pipeline.pipelines.reporting.exhibits import (
     BEATS_ORACLE_P,
     Material,
     beyond_ceiling,
+    ends,
     from_to,
     label,
+    where,
 )
 from gyro_pipeline.pipelines.reporting.results import CNN_BEST
 from gyro_pipeline.scoring.scores import holm
@@ -41,12 +43,12 @@ def answer(material: Material) -> list[str]:
 def findings(material: Material) -> list[str]:
     """Further findings, a sentence for each."""
     rows = distinct(material)
-    networks = rows[rows.estimator == CNN]
+    networks = where(rows, estimator=CNN)
     sentences = [
         *(_ranked(float(str(window)), group) for window, group in networks.groupby("window_s")),
         _matched(material),
         _more_data(networks, "virtual_gyros", "virtual gyroscopes to the same real ones"),
-        _more_data(networks[networks.method == 2], "real_gyros", "real gyroscopes"),  # noqa: PLR2004
+        _more_data(where(networks, method=2), "real_gyros", "real gyroscopes"),
         _beyond_ceiling(rows),
         _prior_conflicts(rows),
         _oracle_check(rows),
@@ -56,32 +58,25 @@ def findings(material: Material) -> list[str]:
 
 def _networks(rows: pd.DataFrame) -> str:
     """Accuracy gains of the network, a constant and the best linear predictor, shortest window."""
-    networks = rows[rows.estimator == CNN]
+    networks = where(rows, estimator=CNN)
     if networks.empty:
         return ""
     window_s = networks.window_s.min()
-    shortest = rows[rows.window_s == window_s]
-    parts = [
-        f"Over all windows of {window_s:g} s, the paper's network is {_gain(shortest, CNN)} % more "
-        "accurate than the mean of the window"
-    ]
-    if (shortest.estimator == CONSTANT).any():
-        parts.append(
-            "a constant, the mean of the device's training recordings, "
-            f"{_gain(shortest, CONSTANT)} %"
-        )
-    if (shortest.estimator == DEFAULT).any():
-        parts.append(f"the {label(DEFAULT)} predictor {_gain(shortest, DEFAULT)} %")
-    limit = f"{_range(shortest[_CEILING_GAIN].dropna())} %"
+    shortest = where(rows, window_s=window_s)
+    words = {
+        CNN: f"Over all windows of {window_s:g} s, the paper's network is {{}} % more accurate "
+        "than the mean of the window",
+        CONSTANT: "a constant, the mean of the device's training recordings, {} %",
+        DEFAULT: f"the {label(DEFAULT)} predictor {{}} %",
+    }
+    gains = {name: where(shortest, estimator=name)[_GAIN] for name in words}
+    parts = [words[name].format(_range(gain)) for name, gain in gains.items() if len(gain)]
     if _ORACLE_GAIN in shortest and shortest[_ORACLE_GAIN].notna().any():
         oracle = _range(shortest[_ORACLE_GAIN].dropna())
         parts.append(f"the oracle, which knows the drawn values, {oracle} %")
-    parts.append(f"the ceiling, which is expected of the best estimator, is {limit}")
+    limit = _range(shortest[_CEILING_GAIN].dropna())
+    parts.append(f"the ceiling, which is expected of the best estimator, is {limit} %")
     return f"{'; '.join(parts)}."
-
-
-def _gain(rows: pd.DataFrame, estimator: str) -> str:
-    return _range(rows[rows.estimator == estimator][_GAIN])
 
 
 def _estimators(rows: pd.DataFrame) -> str:
@@ -91,13 +86,13 @@ def _estimators(rows: pd.DataFrame) -> str:
     if recommended.empty or _GAIN not in recommended:
         return ""
     window_s = recommended.window_s.min()
-    best = recommended[recommended.window_s == window_s].sort_values(_RMSE).iloc[0]
-    ratio = 1 - best[[_GAIN, f"{_GAIN}_hi", f"{_GAIN}_lo"]].astype(float) / 100
+    best = where(recommended, window_s=window_s).sort_values(_RMSE).iloc[0]
+    ratio, hi, lo = 1 - ends(best, _GAIN) / 100
     return (
         f"Over all windows of {window_s:g} s on {best.sensor} the error of {label(best.estimator)} "
-        f"is {ratio.iloc[0]:.2f} times that of the mean [{ratio.iloc[1]:.2f}, "
-        f"{ratio.iloc[2]:.2f}], the smallest of {recommended.estimator.nunique()} recommended "
-        f"estimators; the ceiling is {1 - best[_CEILING_GAIN] / 100:.2f}."
+        f"is {ratio:.2f} times that of the mean [{lo:.2f}, {hi:.2f}], the smallest of "
+        f"{recommended.estimator.nunique()} recommended estimators; the ceiling is "
+        f"{1 - best[_CEILING_GAIN] / 100:.2f}."
     )
 
 
@@ -131,11 +126,8 @@ def _explanations(material: Material, beyond: Sequence[PublishedResult]) -> str:
 
 def _test_of_warm_up(material: Material, names: Sequence[str]) -> str:
     """How to recognise a warm-up; on measured data, the largest warm-up that they allow."""
-    allowed = {
-        material.sensor_name(sensor): material.warm_up_allowed_mdps(sensor)
-        for sensor in material.sensors.sensor
-    }
-    sizes = "; ".join(f"{name} {from_to(a)}" for name, a in allowed.items() if a and name in names)
+    allowed = material.warm_ups_allowed_mdps
+    sizes = "; ".join(f"{name} {from_to(allowed[name])}" for name in allowed if name in names)
     if material.simulated or not sizes:
         return (
             "The mean rate against time after power-on, on measured data, bounds a warm-up, and so "
@@ -144,8 +136,13 @@ def _test_of_warm_up(material: Material, names: Sequence[str]) -> str:
     return f"These recordings allow a warm-up of at most {sizes} mdps (95 % intervals)."
 
 
+def _signs(rows: pd.DataFrame, name: str) -> tuple[int, int]:
+    """The numbers of results whose whole interval is above 0, and below 0."""
+    return (rows[f"{name}_lo"] > 0).sum(), (rows[f"{name}_hi"] < 0).sum()
+
+
 def _ranked(window_s: float, networks: pd.DataFrame) -> str:
-    better, worse = (networks[f"{_GAIN}_lo"] > 0).sum(), (networks[f"{_GAIN}_hi"] < 0).sum()
+    better, worse = _signs(networks, _GAIN)
     has_oracle = _ORACLE in networks and networks[_ORACLE].notna().all()
     best = networks[_ORACLE if has_oracle else _CEILING]
     sentences = (
@@ -157,7 +154,7 @@ def _ranked(window_s: float, networks: pd.DataFrame) -> str:
     key = f"less_{CONSTANT}_dps"
     if key in networks and networks[key].notna().any():
         paired = networks[networks[key].notna()]
-        better, worse = (paired[f"{key}_hi"] < 0).sum(), (paired[f"{key}_lo"] > 0).sum()
+        worse, better = _signs(paired, key)
         sentences += (
             f" In pairs on the same windows, {better} of {len(paired)} are better than the "
             f"constant with their whole interval and {worse} worse."
@@ -168,12 +165,14 @@ def _ranked(window_s: float, networks: pd.DataFrame) -> str:
 def _matched(material: Material) -> str:
     """The number of published gains within the intervals of our results."""
     rows = [(claim, material.result(claim, CNN)) for claim in material.claims]
-    both = [(claim, row) for claim, row in rows if row is not None]
-    if not both:
+    pairs = [(claim, row) for claim, row in rows if not row.empty]
+    if not pairs:
         return ""
-    inside = sum(row[f"{_GAIN}_lo"] <= c.accuracy_gain_pct <= row[f"{_GAIN}_hi"] for c, row in both)
+    inside = sum(
+        row[f"{_GAIN}_lo"] <= claim.accuracy_gain_pct <= row[f"{_GAIN}_hi"] for claim, row in pairs
+    )
     return (
-        f"{len(both)} published results have a training set that was run here; {inside} of them "
+        f"{len(pairs)} published results have a training set that was run here; {inside} of them "
         "are within the 95 % interval of ours, over all windows."
     )
 
@@ -184,7 +183,7 @@ def _more_data(networks: pd.DataFrame, count: str, addition: str) -> str:
     pairs = networks[networks[key].notna()] if key in networks else networks[:0]
     if pairs.empty:
         return ""
-    better, worse = (pairs[f"{key}_lo"] > 0).sum(), (pairs[f"{key}_hi"] < 0).sum()
+    better, worse = _signs(pairs, key)
     half = (pairs[f"{key}_hi"] - pairs[f"{key}_lo"]).median() / 2
     return (
         f"Adding {addition} changes A by {_range(pairs[key], '+.0f')} points, in {len(pairs)} "

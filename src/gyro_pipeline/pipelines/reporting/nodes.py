@@ -3,7 +3,7 @@
 Modules that draw are imported where they are used, since every run imports this module.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from itertools import product
 from typing import Any
 
@@ -15,7 +15,7 @@ from gyro_pipeline.estimators import DEFAULT, ESTIMATORS, estimator_class
 from gyro_pipeline.markup import escape, pipe_table
 from gyro_pipeline.parameters import GroundTruth, Only, Published, Study
 from gyro_pipeline.pipelines.reporting import tables
-from gyro_pipeline.pipelines.reporting.exhibits import Exhibit, Material, label
+from gyro_pipeline.pipelines.reporting.exhibits import Exhibit, Material, label, where
 from gyro_pipeline.pipelines.reporting.findings import answer, findings
 from gyro_pipeline.pipelines.reporting.results import CNN_BEST, NOT_RUN, ROW, WARNINGS
 from gyro_pipeline.studies import CNN, CONSTANT, LEAKAGE, MEAN
@@ -40,21 +40,11 @@ def write_report(
     earlier: Tables,
     **fresh: Tables,
 ) -> tuple[dict[str, pd.DataFrame], dict[str, Any], str]:
-    """Make the tables, the figures and the page of a source.
+    """The tables by name, the figures by name, and the page of a source as Markdown.
 
-    Args:
-        source: Where the logs come from.
-        only: Filters of the run.
-        published: Results and specifications that the paper states.
-        ground_truth: The tolerance that figures show.
-        studies: Configured studies, to list those that were not run.
-        sensors: Configured sensors.
-        earlier: Stored results and descriptions of this source, by
-            ``<study or sensor>/<table>``.
-        **fresh: Results and descriptions of this run, by study or sensor.
-
-    Returns:
-        Tables by name, figures by name, and the page as Markdown.
+    ``earlier`` has stored results and descriptions of this source, by ``<study or
+    sensor>/<table>``, ``fresh`` those of this run, by study or sensor. Configured studies that were
+    not run are listed.
     """
     stored = dict(earlier)
     for name, loaders in fresh.items():
@@ -66,8 +56,11 @@ def write_report(
         "tables": _tables(material),
         "files": _files(material),
     }
-    exhibits = {part: [one for one in some if one is not None] for part, some in possible.items()}
-    shown = [exhibit for part in exhibits.values() for exhibit in part]
+    exhibits = {
+        part: [exhibit for exhibit in candidates if exhibit is not None]
+        for part, candidates in possible.items()
+    }
+    contents = [(exhibit.name, exhibit.content) for part in exhibits.values() for exhibit in part]
     page = _page().render(
         exhibits,
         material=material,
@@ -76,13 +69,13 @@ def write_report(
         answer=answer(material),
         findings=findings(material),
         explained=_explained(material.finished.estimator),
-        facts=_facts(material, only, set(fresh)),
+        facts=_facts(material, only, fresh),
         missing=_missing(material, only, studies, sensors),
         runs=_runs(material),
     )
     return (
-        {item.name: item.content for item in shown if isinstance(item.content, pd.DataFrame)},
-        {item.name: item.content for item in shown if not isinstance(item.content, pd.DataFrame)},
+        {name: content for name, content in contents if isinstance(content, pd.DataFrame)},
+        {name: content for name, content in contents if not isinstance(content, pd.DataFrame)},
         page,
     )
 
@@ -161,15 +154,14 @@ def _files(material: Material) -> list[Exhibit | None]:
 def _comparisons(material: Material) -> list[tuple[str, str]]:
     """Each study that compares estimators, with each of its sensors."""
     rows = material.results[~material.results.study.isin(PAPER_STUDIES)]
-    return list(dict.fromkeys(zip(rows.study, rows.sensor, strict=True)))
+    return [*rows[["study", "sensor"]].drop_duplicates().itertuples(index=False, name=None)]
 
 
 def _explained(estimators: Iterable[str]) -> list[tuple[str, str]]:
     """Name and description of each estimator in the report, those of the first figure first."""
-    first = [MEAN, CNN, CONSTANT, DEFAULT]
-    shown = {*estimators} - {CNN_BEST}
-    names = [name for name in (*first, *ESTIMATORS, *sorted(shown)) if name in shown]
-    return [(label(name), _description(name)) for name in dict.fromkeys(names)]
+    present = {*estimators} - {CNN_BEST}
+    order = dict.fromkeys([MEAN, CNN, CONSTANT, DEFAULT, *ESTIMATORS, *sorted(present)])
+    return [(label(name), _description(name)) for name in order if name in present]
 
 
 def _description(name: str) -> str:
@@ -184,36 +176,35 @@ def _description(name: str) -> str:
     return first + (f" With {', '.join(words)}." if words else "")
 
 
-def _facts(material: Material, only: Only, fresh: set[str]) -> list[tuple[str, str]]:
+def _facts(material: Material, only: Only, fresh: Collection[str]) -> dict[str, str]:
     """How the numbers were made: data, networks, windows, code and environment."""
     rows = material.finished
-    facts = {"Data": _data(material)}
-    if len(material.sensors):
-        facts["Recordings"] = "; ".join(
+    facts = {
+        "Data": _data(material),
+        "Recordings": "; ".join(
             f"{material.sensor_name(row.sensor)}: {row.imus} IMUs, "
             f"{row.all_recordings / len(AXES):.0f} "
             f"recordings used of {row.median_samples / row.rate_hz:.4g} s"
             for _, row in material.sensors.iterrows()
-        )
-    if len(rows):
-        networks = rows[rows.estimator == CNN].drop_duplicates("fingerprints")
+        ),
+    }
+    networks = where(rows, estimator=CNN).drop_duplicates("fingerprints")
+    if len(networks):
         epochs = ", ".join(f"{count:.0f}" for count in sorted(networks.epochs.dropna().unique()))
-        if len(networks):
-            facts["Networks"] = f"{len(networks)}, of {epochs} epochs (the paper: 1200)"
-            facts["Seeds"] = f"{networks.seeds.max():.0f}"
-        facts["Windows"] = (
-            ", ".join(f"{time_s:g}" for time_s in sorted(rows.window_s.unique())) + " s"
-        )
-        facts["Trained"] = f"{rows.started.min()} to {rows.started.max()} UTC"
-        facts["Code"] = "; ".join(sorted(rows.code.unique()))
-        facts["Environment"] = ", ".join(sorted(rows.env.unique()))
-    narrowed = ", ".join(f"{k}={v}" for k, v in only.model_dump(exclude_none=True).items())
-    if narrowed:
-        facts["Narrowed to"] = narrowed
-    earlier = [study for study in material.results.study.unique() if study not in fresh]
-    if earlier:
-        facts["From earlier runs"] = ", ".join(earlier)
-    return [*facts.items()]
+        facts["Networks"] = f"{len(networks)}, of {epochs} epochs (the paper: 1200)"
+        facts["Seeds"] = f"{networks.seeds.max():.0f}"
+    if len(rows):
+        facts |= {
+            "Windows": ", ".join(f"{time_s:g}" for time_s in sorted(rows.window_s.unique())) + " s",
+            "Trained": f"{rows.started.min()} to {rows.started.max()} UTC",
+            "Code": "; ".join(sorted(rows.code.unique())),
+            "Environment": ", ".join(sorted(rows.env.unique())),
+        }
+    filters = only.model_dump(exclude_none=True).items()
+    facts["Narrowed to"] = ", ".join(f"{name}={value}" for name, value in filters)
+    studies = material.results.study.unique()
+    facts["From earlier runs"] = ", ".join(study for study in studies if study not in fresh)
+    return {name: text for name, text in facts.items() if text}
 
 
 def _data(material: Material) -> str:
@@ -235,15 +226,15 @@ def _missing(
     for name, settings in studies.items():
         study = Study.model_validate(settings)
         studied = [s for s in study.sensors_among(sensors) if only.sensor in (None, s)]
-        rows = material.of(name)
+        rows = where(material.results, study=name)
         lacking, begun = int((rows.status == NOT_RUN).sum()), len(rows) > 0
         if not studied or (begun and not lacking) or not (begun or study.default):
             continue
         command = f"kedro run{'' if study.default else f' --pipeline={name}'}{env}"
         results = f"{lacking} of {len(rows)} results of {name}" if begun else f"the study {name}"
         makes.setdefault(command, []).append(results)
-    table = [{"Command": command, "Makes": ", ".join(names)} for command, names in makes.items()]
-    return pd.DataFrame(table, columns=["Command", "Makes"])
+    table = {"Command": [*makes], "Makes": [", ".join(names) for names in makes.values()]}
+    return pd.DataFrame(table)
 
 
 def _runs(material: Material) -> list[dict[str, Any]]:
@@ -268,8 +259,4 @@ def _page() -> Any:
         autoescape=False,  # of HTML: what is rendered is Markdown, escaped by the filter below
     )
     environment.filters |= {"md": escape, "pipes": pipe_table}
-    environment.filters["seen"] = lambda exhibit: (
-        exhibit.content if exhibit.shown is None else exhibit.content[[*exhibit.shown]]
-    )
-    environment.tests["table"] = lambda exhibit: isinstance(exhibit.content, pd.DataFrame)
     return environment.get_template("report.md.j2")

@@ -1,6 +1,5 @@
 """The description of a sensor by its recordings: noise, drift and hours, as tables."""
 
-from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
@@ -46,16 +45,7 @@ def describe(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     ground_truth: GroundTruth,
     virtual: xr.Dataset | None = None,
 ) -> dict[str, pd.DataFrame]:
-    """Describe a sensor by its recordings.
-
-    Args:
-        recordings: Angular rates, deg/s.
-        bias: Ground truth of the recordings.
-        noise: N, B and K of every gyroscope.
-        allan: Allan variances of the recordings.
-        quality: Results of quality control.
-        ground_truth: The tolerance of the settling time.
-        virtual: Virtual recordings, if there are any.
+    """Describe a sensor by its recordings, angular rates in deg/s.
 
     Returns:
         ``description``, one row; ``quality``, the table of the report; and ``signals``, the lines
@@ -68,7 +58,7 @@ def describe(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     signals = [
         *_signals(recordings, bias, ground_truth.tolerance_mdps * MDPS),
         *_allan_lines(allan, noise),
-        drifts.assign(figure="drift"),
+        drifts,
     ]
     return {
         "description": pd.DataFrame([row | bounds]),
@@ -83,8 +73,7 @@ def drift(recordings: xr.Dataset) -> tuple[pd.DataFrame, dict[str, float]]:
     Each recording is centred by the mean of its last quarter, so that only changes within a
     recording are left: a warm-up that all power-ons share stands out, noise averages out.
 
-    Args:
-        recordings: Angular rates, deg/s; the shortest tenth of the recordings is left out.
+    The shortest tenth of the recordings is left out.
 
     Returns:
         Lines for each axis: times ``x``, seconds, the mean ``y``, deg/s, with its 95 % interval
@@ -110,13 +99,14 @@ def drift(recordings: xr.Dataset) -> tuple[pd.DataFrame, dict[str, float]]:
     decay = np.exp(-drifts.time_s / time_s)
     decay -= decay[drifts.time_s >= drifts.time_s[-1] * (1 - LAST)].mean()
     lines = []
-    for i, axis in enumerate(AXES):
-        rate, half = drifts.rate[i], drifts.half[i]
-        ends = {"lo": rate - half, "hi": rate + half}
-        lines.append({"line": axis, "x": drifts.time_s, "y": rate, **ends})
-        fitted = fits[time_s].amplitude[i] * decay
-        lines.append({"line": f"{axis}, warm-up of {time_s:g} s", "x": drifts.time_s, "y": fitted})
-    return pd.concat(map(pd.DataFrame, lines), ignore_index=True), bounds
+    for axis, rate, half, amplitude in zip(
+        AXES, drifts.rate, drifts.half, fits[time_s].amplitude, strict=True
+    ):
+        lines += [
+            _line("drift", axis, drifts.time_s, rate, half),
+            _line("drift", f"{axis}, warm-up of {time_s:g} s", drifts.time_s, amplitude * decay),
+        ]
+    return pd.concat(lines, ignore_index=True), bounds
 
 
 def start_up(recordings: xr.Dataset, bias: pd.DataFrame, noise: pd.DataFrame) -> dict[str, float]:
@@ -125,11 +115,6 @@ def start_up(recordings: xr.Dataset, bias: pd.DataFrame, noise: pd.DataFrame) ->
     The mean of t seconds has the variance N^2/t + (0.664 B)^2 + K^2 t/3. It is combined with the
     mean of earlier calibrations, about which the bias scatters by the turn-on spread; for the
     ceiling this mean is known exactly. There is no warm-up, and power-ons are exchangeable.
-
-    Args:
-        recordings: Recordings with their split and, if simulated, the drawn spread.
-        bias: Ground truth of the recordings.
-        noise: N, B and K.
 
     Returns:
         ``spread_dps`` and ``white_dps_rts`` of each axis, and ``<method>_s_at_<sigma>`` of the
@@ -182,36 +167,34 @@ def _turn_on_spread(
 def recording_quality(table: pd.DataFrame) -> pd.DataFrame:
     """Count the recordings that were kept, repaired and rejected, and list those with findings.
 
-    Args:
-        table: The quality table of the raw-logs stage, a row per IMU and recording.
-
-    Returns:
-        A row for the sensor, and below it the recordings with findings, the worst first.
+    Of a table with a row per IMU and recording, it makes a row for the sensor, and below it the
+    recordings with findings, the worst first.
     """
-    counts, used = Counter(table.outcome), (table.stop - table.start).dropna()
+    sensor, used = table.sensor.iloc[0], (table.stop - table.start).dropna()
     noted = table[(table.outcome != KEPT) | table.findings.notna()]
     noted = noted.sort_values(
         "outcome", key=lambda word: word.map(_WORST_FIRST.index), kind="stable"
     )
+    counts = [f"{(table.outcome == word).sum()} {word}" for word in _WORST_FIRST[::-1]]
     rows: list[dict[str, Any]] = [
         {
-            "Sensor": table.sensor.iloc[0],
+            "Sensor": sensor,
             "IMU": f"all {table.imu.nunique()}",
             "Recording": f"all {len(table)}",
             "File": None,
-            "Outcome": ", ".join(f"{counts[outcome]} {outcome}" for outcome in _WORST_FIRST[::-1]),
-            "Rows used": _range(used) if len(used) else "none",
+            "Outcome": ", ".join(counts),
+            "Rows used": _lengths(used) if len(used) else "none",
             "Findings": f"in {len(noted)} recordings" if len(noted) else "none",
         }
     ]
     rows += [_quality_row(row) for _, row in noted.head(_MAX_ROWS).iterrows()]
     if len(noted) > _MAX_ROWS:
         rest = f"in {len(noted) - _MAX_ROWS} further recordings"
-        rows.append({"Sensor": rows[0]["Sensor"], "Findings": rest})
+        rows.append({"Sensor": sensor, "Findings": rest})
     return pd.DataFrame(rows)
 
 
-def _range(rows: pd.Series) -> str:
+def _lengths(rows: pd.Series) -> str:
     """The number of rows in the shortest and in the longest recording."""
     lowest, highest = f"{rows.min():.0f}", f"{rows.max():.0f}"
     return f"{lowest} of each" if lowest == highest else f"{lowest} to {highest}"
@@ -233,40 +216,35 @@ def _quality_row(row: pd.Series) -> dict[str, Any]:
 def _noise(noise: pd.DataFrame) -> dict[str, float]:
     """Root mean square over gyroscopes, with the smallest and the largest."""
     row: dict[str, float] = {}
-    for name in ["sample_sigma_dps", *FIGURES]:
-        values = noise[name]
-        row |= {name: float(np.sqrt((values**2).mean()))}
+    for name, values in noise[["sample_sigma_dps", *FIGURES]].items():
+        row[f"{name}"] = float(np.sqrt((values**2).mean()))
         row |= {f"{name}_min": float(values.min()), f"{name}_max": float(values.max())}
     return row
 
 
 def _counts(recordings: xr.Dataset, virtual: xr.Dataset | None) -> dict[str, float]:
-    """Numbers of recordings and of their samples that train, test, or do either.
+    """Numbers of gyroscopes, recordings and samples that train, test, or do either.
 
     Training recordings, including those for validation, count for every gyroscope, test recordings
-    for the three of the tested IMU; in a k-fold all recordings do both.
+    for the three of the tested IMU; in a k-fold all recordings do both, virtual ones only train.
     """
-    samples = recordings["samples"].load().transpose("imu", "recording")
-    exists = samples > 0
-    tested = exists & (exists.imu == tested_imu(recordings))
-    train, test = exists, tested
+    samples = recordings["samples"].load()
+    train = samples > 0
+    test = train & (train.imu == tested_imu(recordings))
     if "split" in recordings.coords:
-        train, test = exists & (recordings.split != TEST), tested & (recordings.split == TEST)
-    gyroscopes = len(AXES) * int(train.any("recording").sum())
-    row: dict[str, float] = {
-        "gyroscopes": gyroscopes,
-        "median_samples": float(samples.where(exists).median()),
-    }
-    for name, part in (("train", train), ("test", test), ("all", train | test)):
-        row[f"{name}_recordings"] = len(AXES) * int(part.sum())
-        row[f"{name}_samples"] = len(AXES) * int((samples * part).sum())
+        train, test = train & (recordings.split != TEST), test & (recordings.split == TEST)
+    kinds = {"": (samples, train, test)}
     if virtual is not None:
-        lengths = virtual["samples"].load()
-        used = (lengths > 0) & (virtual.recording <= virtual.attrs["train_recordings"])
-        row["virtual_gyroscopes"] = len(AXES) * virtual.sizes["imu"]
-        row["virtual_median_samples"] = float(lengths.where(lengths > 0).median())
-        row["virtual_recordings"] = len(AXES) * int(used.sum())
-        row["virtual_samples"] = len(AXES) * int((lengths * used).sum())
+        samples = virtual["samples"].load()
+        train = (samples > 0) & (virtual.recording <= virtual.attrs["train_recordings"])
+        kinds["virtual_"] = samples, train, xr.zeros_like(train)
+    row: dict[str, float] = {}
+    for kind, (samples, train, test) in kinds.items():
+        row[f"{kind}gyroscopes"] = len(AXES) * int(train.any("recording").sum())
+        row[f"{kind}median_samples"] = float(samples.where(samples > 0).median())
+        for name, part in (("train", train), ("test", test), ("all", train | test)):
+            row[f"{kind}{name}_recordings"] = len(AXES) * int(part.sum())
+            row[f"{kind}{name}_samples"] = len(AXES) * int((samples * part).sum())
     return row
 
 
@@ -311,10 +289,16 @@ def _signals(
         yield _line("convergence", "each alone", times_s, single)
 
 
-def _line(figure: str, line: str, x: NDArray[np.float64], y: NDArray[np.float64]) -> pd.DataFrame:
-    return pd.DataFrame(
-        {"figure": figure, "line": line, "x": x, "y": y, "lo": np.nan, "hi": np.nan}
-    )
+def _line(
+    figure: str,
+    line: str,
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    half: float | NDArray[np.float64] = np.nan,
+) -> pd.DataFrame:
+    """A line of a figure, with an interval of y ± half."""
+    ends = {"lo": y - half, "hi": y + half}
+    return pd.DataFrame({"figure": figure, "line": line, "x": x, "y": y, **ends})
 
 
 def _running_mean(

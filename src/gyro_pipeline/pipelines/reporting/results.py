@@ -5,7 +5,7 @@ Ceilings, oracle, constant, coverage and p values are read from the scores of th
 """
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache, cached_property
@@ -31,11 +31,10 @@ from gyro_pipeline.studies import (
     LEFT_OUT,
     MEAN,
     RunSpec,
-    possible_runs,
-    run_spec,
+    run_specs,
     study_rows,
 )
-from gyro_pipeline.tracking import CURVE, ERRORS, SCORES, StoredRun
+from gyro_pipeline.tracking import CURVE, ERRORS, FINGERPRINT, SCORES, StoredRun
 
 logger = logging.getLogger(__name__)
 
@@ -85,13 +84,7 @@ def pool_results(  # noqa: PLR0913, PLR0917 - a node's arguments are its dataset
 ) -> dict[str, pd.DataFrame]:
     """Pool the planned runs of a study into one row per result.
 
-    Args:
-        study: The study with its grid.
-        source: Where the logs come from.
-        windows_s: Calibration times, seconds.
-        seeds: Seeds that are pooled in a row.
-        only: Filters of the grid.
-        **stored: For each sensor its plan, ``<sensor>_plan``, and its runs, ``<sensor>_runs``.
+    ``stored`` has the plan of each sensor, ``<sensor>_plan``, and its runs, ``<sensor>_runs``.
 
     Returns:
         ``results``, a row per estimator, sensor, window and training set, whose ``status`` says
@@ -101,18 +94,18 @@ def pool_results(  # noqa: PLR0913, PLR0917 - a node's arguments are its dataset
     sensors = [name.removesuffix("_plan") for name in stored if name.endswith("_plan")]
     plan = pd.concat([stored[f"{sensor}_plan"] for sensor in sensors])
     runs = [run for sensor in sensors for run in stored[f"{sensor}_runs"] if run.finished]
-    finder = Finder(plan, runs, study.unseen_devices)
+    outcomes = planned_outcomes(plan, runs)
     results: list[dict[str, Any]] = []
     curves = [pd.DataFrame(columns=_CURVES)]
     for sensor in sensors:
         specs = study_rows(study, sensor, source, windows_s, seeds, only)
         cells = [
-            Cell([spec for spec in specs if spec.window_s == window_s], finder)
+            Cell([spec for spec in specs if spec.window_s == window_s], study, outcomes)
             for window_s in dict.fromkeys(spec.window_s for spec in specs)
         ]
         results += [row for cell in cells for row in cell.results()]
         curves += [cell.curves() for cell in cells if cell.mean is not None][-1:]
-    unused = len({run.fingerprint for run in runs} - finder.planned)
+    unused = len({run.fingerprint for run in runs} - {*plan[FINGERPRINT]})
     if unused:
         logger.info(
             "%s: %d finished runs with other settings or data are in the store and not used",
@@ -121,64 +114,52 @@ def pool_results(  # noqa: PLR0913, PLR0917 - a node's arguments are its dataset
     return {"results": pd.DataFrame(results), "curves": pd.concat(curves[1:] or curves)}
 
 
-class Finder:
-    """Finds the finished runs of rows by the fingerprints in the plans.
-
-    Args:
-        plan: The plans of all sensors.
-        runs: Finished runs, newest first.
-        unseen_devices: Whether the tested devices are unseen.
-    """
-
-    def __init__(self, plan: pd.DataFrame, runs: Sequence[StoredRun], unseen_devices: bool) -> None:
-        self._keys = {spec: key for key, spec in possible_runs(plan).items()}
-        self._left_out = {
-            RunSpec(**{name: row[name] for name in RunSpec.names()}): str(row[LEFT_OUT])
-            for row in plan[plan[LEFT_OUT].notna()].to_dict("records")
-        }
-        self._runs = {run.fingerprint: replace(run, load=cache(run.load)) for run in reversed(runs)}
-        self._unseen_devices = unseen_devices
-
-    @property
-    def planned(self) -> set[str]:
-        """Fingerprints of the planned runs."""
-        return set(self._keys.values())
-
-    def __call__(self, seeds: Iterable[RunSpec]) -> tuple[list[StoredRun], str]:
-        """The runs of all seeds of a result, or none and the reason."""
-        specs = dict.fromkeys(run_spec(spec, self._unseen_devices) for spec in seeds)
-        reasons = [self._left_out[spec] for spec in specs if self._left_out.get(spec)]
-        keys = [self._keys.get(spec, "") for spec in specs]
-        runs = [self._runs[key] for key in keys if key in self._runs]
-        return (runs, "") if len(runs) == len(specs) else ([], reasons[0] if reasons else NOT_RUN)
+def planned_outcomes(
+    plan: pd.DataFrame, runs: Sequence[StoredRun]
+) -> dict[RunSpec, StoredRun | str]:
+    """The run of each planned spec, or why there is none; of several runs the first counts."""
+    newest = {run.fingerprint: replace(run, load=cache(run.load)) for run in reversed(runs)}
+    outcomes: dict[RunSpec, StoredRun | str] = {}
+    for row in plan.fillna({LEFT_OUT: ""}).to_dict("records"):
+        spec = RunSpec(**{name: row[name] for name in RunSpec.names()})
+        outcomes[spec] = row[LEFT_OUT] or newest.get(row[FINGERPRINT], NOT_RUN)
+    return outcomes
 
 
 @dataclass(frozen=True, eq=False)
 class Cell:
     """The results of a sensor and window length, which share a running mean."""
 
-    specs: Sequence[RunSpec]  # rows of the study, a spec for every seed
-    find: Finder  # finds the runs of a row
+    specs: Sequence[RunSpec]  # rows of the study, a spec for every seed, the running mean first
+    study: Study
+    outcomes: Mapping[RunSpec, StoredRun | str]  # from planned_outcomes
 
     @cached_property
-    def _rows(self) -> list[tuple[list[RunSpec], list[StoredRun], str]]:
-        key = lambda spec: tuple(getattr(spec, name) for name in ROW)  # noqa: E731
-        groups = [list(group) for _, group in groupby(self.specs, key)]
-        return [(group, *self.find(group)) for group in groups]
+    def _rows(self) -> list[tuple[RunSpec, list[StoredRun], str]]:
+        """Each result by its first seed, with the runs of all seeds, or none and the reason."""
+        rows = []
+        for _, group in groupby(self.specs, lambda spec: [getattr(spec, name) for name in ROW]):
+            specs = list(group)
+            needed = run_specs(specs, self.study.unseen_devices)
+            outcomes = [self.outcomes.get(spec, NOT_RUN) for spec in needed]
+            runs = [outcome for outcome in outcomes if isinstance(outcome, StoredRun)]
+            problem = next((outcome for outcome in outcomes if isinstance(outcome, str)), "")
+            rows.append((specs[0], [] if problem else runs, problem))
+        return rows
 
     @cached_property
     def mean(self) -> StoredRun | None:
         """The run of the running mean; None if it is missing."""
-        means = [runs[0] for specs, runs, _ in self._rows if runs and specs[0].estimator == MEAN]
-        return means[0] if means else None
+        _, runs, _ = self._rows[0]
+        return runs[0] if runs else None
 
     @cached_property
     def _errors_compared(self) -> dict[str, pd.DataFrame]:
         return {
             name: errors_of(runs)
             for name in COMPARED_WITH
-            for specs, runs, _ in self._rows
-            if runs and specs[0].estimator == name
+            for spec, runs, _ in self._rows
+            if runs and spec.estimator == name
         }
 
     @cached_property
@@ -190,13 +171,13 @@ class Cell:
     def results(self) -> list[dict[str, Any]]:
         """A result for each row; all need the running mean, which they are compared with."""
         results = []
-        for specs, runs, problem in self._rows:
-            name = {key: getattr(specs[0], key) for key in ("study", "protocol", *ROW)}
+        for spec, runs, problem in self._rows:
+            name = {key: getattr(spec, key) for key in ("study", "protocol", *ROW)}
             if not runs or self.mean is None:
                 results.append(name | {"status": problem or NOT_RUN, "run_ids": None})
                 continue
-            results.append(name | self._result(specs[0], runs) | self._added(specs[0], runs))
-            best = [best_epoch(run) for run in runs if specs[0].estimator == CNN]
+            results.append(name | self._result(spec, runs) | self._added(spec, runs))
+            best = [best_epoch(run) for run in runs if spec.estimator == CNN]
             if best and all(len(run.load(ERRORS)) for run in best):
                 results.append(results[-1] | self._pooled(best) | {"estimator": CNN_BEST})
         return results
@@ -222,7 +203,7 @@ class Cell:
         return row | {
             **{name: scores.get((name, ALL), MISSING).value for name in OTHERS},
             **{
-                name: next(filter(None, (r.tags.get(name) for r in runs)), None)
+                name: next((run.tags[name] for run in runs if run.tags.get(name)), None)
                 for name in WARNINGS
             },
             "simulated": tags["simulated"] == "1",
@@ -246,7 +227,7 @@ class Cell:
         row: dict[str, Any] = {"seeds": len(errors), "recordings": len(places.drop_duplicates())}
         for windows in (ALL, FIRST):
             pooled = self._scores(pd.concat(errors), windows)
-            single = [self._scores(table, windows) for table in errors[1:] and errors]
+            single = [self._scores(table, windows) for table in errors] if len(errors) > 1 else []
             for base, estimate in pooled.items():
                 name = column(base, windows)
                 row |= with_ends(name, estimate)
@@ -268,9 +249,9 @@ class Cell:
         for count in PAIRED_COUNTS if spec.estimator == CNN else ():
             without: dict[str, Any] = {count: 0}
             similar = [
-                (getattr(specs[0], count), others)
-                for specs, others, _ in self._rows
-                if others and replace(specs[0], **without) == replace(spec, **without)
+                (getattr(row_spec, count), row_runs)
+                for row_spec, row_runs, _ in self._rows
+                if row_runs and replace(row_spec, **without) == replace(spec, **without)
             ]
             fewest, base_runs = min(similar, key=lambda pair: pair[0])
             if getattr(spec, count) > fewest:

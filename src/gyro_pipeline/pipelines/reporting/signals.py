@@ -12,7 +12,7 @@ from matplotlib.ticker import LogLocator
 
 from gyro_pipeline.conventions import AXES, MDPS
 from gyro_pipeline.parameters import GroundTruth
-from gyro_pipeline.pipelines.reporting.exhibits import Exhibit, Material
+from gyro_pipeline.pipelines.reporting.exhibits import Exhibit, Material, where
 from gyro_pipeline.pipelines.reporting.recordings import GYROSCOPES, WARM_UPS_S
 from gyro_pipeline.pipelines.reporting.style import (
     CEILING,
@@ -29,15 +29,15 @@ _TOLERANCE = "The band is the tolerance around the mean of the recording, which 
 
 def drift(material: Material) -> Exhibit | None:
     """Mean rate against time after power-on, over all recordings of each sensor."""
-    lines = material.signals[material.signals.figure == "drift"]
+    lines = where(material.signals, figure="drift")
     if lines.empty:
         return None
     title = f"Mean rate against time after power-on; {material.source_name}"
     with _sensor_panels(material, title, columns=4, sharey=False) as (figure, axes):
         for ax, sensor in axes:
-            rows = lines[lines.sensor == sensor]
+            rows = where(lines, sensor=sensor)
             for axis, colour in zip(AXES, COLOURS, strict=False):
-                line = rows[rows.line == axis]
+                line = where(rows, line=axis)
                 ax.plot(line.x, line.y / MDPS, color=colour, lw=1.4, label=f"axis {axis}")
                 band = line.lo / MDPS, line.hi / MDPS
                 ax.fill_between(line.x, *band, color=colour, alpha=0.18, lw=0)
@@ -59,29 +59,26 @@ def drift(material: Material) -> Exhibit | None:
 
 def _bounds(material: Material) -> str:
     """The largest warm-up amplitude that recordings allow, by sensor and time constant."""
-    allowed = {sensor: material.warm_up_allowed_mdps(sensor) for sensor in material.sensors.sensor}
     times_s = "/".join(f"{time_s:g}" for time_s in WARM_UPS_S)
     sizes = ", ".join(
-        f"{material.sensor_name(sensor)} " + "/".join(f"{bound:.2g}" for bound in bounds)
-        for sensor, bounds in allowed.items()
-        if bounds
+        f"{name} " + "/".join(f"{bound:.2g}" for bound in bounds)
+        for name, bounds in material.warm_ups_allowed_mdps.items()
     )
     return f"{sizes} mdps for time constants of {times_s} s, on the worst axis"
 
 
 def allan_deviation(material: Material) -> Exhibit | None:
     """Allan deviation of every gyroscope, and the fitted N, B and K (IEEE Std 952)."""
-    lines = material.signals[material.signals.figure == "allan"]
+    lines = where(material.signals, figure="allan")
     if lines.empty:
         return None
     title = f"Overlapping Allan deviation; {material.source_name}"
     with _sensor_panels(material, title, columns=3, sharey=True) as (figure, axes):
         for ax, sensor in axes:
-            row = material.sensors[material.sensors.sensor == sensor].iloc[0]
-            _draw_allan(ax, lines[lines.sensor == sensor], row)
-            sheet = material.sheets.get(sensor)
+            rows, sheet = where(lines, sensor=sensor), material.sheets.get(sensor)
+            _draw_allan(ax, rows, material.described[sensor])
             if sheet is not None and sheet.noise_density_mdps_rthz is not None:
-                times_s = np.sort(lines[lines.sensor == sensor].x.unique())
+                times_s = np.sort(rows.x.unique())
                 stated = sheet.noise_density_mdps_rthz / np.sqrt(2) / np.sqrt(times_s)
                 ax.plot(times_s, stated, "k:", label="white noise of the datasheet")
             ax.set(title=material.sensor_name(sensor), xlabel="averaging time [s]")
@@ -111,10 +108,10 @@ def _draw_allan(ax: Axes, lines: Any, row: pd.Series) -> None:
 
 def running_average(material: Material, ground_truth: GroundTruth) -> Exhibit | None:
     """Running average of one gyroscope until it has converged (paper, section II)."""
-    lines = _shown_lines(material)
-    if lines is None:
+    lines = _example_lines(material)
+    if lines.empty:
         return None
-    mean, settled = (lines[lines.figure == name] for name in ("running average", "bias"))
+    mean, settled = (where(lines, figure=name) for name in ("running average", "bias"))
     settled_s, bias = float(settled.x.iloc[0]), float(settled.y.iloc[0]) / MDPS
     tolerance = ground_truth.tolerance_mdps
     title = "Running average of one gyroscope"
@@ -133,11 +130,13 @@ def running_average(material: Material, ground_truth: GroundTruth) -> Exhibit | 
 
 def calibrated_signal(material: Material) -> Exhibit | None:
     """Raw and calibrated signal of the same gyroscope (paper, section II, second figure)."""
-    lines = _shown_lines(material)
-    if lines is None:
+    lines = _example_lines(material)
+    if lines.empty:
         return None
-    raw, bias = lines[lines.figure == "signal"], float(lines[lines.figure == "bias"].y.iloc[0])
-    mean = lines[lines.figure == "running average"]
+    raw, mean, settled = (
+        where(lines, figure=name) for name in ("signal", "running average", "bias")
+    )
+    bias = float(settled.y.iloc[0])
     title = f"Raw and calibrated signal: {_gyroscope(material, mean)}"
     with panels(title, (8.5, 4.2)) as (figure, (ax,)):
         # as pixels also in the SVG, which would hold every sample otherwise
@@ -156,19 +155,19 @@ def calibrated_signal(material: Material) -> Exhibit | None:
 
 def mg_convergence(material: Material, ground_truth: GroundTruth) -> Exhibit | None:
     """Running average over several gyroscopes (paper, section III-A, figure of MG convergence)."""
-    lines = _shown_lines(material)
-    if lines is None:
+    lines = _example_lines(material)
+    if lines.empty:
         return None
     tolerance = ground_truth.tolerance_mdps
-    together = [lines[lines.figure == f"convergence {count}"] for count in GYROSCOPES]
-    counts = [count for count, line in zip(GYROSCOPES, together, strict=True) if len(line)]
-    each = lines[lines.figure == "convergence"]
-    alone = np.reshape(each.y / MDPS, (-1, len(together[0])))
+    together = {count: where(lines, figure=f"convergence {count}") for count in GYROSCOPES}
+    together = {count: line for count, line in together.items() if len(line)}
+    times_s = together[1].x
+    alone = np.reshape(where(lines, figure="convergence").y / MDPS, (-1, len(times_s)))
     title, sensor = "Running average of several gyroscopes", lines.sensor.iloc[0]
     heading = f"{title}: {material.sensor_name(sensor)}; {material.source_name}"
-    shape = (1, len(counts))
+    shape = (1, len(together))
     with panels(heading, (9.5, 3.6), shape, sharex=True, sharey=True) as (figure, axes):
-        for ax, count, line in zip(axes, counts, together, strict=False):
+        for ax, (count, line) in zip(axes, together.items(), strict=True):
             for single in alone[:count]:
                 ax.plot(line.x, single, color="grey", lw=0.5, alpha=0.6, label="each alone")
             ax.plot(line.x, line.y / MDPS, color=COLOURS[0], lw=1.8, label="average of all")
@@ -176,7 +175,7 @@ def mg_convergence(material: Material, ground_truth: GroundTruth) -> Exhibit | N
             plural = "s" if count > 1 else ""
             ax.set(title=f"{count} gyroscope{plural}, {line.line.iloc[0]}", xlabel="time [s]")
             ax.set_xlim(0, line.x.max())
-        _set_limits(axes[0], alone[:, together[0].x >= 2 * _FROM_S], tolerance)
+        _set_limits(axes[0], alone[:, times_s >= 2 * _FROM_S], tolerance)
         axes[0].set_ylabel("running average less ground truth [mdps]")
     caption = (
         "Each gyroscope is centred by its bias before averaging: biases of several deg/s would "
@@ -185,13 +184,11 @@ def mg_convergence(material: Material, ground_truth: GroundTruth) -> Exhibit | N
     return Exhibit("mg_convergence", title, caption, figure)
 
 
-def _shown_lines(material: Material) -> pd.DataFrame | None:
-    """The lines of SparkFun or, without it, of the first sensor; None without signals."""
-    if material.signals.empty:
-        return None
-    sensors = material.signals.sensor.unique().tolist()
-    shown = "sparkfun" if "sparkfun" in sensors else sensors[0]
-    return material.signals[material.signals.sensor == shown]
+def _example_lines(material: Material) -> pd.DataFrame:
+    """The lines of SparkFun or, without it, of the first sensor."""
+    lines = where(material.signals, sensor="sparkfun")
+    first = material.signals.sensor.head(1)
+    return lines if len(lines) else material.signals[material.signals.sensor.isin(first)]
 
 
 @contextmanager

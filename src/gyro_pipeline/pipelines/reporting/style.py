@@ -54,9 +54,7 @@ def panels(
     size: tuple[float, float],
     shape: tuple[int, int] = (1, 1),
     columns: int = 3,
-    *,
-    sharex: bool = False,
-    sharey: bool = False,
+    **shared: Any,
 ) -> Iterator[tuple[Figure, list[Axes]]]:
     """A figure whose panels are drawn in this context, and share the legend below them.
 
@@ -65,13 +63,11 @@ def panels(
         size: Width and height, inches.
         shape: Rows and columns of panels.
         columns: Columns of the legend, which has each label once.
-        sharex: Whether panels share their x axis.
-        sharey: Whether panels share their y axis.
+        **shared: ``sharex`` and ``sharey`` of ``Figure.subplots``.
     """
     with mpl.rc_context(PLOT_STYLE):
         figure = Figure(figsize=size, layout="constrained")
-        grid = figure.subplots(*shape, sharex=sharex, sharey=sharey, squeeze=False)
-        axes = grid.ravel().tolist()
+        axes = figure.subplots(*shape, squeeze=False, **shared).ravel().tolist()
         yield figure, axes
         handles: dict[str, Artist] = {}
         for ax in axes:

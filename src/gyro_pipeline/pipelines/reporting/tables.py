@@ -8,7 +8,7 @@ import pandas as pd
 
 from gyro_pipeline.conventions import ALL, AXES, DISJOINT, FIRST, MDPS, PAPER, TRUE
 from gyro_pipeline.estimators import DEFAULT, ESTIMATORS, ORIENTATION_NOTE
-from gyro_pipeline.parameters import PublishedHours, PublishedResult
+from gyro_pipeline.parameters import PublishedHours, PublishedResult, PublishedSpecification
 from gyro_pipeline.pipelines.reporting.exhibits import (
     BEATS_ORACLE_P,
     LEAK_VARIANTS,
@@ -24,6 +24,7 @@ from gyro_pipeline.pipelines.reporting.exhibits import (
     percent,
     remark,
     split,
+    where,
 )
 from gyro_pipeline.pipelines.reporting.recordings import SIGMAS_MDPS
 from gyro_pipeline.pipelines.reporting.results import (
@@ -70,25 +71,25 @@ _SUMMARY = (
 def paper_results(material: Material, table: str) -> Exhibit | None:
     """A result table of the paper, one of ``PAPER_TABLES``, with our results beside it."""
     study = STUDIES_OF[table]
-    if material.of(study).empty:
+    if where(material.results, study=study).empty:
         return None
-    rows = [_result_row(material, claim) for claim in material.published.of_table(table)]
-    results = pd.DataFrame(rows)
-    shown = ["Sensor", "Gyroscopes", "Published S/A %", "S %", "A %", "Constant A %", _BEST_A]
-    shown += ["Ceiling A %", *[_ORACLE_A] * material.simulated, "Paper's way A %", _WARM_UP]
-    shown += ["Note"] if results["Note"].notna().any() else []
-    return Exhibit(f"{study}_{table}", PAPER_TABLES[table], _SUMMARY, results, shown)
+    claims = material.published.of_table(table)
+    results = pd.DataFrame(_result_row(material, claim) for claim in claims)
+    columns = ["Sensor", "Gyroscopes", "Published S/A %", "S %", "A %", "Constant A %", _BEST_A]
+    columns += ["Ceiling A %", *[_ORACLE_A] * material.simulated, "Paper's way A %", _WARM_UP]
+    columns += ["Note"] if results["Note"].notna().any() else []
+    return Exhibit(f"{study}_{table}", PAPER_TABLES[table], _SUMMARY, results, columns)
 
 
 def trained_on_first_windows(material: Material) -> Exhibit | None:
     """Networks trained on all and on first windows, beside a constant, for a bias that warms up."""
-    if material.of(FIRST_WINDOWS).empty:
+    if where(material.results, study=FIRST_WINDOWS).empty:
         return None
     rows = []
-    for claim in (claim for claim in material.claims if claim.table != "generalization"):
+    for claim in material.claims:
         for study, trained in (("augmentation", ALL), (FIRST_WINDOWS, FIRST)):
             row = material.result(claim, CNN, study)
-            if row is not None and row.real_gyros == claim.real_gyros:
+            if claim.table != "generalization" and row.get("real_gyros") == claim.real_gyros:
                 rows.append(_first_and_all(material, claim, row, trained))
     if not rows:
         return None
@@ -105,17 +106,15 @@ def trained_on_first_windows(material: Material) -> Exhibit | None:
 def _first_and_all(
     material: Material, claim: PublishedResult, row: pd.Series, trained: str
 ) -> dict[str, Any]:
-    gains = {
-        f"{name} A %, {windows} windows": interval(row, f"{kind}accuracy_gain_pct", windows)
-        for windows in (FIRST, ALL)
-        for name, kind in (("Network", ""), ("Constant", "constant_"), ("Ceiling", "ceiling_"))
-    }
     return {
         "Sensor": material.sensor_name(claim.sensor),
         "Gyroscopes": gyroscopes(row),
         "Trained on": f"{trained} windows",
         "Published A %": f"{claim.accuracy_gain_pct:.0f}",
-        **gains,
+    } | {
+        f"{name} A %, {windows} windows": interval(row, f"{kind}accuracy_gain_pct", windows)
+        for windows in (FIRST, ALL)
+        for name, kind in (("Network", ""), ("Constant", "constant_"), ("Ceiling", "ceiling_"))
     }
 
 
@@ -126,41 +125,45 @@ _BEST_A = f"{label(DEFAULT).capitalize()} A %"
 
 
 def _result_row(material: Material, claim: PublishedResult) -> dict[str, Any]:
-    row = material.result(claim, CNN)
-    others = {name: material.result(claim, name) for name in (RESIDUAL_NETWORK, CONSTANT, DEFAULT)}
-    residual = others[RESIDUAL_NETWORK]
-    result: Any = {} if row is None else row
-    runs = [other.run_ids for other in (row, residual) if other is not None]
-    fewer = row is not None and bool(row.real_gyros < claim.real_gyros)
-    other = f" ({gyroscopes(claim)})" * fewer
+    row, residual, constant, default = (
+        material.result(claim, name) for name in (CNN, RESIDUAL_NETWORK, CONSTANT, DEFAULT)
+    )
+    published = _published(claim)
+    if not row.empty and row.real_gyros < claim.real_gyros:
+        published += f" ({gyroscopes(claim)})"
+    runs = [ids for ids in (row.get("run_ids"), residual.get("run_ids")) if ids is not None]
     return {
         "Approach": claim.approach,
         "Sensor": claim.sensor,
         "Source": material.source_name,
-        "Split": split(result),
-        "Gyroscopes": gyroscopes(claim if row is None else row),
-        "Published S/A %": f"{claim.time_saving_pct:.0f}/{claim.accuracy_gain_pct:.0f}" + other,
+        "Split": split(row),
+        "Gyroscopes": gyroscopes(claim if row.empty else row),
+        "Published S/A %": published,
         "S %": interval(row, "time_saving_pct"),
         "A %": interval(row, "accuracy_gain_pct"),
         "Paper's way S %": interval(row, "time_saving_pct", FIRST),
         "Paper's way A %": interval(row, "accuracy_gain_pct", FIRST),
         "Residual network S %": interval(residual, "time_saving_pct"),
         "Residual network A %": interval(residual, "accuracy_gain_pct"),
-        "Constant A %": interval(others[CONSTANT], "accuracy_gain_pct"),
-        _BEST_A: interval(others[DEFAULT], "accuracy_gain_pct"),
+        "Constant A %": interval(constant, "accuracy_gain_pct"),
+        _BEST_A: interval(default, "accuracy_gain_pct"),
         "Ceiling S %": interval(row, "ceiling_time_saving_pct"),
         "Ceiling A %": interval(row, "ceiling_accuracy_gain_pct"),
         _ORACLE_A: interval(row, "oracle_accuracy_gain_pct"),
         "Paper's way ceiling A %": interval(row, "ceiling_accuracy_gain_pct", FIRST),
         _WARM_UP: _warm_up(material, claim),
-        "Seeds": result.get("seeds"),
-        "Spread of S over seeds": _spread(result, "time_saving_pct"),
-        "Spread of A over seeds": _spread(result, "accuracy_gain_pct"),
-        "Recordings": result.get("recordings"),
+        "Seeds": row.get("seeds"),
+        "Spread of S over seeds": _spread(row, "time_saving_pct"),
+        "Spread of A over seeds": _spread(row, "accuracy_gain_pct"),
+        "Recordings": row.get("recordings"),
         "Section": claim.section,
-        "Runs": " ".join(_short(ids) for ids in runs) or None,
-        "Note": material.status(claim) if row is None else remark(row),
+        "Runs": _short(" ".join(runs)) or None,
+        "Note": material.status(claim) if row.empty else remark(row),
     }
+
+
+def _published(claim: PublishedResult) -> str:
+    return f"{claim.time_saving_pct:.0f}/{claim.accuracy_gain_pct:.0f}"
 
 
 def _warm_up(material: Material, claim: PublishedResult) -> str:
@@ -170,9 +173,9 @@ def _warm_up(material: Material, claim: PublishedResult) -> str:
     return from_to(amplitudes_mdps) if amplitudes_mdps else "–"
 
 
-def _spread(row: Any, base: str) -> str:
+def _spread(row: pd.Series, base: str) -> str:
     spread = row.get(f"{base}_seed_sd")
-    return "–" if spread is None or pd.isna(spread) else f"{spread:.1f}"
+    return "–" if pd.isna(spread) else f"{spread:.1f}"
 
 
 def _short(run_ids: str) -> str:
@@ -185,7 +188,7 @@ def _short(run_ids: str) -> str:
 
 def results_table(material: Material, study: str) -> Exhibit:
     """All results of a study in mdps and percent, which are also logged."""
-    rows = material.of(study)
+    rows = where(material.results, study=study)
     # the same runs, where an estimator uses the same part of several training sets
     copies = rows.duplicated(["sensor", "estimator", "window_s", "run_ids"]) & rows.run_ids.notna()
     rows = rows[~copies]
@@ -210,8 +213,8 @@ def results_table(material: Material, study: str) -> Exhibit:
 
 
 def _scaled(rows: pd.DataFrame, name: str, digits: int, unit: float = 1.0) -> pd.Series:
-    values = rows[name] if name in rows else pd.Series(np.nan, rows.index)
-    return (values.astype(float) / unit).round(digits) + 0.0  # no "-0"
+    values = rows.get(name, pd.Series(np.nan, rows.index)).astype(float)
+    return (values / unit).round(digits) + 0.0  # no "-0"
 
 
 def comparison(material: Material, study: str) -> Exhibit | None:
@@ -221,17 +224,14 @@ def comparison(material: Material, study: str) -> Exhibit | None:
     negative one favours the estimator of the row. Against the samples outside the window, truth
     (b), and the drawn bias, truth (c), they are differences of mean squares.
     """
-    results = material.finished_of(study).copy()
+    results = where(material.finished, study=study).copy()
     if results.empty:
         return None
     results["rank"] = results.estimator.map({name: i for i, name in enumerate(ESTIMATORS)})
-    groups = results.sort_values(["sensor", "window_s", "rank"]).groupby(
-        ["sensor", "window_s"], sort=False
-    )
-    rows = [
+    groups = results.sort_values("rank", kind="stable").groupby(["sensor", "window_s"])
+    table = pd.DataFrame(
         _comparison_row(material, row, group) for _, group in groups for _, row in group.iterrows()
-    ]
-    table = pd.DataFrame(rows).round({"Within ±1σ %": 1, "Within ±2σ %": 1})
+    ).round({"Within ±1σ %": 1, "Within ±2σ %": 1})
     return Exhibit(f"{study}_comparison", f"{study}: estimators compared", "", table, ())
 
 
@@ -255,7 +255,7 @@ def _comparison_row(material: Material, row: pd.Series, group: pd.DataFrame) -> 
             for name in (MEAN, DEFAULT)
         },
         "Ceiling mdps": round(row.ceiling_rmse_dps / MDPS, 3),
-        "Oracle mdps": round(ends(row, "oracle_rmse_dps", ALL)[0] / MDPS, 3),
+        "Oracle mdps": round(ends(row, "oracle_rmse_dps")[0] / MDPS, 3),
         "Within ±1σ %": row.coverage_1sigma_pct,
         "Within ±2σ %": row.coverage_2sigma_pct,
         "Recordings": group.recordings.max(),
@@ -269,27 +269,24 @@ def _difference(row: pd.Series, name: str, truth: str = PAPER) -> str:
     key, unit = f"less_{name}_dps", MDPS
     if truth != PAPER:
         key, unit = f"less_{name}_dps2_{truth}", MDPS**2
-    if name == row.estimator:
-        return "–"
-    return bracketed((end / unit for end in ends(row, key)), "{:+.3f}".format)
+    return "–" if name == row.estimator else bracketed(ends(row, key) / unit, "{:+.3f}".format)
 
 
 def ratios(material: Material, study: str, sensor: str) -> Exhibit | None:
     """Errors of a sensor's estimators relative to the running mean, by window length."""
-    rows = material.finished_of(study, sensor=sensor)
+    rows = where(material.finished, study=study, sensor=sensor)
     if rows.empty:
         return None
     table: dict[str, dict[str, str]] = {}
     for window_s, group in rows.sort_values("window_s").groupby("window_s"):
-        means = group[group.estimator == MEAN]
-        mean = means.iloc[0]
-        shown = {"running mean, RMSE in mdps": f"{mean.test_rmse_dps / MDPS:.3f}"}
+        mean = where(group, estimator=MEAN).iloc[0]
+        texts = {"running mean, RMSE in mdps": f"{mean.test_rmse_dps / MDPS:.3f}"}
         for _, row in group[group.estimator != MEAN].iterrows():
-            shown[in_full(row, rows)] = _ratio(row, "accuracy_gain_pct")
-        shown["ceiling"] = _ratio(mean, "ceiling_accuracy_gain_pct")
+            texts[in_full(row, rows)] = _ratio(row, "accuracy_gain_pct")
+        texts["ceiling"] = _ratio(mean, "ceiling_accuracy_gain_pct")
         if pd.notna(mean.get("oracle_accuracy_gain_pct")):
-            shown[_ORACLE] = _ratio(mean, "oracle_accuracy_gain_pct")
-        table[f"{float(str(window_s)):g} s"] = shown
+            texts[_ORACLE] = _ratio(mean, "oracle_accuracy_gain_pct")
+        table[f"{float(str(window_s)):g} s"] = texts
     errors = pd.DataFrame(table)
     last = [name for name in ("ceiling", _ORACLE) if name in errors.index]
     errors = errors.reindex([*errors.index.drop(last), *last]).fillna("–")
@@ -297,7 +294,7 @@ def ratios(material: Material, study: str, sensor: str) -> Exhibit | None:
     columns = [*errors.columns]
     errors.insert(1, "Source", material.source_name)
     errors = errors.assign(Split=split(rows.iloc[0]))
-    priors = dict.fromkeys(rows[rows.uses_prior.astype(bool)].estimator.map(label))
+    priors = rows[rows.uses_prior.astype(bool)].estimator.map(label).unique()
     unseen = " No estimator has seen the device that it is tested on; intervals are over devices."
     caption = (
         "RMSE over all windows against the mean of the recording, relative to that of the running "
@@ -319,7 +316,7 @@ def in_full(row: pd.Series, rows: pd.DataFrame) -> str:
 
 def _ratio(row: pd.Series, gain: str) -> str:
     """The error relative to the running mean, 1 - A, with its interval."""
-    value, hi, lo = (1 - np.array(ends(row, gain)) / 100).tolist()
+    value, hi, lo = 1 - ends(row, gain) / 100
     return bracketed((value, lo, hi), "{:.3f}".format)
 
 
@@ -330,21 +327,20 @@ def start_up(material: Material) -> Exhibit | None:
     """Seconds at rest until the bias is known to 1 and 0.5 mdps."""
     if material.sensors.empty:
         return None
-    rows = [
-        {
-            "Sensor": material.sensor_name(row.sensor),
-            "Turn-on spread mdps": _plain(row.spread_dps / MDPS),
-            **{
-                f"{words}, σ = {sigma:g} mdps": _seconds(row[f"{method}_s_at_{sigma:g}"])
-                for sigma in SIGMAS_MDPS
-                for method, words in (
-                    ("mean", "mean"), ("history", "with history"), ("ceiling", "ceiling"),
-                )
-            },
-            "Earlier calibrations": row.history_recordings,
-        }
-        for _, row in material.sensors.iterrows()
-    ]  # fmt: skip
+    rows = material.sensors
+    methods = {"mean": "mean", "history": "with history", "ceiling": "ceiling"}
+    table = pd.DataFrame({
+        "Sensor": rows.sensor.map(material.sensor_name),
+        "Turn-on spread mdps": (rows.spread_dps / MDPS)
+        .map("{:.2g}".format, na_action="ignore")
+        .fillna("–"),
+        **{
+            f"{words}, σ = {sigma:g} mdps": rows[f"{method}_s_at_{sigma:g}"].map(_seconds)
+            for sigma in SIGMAS_MDPS
+            for method, words in methods.items()
+        },
+        "Earlier calibrations": rows.history_recordings,
+    })  # fmt: skip
     caption = (
         "Seconds at rest after a power-on until the standard deviation of the bias, pooled over "
         "the axes of IMU 1, is 1 or 0.5 mdps. *Mean*: the average of the samples alone. *With "
@@ -353,7 +349,7 @@ def start_up(material: Material) -> Exhibit | None:
         "earlier calibrations alone suffice. Computed from N, B and K of the recordings, for a "
         "device without warm-up, in the same orientation, with independent power-ons."
     )
-    return Exhibit("start_up", "Seconds of rest that a start-up takes", caption, pd.DataFrame(rows))
+    return Exhibit("start_up", "Seconds of rest that a start-up takes", caption, table)
 
 
 def _seconds(value: float) -> str:
@@ -364,69 +360,65 @@ def _seconds(value: float) -> str:
     return f"{value:.0f} s" if value >= 10 or value == 0 else f"{value:.1f} s"  # noqa: PLR2004
 
 
-def _plain(value: float) -> str:
-    return "–" if np.isnan(value) else f"{value:.2g}"
-
-
 def sensor_specifications(material: Material) -> Exhibit | None:
     """Datasheet values beside measured ones (section IV-A, table of specifications)."""
     if material.sensors.empty:
         return None
-    sensors = dict.fromkeys([*material.sheets, *material.described])
+    fields = [*PublishedSpecification.model_fields]
+    sheets = pd.DataFrame(map(dict, material.published.specifications), columns=fields)
+    sheets = sheets.set_index("sensor")
+    rows = sheets.add_prefix("sheet_").join(material.sensors.set_index("sensor"), how="outer")
+    rows = rows.reindex([*dict.fromkeys([*sheets.index, *material.sensors.sensor])])
+    density = rows.sheet_noise_density_mdps_rthz.astype(float)
+    # a one-sided density ND: N = ND / sqrt(2), sigma = ND sqrt(rate / 2)
+    table = pd.DataFrame({
+        "Sensor": rows.index.to_series().map(material.sensor_name),
+        "Source": material.source_name,
+        "Gyroscopes": len(AXES) * rows.imus,
+        "Datasheet rate Hz": rows.sheet_rate_hz.map(_rates, na_action="ignore"),
+        "Rate Hz": rows.rate_hz.round(1),
+        "Datasheet noise density mdps/√Hz": density,
+        "Datasheet N mdps√s": density / np.sqrt(2),
+        "N mdps√s": _rms(rows, "white_dps_rts", 1 / MDPS),
+        "Datasheet σ mdps": density * np.sqrt(rows.rate_hz / 2),
+        "σ mdps": _rms(rows, "sample_sigma_dps", 1 / MDPS),
+        "Datasheet B deg/h": rows.sheet_bias_stability_dph,
+        "B deg/h": _rms(rows, "instability_dps", _HOUR_S),
+        "Section": rows.sheet_section,
+    })  # fmt: skip
     caption = (
         "Datasheet values beside those measured in the recordings: the root mean square over "
         "gyroscopes, with the smallest and the largest value. N is the white noise: the mean of t "
         "seconds scatters by N/√t. B is the bias instability. Paper, section IV-A."
     )
-    table = pd.DataFrame(_specifications(material, sensor) for sensor in sensors)
     hidden = ("Source", "Datasheet noise density mdps/√Hz", "Section")
-    shown = [name for name in table.columns.astype(str) if name not in hidden]
+    columns = [name for name in table.columns.astype(str) if name not in hidden]
     name, title = "sensor_specifications", "Sensors: datasheets and recordings"
-    return Exhibit(name, title, caption, table, shown)
+    return Exhibit(name, title, caption, table, columns)
 
 
-def _specifications(material: Material, sensor: str) -> dict[str, Any]:
-    sheet, row = material.sheets.get(sensor), material.described.get(sensor)
-    density = sheet.noise_density_mdps_rthz if sheet else None
-    # a one-sided density ND: N = ND / sqrt(2), sigma = ND sqrt(rate / 2)
-    sigma = None if density is None or row is None else density * np.sqrt(row.rate_hz / 2)
-    return {
-        "Sensor": material.sensor_name(sensor),
-        "Source": material.source_name,
-        "Gyroscopes": None if row is None else len(AXES) * int(row.imus),
-        "Datasheet rate Hz": "–".join(f"{rate:g}" for rate in dict.fromkeys(sheet.rate_hz))
-        if sheet
-        else None,
-        "Rate Hz": None if row is None else round(row.rate_hz, 1),
-        "Datasheet noise density mdps/√Hz": density,
-        "Datasheet N mdps√s": None if density is None else density / np.sqrt(2),
-        "N mdps√s": _rms(row, "white_dps_rts", 1 / MDPS),
-        "Datasheet σ mdps": sigma,
-        "σ mdps": _rms(row, "sample_sigma_dps", 1 / MDPS),
-        "Datasheet B deg/h": sheet.bias_stability_dph if sheet else None,
-        "B deg/h": _rms(row, "instability_dps", _HOUR_S),
-        "Section": sheet.section if sheet else None,
-    }
+def _rates(rates_hz: tuple[float, float]) -> str:
+    return "–".join(f"{rate:g}" for rate in dict.fromkeys(rates_hz))
 
 
-def _rms(row: pd.Series | None, name: str, factor: float) -> str:
+def _rms(rows: pd.DataFrame, name: str, factor: float) -> pd.Series:
     """Root mean square over gyroscopes, with the smallest and the largest."""
-    if row is None:
-        return "not read"
-    value, low, high = (row[key] * factor for key in (name, f"{name}_min", f"{name}_max"))
-    return f"{value:.3g} [{low:.3g}, {high:.3g}]"
+    values = rows[[name, f"{name}_min", f"{name}_max"]] * factor
+    texts = values.apply(lambda row: "{:.3g} [{:.3g}, {:.3g}]".format(*row), axis=1)
+    return texts.where(rows.imus.notna(), "not read")
 
 
 def dataset_hours(material: Material) -> Exhibit | None:
     """Hours of all datasets, from counts of samples (section IV-A, table of hours)."""
     if not {row.sensor for row in material.published.hours} & set(material.described):
         return None
-    table = pd.DataFrame(_hours(material, row) for row in material.published.hours)
-    virtual = np.array([row.virtual for row in material.published.hours])
+    hours = material.published.hours
+    table = pd.DataFrame(_hours(material, claim) for claim in hours)
+    virtual = np.array([claim.virtual for claim in hours])
     sums = [
-        _sum("real", table[~virtual], ""),
-        _sum("virtual", table[virtual], ""),
-        _sum("all", table, "the paper's total includes the virtual recordings"),
+        _sum("real", table[~virtual]),
+        _sum("virtual", table[virtual]),
+        _sum("all", table) | {"Note": "the paper's total includes the virtual recordings"},
     ]
     table = pd.concat([table, pd.DataFrame(sums)], ignore_index=True)
     table = table.drop(columns=["_lo", "_hi"])
@@ -434,13 +426,14 @@ def dataset_hours(material: Material) -> Exhibit | None:
         "Training recordings count for every gyroscope, test recordings for the three of IMU 1. "
         "In a k-fold each recording does both, and counts once in the total. Paper, section IV-A."
     )
-    shown = ["Dataset", "Sensor", "Gyroscopes", "Training recordings", "Test recordings", "T s"]
-    shown += ["Total h", "Paper's total h", "Note"]
-    return Exhibit("dataset_hours", "Hours of the datasets", caption, table, shown)
+    columns = ["Dataset", "Sensor", "Gyroscopes", "Training recordings", "Test recordings", "T s"]
+    columns += ["Total h", "Paper's total h", "Note"]
+    return Exhibit("dataset_hours", "Hours of the datasets", caption, table, columns)
 
 
 def _hours(material: Material, claim: PublishedHours) -> dict[str, Any]:
-    row = material.described.get(claim.sensor)
+    row = material.described.get(claim.sensor, pd.Series())
+    prefix = "virtual_" if claim.virtual else ""
     head = {"Dataset": str(claim.dataset), "Sensor": claim.sensor}
     tail = {
         "Paper's train h": claim.train_h,
@@ -449,24 +442,22 @@ def _hours(material: Material, claim: PublishedHours) -> dict[str, Any]:
         "Section": claim.section,
         "Note": claim.note or None,
     }
-    if row is None or (claim.virtual and pd.isna(row.get("virtual_samples"))):
+    if pd.isna(row.get(f"{prefix}all_samples")):
         return head | tail | {"Note": "not made"}
-    kinds = ("virtual", None, "virtual") if claim.virtual else ("train", "test", "all")
-    samples = [0 if kind is None else row[f"{kind}_samples"] for kind in kinds]
-    counts = [0 if kind is None else int(row[f"{kind}_recordings"]) for kind in kinds]
-    hours = [round(total / row.rate_hz / _HOUR_S, 2) for total in samples]
-    fast, slow = (
-        samples[2] / rate / _HOUR_S for rate in reversed(material.sheets[claim.sensor].rate_hz)
+    train, test, total = (
+        row[f"{prefix}{part}_samples"] / _HOUR_S for part in ("train", "test", "all")
     )
-    prefix = "virtual_" if claim.virtual else ""
-    return {
-        **head,
-        "Source": "virtual, from " * claim.virtual + material.source_name,
+    slowest_hz, fastest_hz = material.sheets[claim.sensor].rate_hz
+    fast, slow = total / fastest_hz, total / slowest_hz
+    return head | {
+        "Source": f"{'virtual, from ' if claim.virtual else ''}{material.source_name}",
         "Gyroscopes": int(row[f"{prefix}gyroscopes"]),
-        "Training recordings": counts[0],
-        "Test recordings": counts[1],
+        "Training recordings": int(row[f"{prefix}train_recordings"]),
+        "Test recordings": int(row[f"{prefix}test_recordings"]),
         "T s": round(row[f"{prefix}median_samples"] / row.rate_hz, 2),
-        **dict(zip(("Train h", "Test h", "Total h"), hours, strict=True)),
+        "Train h": round(train / row.rate_hz, 2),
+        "Test h": round(test / row.rate_hz, 2),
+        "Total h": round(total / row.rate_hz, 2),
         _AT_DATASHEET: from_to((fast, slow), "{:.2f}".format),
         **tail,
         "_lo": fast,
@@ -474,14 +465,11 @@ def _hours(material: Material, claim: PublishedHours) -> dict[str, Any]:
     }
 
 
-def _sum(name: str, rows: pd.DataFrame, note: str) -> dict[str, Any]:
-    total: dict[str, Any] = {
-        column: round(rows[column].sum(), 2)
-        for column in rows.select_dtypes("number").columns.astype(str)
-        if column != "T s"
-    }
-    total[_AT_DATASHEET] = from_to((total["_lo"], total["_hi"]), "{:.2f}".format)
-    return {"Dataset": name, "Note": note or None} | total
+def _sum(dataset: str, rows: pd.DataFrame) -> dict[str, Any]:
+    numbers = rows.select_dtypes("number").drop(columns="T s")
+    total = {str(name): round(values.sum(), 2) for name, values in numbers.items()}
+    hours = from_to((total["_lo"], total["_hi"]), "{:.2f}".format)
+    return {"Dataset": dataset, **total, _AT_DATASHEET: hours}
 
 
 def recording_quality(material: Material) -> Exhibit | None:
@@ -514,14 +502,14 @@ def leakage_results(material: Material) -> Exhibit | None:
         "suffices to pass the ceiling, not that anybody had one. S and A are over the test windows "
         "of each way of training, in percent, with 95 % intervals of A over recordings."
     )
-    shown = ["Sensor", "Window stride s", *(f"{name} S/A %" for name in LEAK_VARIANTS.values())]
-    shown += ["Constant A %", "Ceiling S/A %", "Published S/A %"]
+    columns = ["Sensor", "Window stride s", *(f"{name} S/A %" for name in LEAK_VARIANTS.values())]
+    columns += ["Constant A %", "Ceiling S/A %", "Published S/A %"]
     title = "Trained with leaks on purpose: S and A"
-    return Exhibit("leakage_results", title, caption, table, shown)
+    return Exhibit("leakage_results", title, caption, table, columns)
 
 
 def _leak_row(material: Material, ways: pd.DataFrame) -> dict[str, Any]:
-    first = ways.iloc[0]
+    first, texts = ways.iloc[0], ways.apply(_saving_and_gain, axis=1, kind="")
     claim = published_claim(material, first)
     shuffled = ways[ways.index.get_level_values("estimator") == CNN_SHUFFLED]
     p_values = ways.beats_oracle_p.dropna()
@@ -532,15 +520,10 @@ def _leak_row(material: Material, ways: pd.DataFrame) -> dict[str, Any]:
         "Window stride s": first.window_stride_s,
         "Windows": first.windows,
         "Recordings": first.recordings,
-        **{
-            f"{name} S/A %": _saving_and_gain(ways.loc[[way]].iloc[0], "")
-            if way in ways.index
-            else None
-            for way, name in LEAK_VARIANTS.items()
-        },
+        **{f"{name} S/A %": texts.get(way) for way, name in LEAK_VARIANTS.items()},
         "Constant A %": percent(first.constant_accuracy_gain_pct),
         "Ceiling S/A %": _saving_and_gain(first, "ceiling_"),
-        "Published S/A %": claim and f"{claim.time_saving_pct:.0f}/{claim.accuracy_gain_pct:.0f}",
+        "Published S/A %": claim and _published(claim),
         "Shuffled beats the constant": "yes"
         if (shuffled.over_constant_dps2_hi < 0).any()
         else "no",
