@@ -347,7 +347,7 @@ class Calibrator:
     def _end_stretch(self, alarm: Alarm) -> None:
         """Note why a stretch ended, and start the next one."""
         name = self.setup.device_type.type
-        cause = unit_reason(alarm.value, name) if alarm.code == NOISE else None
+        cause = unit_reason(alarm.value, name, alarm.sigma) if alarm.code == NOISE else None
         words: dict[str, Any] = {"name": name, "factor": alarm.value, "rate": alarm.value / MDPS}
         cause = cause or reason(alarm.code, self.time_s, sigma=alarm.sigma / MDPS, **words)
         self.ended = {**self.ended, alarm.code: cause}
