@@ -104,6 +104,9 @@ class Calibrator:
     ) -> None:  # fmt: skip
         if not (np.isfinite(rate_hz) and rate_hz >= 2):  # noqa: PLR2004
             raise InputError(f"rate_hz: expected at least 2 samples a second, got {rate_hz}")
+        if target_dps is not None and not 0 < target_dps < np.inf:
+            got = f"{target_dps / MDPS:g}"
+            raise InputError(f"target: expected more than 0 mdps, such as 0.5, got {got}")
         target_dps, now = np.inf if target_dps is None else target_dps, now or Circumstances()
         self.setup = Setup(device_type, float(rate_hz), tuple(history), now, target_dps)
         self.counts, self.ended = Counter[str](), dict[str, Reason]()
