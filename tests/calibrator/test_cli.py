@@ -161,7 +161,13 @@ def test_attempts_are_counted_until_one_does_and_the_highest_code_counts(csv, tm
 
 def test_notes_and_withdrawals_are_appended(csv, tmp_path):
     run("log", csv(rates(20)), "--device", "B17", "--type", "memsense")
-    assert run("devices", "note", "B17", "fell").exit_code == 0
+    assert run("devices", "note", "B17", "in a new case").exit_code == 0
+    before, _ = said("log", csv(rates(2)), "--device", "B17", "--no-store")
+    assert run("devices", "note", "B17", "fell", "--knocked").exit_code == 0
+    knocked, _ = said("log", csv(rates(2)), "--device", "B17", "--no-store")
+    told = ["knocked" in {reason["code"] for reason in r["reasons"]} for r in (before, knocked)]
+    assert told == [False, True]
+    assert "note of a knock: fell" in run("devices", "show", "B17").stdout
     assert run("devices", "forget", "B17", "still.csv").exit_code == 0
     assert "does not count" in run("devices", "show", "B17").stdout
     assert run("devices", "save", "B17", tmp_path / "b17.json").exit_code == 0

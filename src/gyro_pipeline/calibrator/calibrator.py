@@ -165,6 +165,7 @@ class Calibrator:
             settings.get("latitude") if latitude_deg is None else latitude_deg,
             known_still,
             stored.attempt(without) if stored else 1,
+            stored.knocks() if stored else 0,
         )
         resolved = read_type(device_type or settings.get("type"), folder)
         history = stored.history(without) if stored else ()
@@ -241,6 +242,7 @@ class Calibrator:
             noise_freedom=freedom,
             same_heading=now.same_heading,
             known_still=now.known_still,
+            knocks=now.knocks,
             reached=state.done,
             attempt=now.attempt,
             reasons=tuple(reason.sentence for reason in state.reasons),

@@ -362,10 +362,12 @@ def show(name: str, registry: Path, as_json: bool) -> None:
 @devices.command()
 @argument("name")
 @argument("text")
+@option("--knocked", is_flag=True, help="it was knocked or dropped: what came before counts less")
 @_REGISTRY
-def note(name: str, text: str, registry: Path) -> None:
+def note(name: str, text: str, knocked: bool, registry: Path) -> None:
     """Append a note to the history of a device."""
-    _existing_device(registry, name).append({"event": "note", "time": time.time(), "text": text})
+    line = {"event": "note", "time": time.time(), "text": text, "knocked": knocked}
+    _existing_device(registry, name).append(line)
 
 
 @devices.command("set", context_settings={"ignore_unknown_options": True})  # -0.1 is a number
@@ -381,7 +383,7 @@ def set_bias(
     device, variance = Device(registry, name), (sigma * MDPS) ** 2
     device.create(device_type)
     typed: Any = {"time": time.time(), "hash": SET, "source": SET, "event": SET}
-    device.append(Calibration(bias_dps, (variance,) * 3, **typed))
+    device.append(Calibration(bias_dps, (variance,) * 3, knocks=device.knocks(), **typed))
 
 
 @devices.command()

@@ -143,7 +143,7 @@ def device_table(device: Device) -> Iterator[str]:
     stored, counting = device.calibrations(), device.history()
     for line in device.lines():
         if line["event"] == "note":
-            yield f"note: {line['text']}"
+            yield f"note{' of a knock' * bool(line.get('knocked'))}: {line['text']}"
         elif line["event"] != "forget":
             head = f"{line['source'][:23]:<24}{line['rest']:>8}{line['seconds']:8.1f}"
             mean = "".join(f"{m:+12.6f}" for m in line["mean_dps"] or [])
