@@ -204,10 +204,8 @@ def _axis_prior(
     type_slope = device_type.dps("temperature_slope_mdps_per_c")[axis]
     spread = device_type.dps("temperature_spread_mdps_per_c")[axis] ** 2
     tau, walk, logs = _grid(device_type, axis)
-    days, knocks = days - days[0], np.array([*(c.knocks for c in past), now.knocks])
-    knocks = (knocks - knocks.min()) * device_type.dps("conflict_mdps")[axis] ** 2
-    of_level = walk[:, None, None] ** 2 * np.minimum(days[:, None], days)
-    of_level = of_level + np.minimum(knocks[:, None], knocks)
+    knocks = np.array([*(c.knocks for c in past), now.knocks])
+    of_level = _level_covariance(days, walk, knocks, device_type.dps("conflict_mdps")[axis])
     moving = of_level + spread * np.outer(warmth, warmth)
     variances = np.array([c.variance[axis] for c in past])
     if not unknown.all():
@@ -228,6 +226,13 @@ def _axis_prior(
     fitted = dict(zip(("tau", "walk"), _moments(weights, grid, np.zeros_like(grid)), strict=True))
     fitted |= {"level": level, "slope": (float(type_slope + extra), slope_sigma)}
     return bias + type_slope * warmth[-1], sigma**2, float(weights @ tau**2), fitted
+
+
+def _level_covariance(days: Array, walk: Array, knocks: Array, step: float) -> Array:
+    """Covariance of the level at each of n times, (g, n, n), which walks and moves at knocks."""
+    days, steps = days - days[0], (knocks - knocks.min()) * step**2
+    walked = walk[:, None, None] ** 2 * np.minimum(days[:, None], days)
+    return np.asarray(walked + np.minimum(steps[:, None], steps))
 
 
 def _at_present_attitude(past: Sequence[Calibration], axis: int, now: Circumstances) -> Array:
