@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gyro_pipeline.calibrator import Calibration, Calibrator, Circumstances
-from gyro_pipeline.calibrator.device_types import type_of
+from gyro_pipeline.calibrator.device_types import read_type, type_of
 
 RATE = 100.0
 BIAS = np.array([0.412, -0.104, 0.087])  # three different axes
@@ -164,6 +164,13 @@ def test_what_is_left_of_a_recording_with_a_motion(motion, code, least, most):
 def test_motion_throughout_is_not_at_rest():
     for kind in (KIND, UNKNOWN):
         assert finished(still(20) + SWAY, kind=kind).rest == "moving"
+
+
+@pytest.mark.parametrize("samples_a_radian", [10, 300])
+def test_motion_is_not_taken_for_a_wrong_unit(samples_a_radian):
+    sway = 20 * np.sin(np.arange(2000) / samples_a_radian)[:, None]
+    state = finished(still(20) + sway, kind=read_type("memsense"))
+    assert (state.rest, "noise" in codes(state), "unit" in codes(state)) == ("moving", True, False)
 
 
 def test_a_slow_rotation_is_seen_by_the_accelerometer_alone():

@@ -2,6 +2,9 @@
 
 import json
 import os
+import termios
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -86,6 +89,8 @@ def test_six_logs_make_a_history_that_the_next_one_uses_but_not_the_same_one(csv
         (["--type", "nope"], 2, "expected consumer, dot, memsense"),
         (["--units", "m"], 2, "--units: "),
         (["--columns", "a,b,c"], 2, "expected one column 'a', got 0"),
+        (["--target", "0"], 2, "target: expected more than 0 mdps"),
+        (["--target", "nan"], 2, "got nan"),
     ],
 )
 def test_exit_codes_of_a_log(csv, arguments, code, words):
@@ -100,6 +105,14 @@ def test_what_is_lacking_is_named_as_an_option(tmp_path):
     result = run("log", tmp_path / "still.npy", "--units", "deg/s")
     assert (result.exit_code, "give --rate" in result.stderr) == (2, True)
     assert run("log", tmp_path / "still.npy", "--units", "deg/s", "--rate", RATE).exit_code == 0
+
+
+def test_a_file_that_is_refused_does_not_stop_the_others(csv, tmp_path):
+    np.save(tmp_path / "no_rate.npy", rates(20))
+    options = ("--units", "deg/s", "--type", "memsense", "--target", "0.1")
+    result = run("log", tmp_path / "no_rate.npy", csv(rates(20)), *options)
+    assert (result.exit_code, "give --rate" in result.stderr) == (3, True)
+    assert "at rest for 20.0 of 20.0 s" in result.stdout
 
 
 def test_a_registry_that_cannot_be_written_is_said_before_measuring(csv, tmp_path):
@@ -148,7 +161,13 @@ def test_attempts_are_counted_until_one_does_and_the_highest_code_counts(csv, tm
 
 def test_notes_and_withdrawals_are_appended(csv, tmp_path):
     run("log", csv(rates(20)), "--device", "B17", "--type", "memsense")
-    assert run("devices", "note", "B17", "fell").exit_code == 0
+    assert run("devices", "note", "B17", "in a new case").exit_code == 0
+    before, _ = said("log", csv(rates(2)), "--device", "B17", "--no-store")
+    assert run("devices", "note", "B17", "fell", "--knocked").exit_code == 0
+    knocked, _ = said("log", csv(rates(2)), "--device", "B17", "--no-store")
+    told = ["knocked" in {reason["code"] for reason in r["reasons"]} for r in (before, knocked)]
+    assert told == [False, True]
+    assert "note of a knock: fell" in run("devices", "show", "B17").stdout
     assert run("devices", "forget", "B17", "still.csv").exit_code == 0
     assert "does not count" in run("devices", "show", "B17").stdout
     assert run("devices", "save", "B17", tmp_path / "b17.json").exit_code == 0
@@ -201,8 +220,55 @@ def test_a_sensor_that_stops_sending_or_sends_no_times_is_said():
     assert "give --rate" in streamed(send=rows).stderr
 
 
+def test_a_stream_that_begins_within_a_line_is_refused_with_the_line():
+    done = streamed(send='{"t (s)": 0.0, "gyro_x (d\n' + '{"t (s)": 0.01}\n' * 30)
+    assert (done.exit_code, """got '{"t (s)": 0.0, "gyro_x (d'""" in done.stderr) == (2, True)
+
+
 def test_a_picture(csv, tmp_path):
     pytest.importorskip("matplotlib")
     picture = tmp_path / "a.png"
     assert run("log", csv(rates(10)), "--type", "memsense", "--plot", picture).exit_code == 0
     assert picture.stat().st_size > 10_000
+
+
+def test_a_serial_port():
+    pytest.importorskip("serial")
+    master, slave = os.openpty()
+
+    def send():
+        while termios.tcgetattr(master)[3] & termios.ICANON:  # until the port is open
+            time.sleep(0.01)
+        time.sleep(0.2)  # opening it discards what came before
+        for line in text(rates(5)).splitlines(keepends=True):
+            os.write(master, line.encode())
+
+    sender = threading.Thread(target=send, daemon=True)
+    sender.start()
+    port = ("--port", os.ttyname(slave), "--timeout", "1")
+    answer, done = said("stream", *port, "--type", "memsense")
+    sender.join()
+    assert (done.exit_code, answer["seconds_at_rest"], "nothing came" in done.stderr) == (
+        0,
+        5,
+        True,
+    )
+    np.testing.assert_allclose(answer["bias_dps"], rates(5).mean(axis=0), atol=1e-6)
+
+
+def test_a_picture_that_cannot_be_drawn_is_refused_or_loses_no_calibration(
+    csv, tmp_path, monkeypatch
+):
+    figure = pytest.importorskip("matplotlib.figure").Figure
+    about = ("log", csv(rates(10)), "--type", "memsense", "--device", "B17", "--plot")
+    for name, words in (("a.xyz", ".png"), ("nowhere/a.png", "can be written")):
+        result = run(*about, tmp_path / name)
+        assert (result.exit_code, result.stdout, words in result.stderr) == (2, "", True)
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(figure, "savefig", full)
+    result = run(*about, tmp_path / "a.png")
+    assert (result.exit_code, "No space left" in result.stderr) == (2, True)
+    assert run("devices", "list").stdout.split()[:3] == ["B17", "memsense", "1"]

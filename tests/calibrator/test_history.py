@@ -76,6 +76,36 @@ def test_temperature_follows_a_slope_and_widens_beyond_the_range():
     assert {reason.code for reason in beyond.reasons} == {"temperature"}
 
 
+@pytest.mark.parametrize(("celsius", "degrees"), [(20.0, 0), (23.0, 3), (None, 5)])
+def test_at_one_past_temperature_the_slope_is_that_of_the_type_and_counts_once(celsius, degrees):
+    kinds = kind(turn_on_mdps=0.01, temperature_spread_mdps_per_c=10.0)
+    made = past(0.0, 0.0, variance=1e-12, temperature_c=(20.0,) * 3)
+    made += past(9.0, variance=1e-12)  # at an unknown temperature, so that it counts little
+    prior = prior_of(made, kinds, Circumstances(temperature_c=celsius, same_heading=True))
+    np.testing.assert_allclose(prior.mean, 0, atol=1e-6)
+    np.testing.assert_allclose(np.sqrt(prior.narrow), 10e-3 * degrees, rtol=1e-3, atol=1e-4)
+
+
+def test_an_unknown_temperature_costs_the_known_slope_as_well():
+    kinds = kind(turn_on_mdps=0.01, temperature_spread_mdps_per_c=10.0)
+    made = [
+        past(20.0 * t, variance=1e-12, temperature_c=(20.0 + t,) * 3)[0] for t in range(0, 9, 2)
+    ]
+    prior = prior_of(made, kinds, DECLARED)
+    np.testing.assert_allclose(np.sqrt(prior.narrow), 8e-3 * np.hypot(10, 20), rtol=1e-2)
+
+
+def test_a_knock_costs_the_spread_of_a_wrong_history_until_the_next_calibration():
+    kinds, now = kind(turn_on_mdps=0.01), Circumstances(same_heading=True, knocks=1)
+    before = past(0.0, 0.0, variance=1e-12)
+    prior = prior_of(before, kinds, now)
+    np.testing.assert_allclose(np.sqrt(prior.narrow), 5e-3, rtol=1e-3)
+    assert {reason.code for reason in prior.reasons} == {"knocked"}
+    prior = prior_of(before + past(7.0, variance=1e-12, knocks=1), kinds, now)
+    np.testing.assert_allclose(prior.mean, 7e-3, rtol=1e-3)
+    assert (np.all(prior.narrow < 1e-9), prior.reasons) == (True, ())
+
+
 @pytest.mark.parametrize(
     ("up", "axes"),
     [(None, (1, 1, 1)), ((0, 0, 1), (1, 1, 0)), ((0.6, 0, 0.8), (0.64, 1, 0.36))],

@@ -104,6 +104,9 @@ class Calibrator:
     ) -> None:  # fmt: skip
         if not (np.isfinite(rate_hz) and rate_hz >= 2):  # noqa: PLR2004
             raise InputError(f"rate_hz: expected at least 2 samples a second, got {rate_hz}")
+        if target_dps is not None and not 0 < target_dps < np.inf:
+            got = f"{target_dps / MDPS:g}"
+            raise InputError(f"target: expected more than 0 mdps, such as 0.5, got {got}")
         target_dps, now = np.inf if target_dps is None else target_dps, now or Circumstances()
         self.setup = Setup(device_type, float(rate_hz), tuple(history), now, target_dps)
         self.counts, self.ended = Counter[str](), dict[str, Reason]()
@@ -162,6 +165,7 @@ class Calibrator:
             settings.get("latitude") if latitude_deg is None else latitude_deg,
             known_still,
             stored.attempt(without) if stored else 1,
+            stored.knocks() if stored else 0,
         )
         resolved = read_type(device_type or settings.get("type"), folder)
         history = stored.history(without) if stored else ()
@@ -238,6 +242,7 @@ class Calibrator:
             noise_freedom=freedom,
             same_heading=now.same_heading,
             known_still=now.known_still,
+            knocks=now.knocks,
             reached=state.done,
             attempt=now.attempt,
             reasons=tuple(reason.sentence for reason in state.reasons),
@@ -347,7 +352,7 @@ class Calibrator:
     def _end_stretch(self, alarm: Alarm) -> None:
         """Note why a stretch ended, and start the next one."""
         name = self.setup.device_type.type
-        cause = unit_reason(alarm.value, name) if alarm.code == NOISE else None
+        cause = unit_reason(alarm.value, name, alarm.sigma) if alarm.code == NOISE else None
         words: dict[str, Any] = {"name": name, "factor": alarm.value, "rate": alarm.value / MDPS}
         cause = cause or reason(alarm.code, self.time_s, sigma=alarm.sigma / MDPS, **words)
         self.ended = {**self.ended, alarm.code: cause}

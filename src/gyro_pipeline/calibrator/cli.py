@@ -131,17 +131,21 @@ def _print(as_json: bool, result: Any, lines: Iterable[str]) -> None:
     click.echo(json.dumps(result, allow_nan=False) if as_json else "\n".join(lines))
 
 
+def _code_of(command: Callable[..., Any], *arguments: Any) -> Any:
+    """The exit code that a command returns, or that of the error it raises, which is shown."""
+    try:
+        return command(*arguments)
+    except (InputError, RegistryError) as error:
+        _remark(_name_options(str(error)), "red")
+        return USAGE if isinstance(error, InputError) else NOT_STORED
+
+
 class Commands(click.Group):
     """Commands that return exit codes, and whose errors are shown as a sentence."""
 
     def invoke(self, ctx: click.Context) -> None:
         """Run a command and exit with its code."""
-        try:
-            code = super().invoke(ctx)
-        except (InputError, RegistryError) as error:
-            _remark(_name_options(str(error)), "red")
-            code = USAGE if isinstance(error, InputError) else NOT_STORED
-        ctx.exit(code or DONE)
+        ctx.exit(_code_of(super().invoke, ctx) or DONE)
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
@@ -153,11 +157,14 @@ def main() -> None:
 def _job(store: bool, **values: Any) -> SimpleNamespace:
     """The options of ``log`` and ``stream``; ``opening`` is for :meth:`.Calibrator.open`.
 
-    The device is created here, so that a registry that cannot be written fails before measuring.
+    Everything that can be refused without samples is refused here, before anything is read.
     """
     reader = _read_reader_options({name: values.pop(name) for name in ReaderOptions.model_fields})
     names = "require_history", "plot", "rate_hz", "as_json"
     job = SimpleNamespace(reader=reader, device=None, **{name: values.pop(name) for name in names})
+    if job.plot:
+        output.check_plot(job.plot)
+    Calibrator.open(rate_hz=100.0, **values)
     if values["device"] is not None and store:
         job.device = Device(values["registry"], values["device"])
         job.device.create(values["device_type"])
@@ -171,7 +178,7 @@ def _job(store: bool, **values: Any) -> SimpleNamespace:
 def log(files: tuple[Path, ...], **values: Any) -> int:
     """Calibrate from log files, one after the other."""
     job = _job(**values)
-    return max(_calibrate(path, job) for path in files)
+    return max(_code_of(_calibrate, path, job) for path in files)
 
 
 def _calibrate(path: Path, job: SimpleNamespace) -> int:
@@ -211,7 +218,7 @@ def _feed(calibrator: Calibrator, recording: Any, chunk_s: float) -> list[State]
 def _report(
     calibrator: Calibrator, job: SimpleNamespace, states: Sequence[State], source: str, name: str
 ) -> int:
-    """Print, plot and store the result; returns the exit code."""
+    """Print, store and plot the result; returns the exit code."""
     state = calibrator.finish()
     code = _exit_code(state, job.require_history)
     if job.as_json or code != UNUSABLE:
@@ -220,10 +227,10 @@ def _report(
     if not job.as_json:
         for sentence in output.notes(state):
             _remark(sentence, "red" if code in {UNUSABLE, NOT_AT_REST} else "yellow")
-    if job.plot:
-        output.plot(job.plot, [*states, state])
     if job.device is not None and code != UNUSABLE:
         _store(calibrator, job, source, name)
+    if job.plot:
+        output.plot(job.plot, [*states, state])
     return code
 
 
@@ -355,10 +362,12 @@ def show(name: str, registry: Path, as_json: bool) -> None:
 @devices.command()
 @argument("name")
 @argument("text")
+@option("--knocked", is_flag=True, help="it was knocked or dropped: what came before counts less")
 @_REGISTRY
-def note(name: str, text: str, registry: Path) -> None:
+def note(name: str, text: str, knocked: bool, registry: Path) -> None:
     """Append a note to the history of a device."""
-    _existing_device(registry, name).append({"event": "note", "time": time.time(), "text": text})
+    line = {"event": "note", "time": time.time(), "text": text, "knocked": knocked}
+    _existing_device(registry, name).append(line)
 
 
 @devices.command("set", context_settings={"ignore_unknown_options": True})  # -0.1 is a number
@@ -374,7 +383,7 @@ def set_bias(
     device, variance = Device(registry, name), (sigma * MDPS) ** 2
     device.create(device_type)
     typed: Any = {"time": time.time(), "hash": SET, "source": SET, "event": SET}
-    device.append(Calibration(bias_dps, (variance,) * 3, **typed))
+    device.append(Calibration(bias_dps, (variance,) * 3, knocks=device.knocks(), **typed))
 
 
 @devices.command()

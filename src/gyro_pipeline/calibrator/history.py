@@ -4,11 +4,11 @@ Each calibration stores its evidence: the mean and the variance of its own data 
 
     evidence_i = level_i + slope (temperature_i - reference) + turn-on_i + Earth's rate_i + noise_i
 
-with a level that walks by a variance of walk^2 a day, a turn-on bias of standard deviation tau and
-noise of the stored variance. The first level is unknown, and the slope has the normal prior of the
-device type. The bias of the next calibration is its conditional mean given the others (kriging),
-integrated over a grid of tau and walk, each point weighted by its restricted likelihood times the
-log-normal prior of the type.
+with a level that walks by a variance of walk^2 a day, and by conflict_mdps^2 at a knock that was
+noted, a turn-on bias of standard deviation tau and noise of the stored variance. The first level is
+unknown, and the slope has the normal prior of the device type. The bias of the next calibration is
+its conditional mean given the others (kriging), integrated over a grid of tau and walk, each point
+weighted by its restricted likelihood times the log-normal prior of the type.
 
 The Earth turns at 4.18 mdps, so the bias of a device at rest depends on attitude and heading. With
 the up direction u in the axes of the device, latitude phi and an unknown heading, the Earth's rate
@@ -42,6 +42,7 @@ _DAY_S = 86400.0
 _GRID = (11, 9)  # points of tau and of the walk, over 2.5 standard deviations on both sides
 _MAX_CALIBRATIONS = 100  # the latest ones are used
 _MIN_DPS = 1e-3 * MDPS
+_MIN_UNKNOWN_C = 5.0  # the least distance of an unknown temperature from those of the history
 
 Triple = tuple[float, float, float]
 Fitted = dict[str, tuple[float, float]]
@@ -63,8 +64,9 @@ class Calibration:
     outcome: tuple[str, str, str] = (NONE, NONE, NONE)  # how the history was treated on each axis
     noise_mdps_rts: Triple | None = None  # N, estimated from these data
     noise_freedom: float = 0.0  # its degrees of freedom
-    same_heading: bool = False  # declared
+    same_heading: bool = False  # declared, as a record: one that is not declared may be the same
     known_still: bool = False  # declared
+    knocks: int = 0  # noted before it
     reached: bool = True  # whether the target, if any, was reached
     attempt: int = 1  # 2: the previous attempt was not at rest or did not reach its target
     reasons: tuple[str, ...] = ()
@@ -105,6 +107,7 @@ class Circumstances:
     latitude_deg: float | None = None
     known_still: bool = False  # declared to be at rest: nothing is cut
     attempt: int = 1
+    knocks: int = 0  # noted so far
     temperature_c: float | None = None
     up: Array | None = None
 
@@ -155,11 +158,13 @@ def prior_of(
     mean, variance, tau, fitted = zip(*axes, strict=True)
     slope, slope_sigma = np.array([parameters["slope"] for parameters in fitted]).T
     earth, earth_reasons = _earth_rate_variance(past, now, np.array(tau))
-    temperature, temperature_reasons = _temperature_variance(past, device_type, now)
+    slopes = device_type.dps("temperature_spread_mdps_per_c"), slope, slope_sigma
+    temperature, temperature_reasons = _temperature_variance(past, now, *slopes)
     narrow = np.array(variance) + earth + temperature
     # A wrong history spreads at least three times as much as a right one.
     wide = np.maximum(device_type.dps("conflict_mdps") ** 2, 9 * narrow)
-    count, reasons = max(map(len, members)), (*earth_reasons, *temperature_reasons)
+    knocked = [reason("knocked")] if now.knocks > past[-1].knocks else []
+    count, reasons = max(map(len, members)), (*earth_reasons, *temperature_reasons, *knocked)
     return Prior(np.array(mean), narrow, wide, slope, slope_sigma, count, reasons, fitted)
 
 
@@ -199,15 +204,18 @@ def _axis_prior(
     type_slope = device_type.dps("temperature_slope_mdps_per_c")[axis]
     spread = device_type.dps("temperature_spread_mdps_per_c")[axis] ** 2
     tau, walk, logs = _grid(device_type, axis)
-    days = days - days[0]
-    of_walk = walk[:, None, None] ** 2 * np.minimum(days[:, None], days)
-    moving = of_walk + spread * np.outer(warmth, warmth)
-    variances = np.array([c.variance[axis] for c in past]) + unknown * spread * measured.var()
+    knocks = np.array([*(c.knocks for c in past), now.knocks])
+    of_level = _level_covariance(days, walk, knocks, device_type.dps("conflict_mdps")[axis])
+    moving = of_level + spread * np.outer(warmth, warmth)
+    variances = np.array([c.variance[axis] for c in past])
+    if not unknown.all():
+        apart = max(measured.var(), _MIN_UNKNOWN_C**2)
+        variances = variances + unknown * (spread + type_slope**2) * apart
     variances = variances + tau[:, None] ** 2
     among = moving[:, :-1, :-1] + variances[:, :, None] * np.eye(len(past))
     slope = np.broadcast_to(spread * warmth[:-1], variances.shape)
-    cross = np.stack([moving[:, :-1, -1], of_walk[:, :-1, -1], slope], axis=-1)
-    targets = [moving[:, -1, -1] + tau**2, of_walk[:, -1, -1], np.full(len(tau), spread)]
+    cross = np.stack([moving[:, :-1, -1], of_level[:, :-1, -1], slope], axis=-1)
+    targets = [moving[:, -1, -1] + tau**2, of_level[:, -1, -1], np.full(len(tau), spread)]
     y = _at_present_attitude(past, axis, now) - type_slope * warmth[:-1]
     flat = np.array([1.0, 1.0, 0.0])  # bias and level move with the level, the slope does not
     deviance, mean, variance = _krige(among, cross, np.stack(targets, axis=-1), y, flat)
@@ -218,6 +226,13 @@ def _axis_prior(
     fitted = dict(zip(("tau", "walk"), _moments(weights, grid, np.zeros_like(grid)), strict=True))
     fitted |= {"level": level, "slope": (float(type_slope + extra), slope_sigma)}
     return bias + type_slope * warmth[-1], sigma**2, float(weights @ tau**2), fitted
+
+
+def _level_covariance(days: Array, walk: Array, knocks: Array, step: float) -> Array:
+    """Covariance of the level at each of n times, (g, n, n), which walks and moves at knocks."""
+    days, steps = days - days[0], (knocks - knocks.min()) * step**2
+    walked = walk[:, None, None] ** 2 * np.minimum(days[:, None], days)
+    return np.asarray(walked + np.minimum(steps[:, None], steps))
 
 
 def _at_present_attitude(past: Sequence[Calibration], axis: int, now: Circumstances) -> Array:
@@ -273,20 +288,25 @@ def _moments(weights: Array, mean: Array, variance: Array) -> list[tuple[float, 
 
 
 def _temperature_variance(
-    past: Sequence[Calibration], device_type: DeviceType, now: Circumstances
+    past: Sequence[Calibration], now: Circumstances, spread: Array, slope: Array, sigma: Array
 ) -> tuple[Array, list[Reason]]:
-    """Variance due to a temperature that is unknown now, or beyond the range of the history."""
-    spread = device_type.dps("temperature_spread_mdps_per_c")
+    """Variance due to a temperature that is unknown now, or beyond the range of the history.
+
+    Beyond it, the slope is as uncertain as the type's; the part of the fitted one counts already.
+    """
     ranges = [c.temperature_c for c in past if c.temperature_c is not None]
-    if not ranges or not spread.any():
+    if not ranges:
         return np.zeros(3), []
     least, most = min(r[1] for r in ranges), max(r[2] for r in ranges)
-    value = now.temperature_c
-    distance = most - least if value is None else max(value - most, least - value, 0.0)
-    if not distance:
+    if (value := now.temperature_c) is None:
+        key, distance = "temperature unknown", max(most - least, _MIN_UNKNOWN_C)
+        added = spread**2 + slope**2
+    else:
+        key, distance = "temperature beyond", max(value - most, least - value, 0.0)
+        added = np.maximum(spread**2 - sigma**2, 0)
+    if not distance or not np.any(spread + added):
         return np.zeros(3), []
-    key = "temperature unknown" if value is None else "temperature beyond"
-    return (spread * distance) ** 2, [reason(key, value, distance, least=least, most=most)]
+    return added * distance**2, [reason(key, value, distance, least=least, most=most)]
 
 
 def _earth_rate_variance(

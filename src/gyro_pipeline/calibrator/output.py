@@ -1,6 +1,7 @@
 """Results as text for people, as JSON for programs, and as a plot of the running estimate."""
 
 import math
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -142,7 +143,7 @@ def device_table(device: Device) -> Iterator[str]:
     stored, counting = device.calibrations(), device.history()
     for line in device.lines():
         if line["event"] == "note":
-            yield f"note: {line['text']}"
+            yield f"note{' of a knock' * bool(line.get('knocked'))}: {line['text']}"
         elif line["event"] != "forget":
             head = f"{line['source'][:23]:<24}{line['rest']:>8}{line['seconds']:8.1f}"
             mean = "".join(f"{m:+12.6f}" for m in line["mean_dps"] or [])
@@ -159,19 +160,35 @@ def device_table(device: Device) -> Iterator[str]:
     yield f"{len(attempts)} attempts: {failed} not at rest, {dropped} dropped the history"
 
 
-def plot(path: Path, states: Sequence[State]) -> None:
-    """Plot the running estimate with its limits, the history, the stop and motions that were cut.
-
-    The suffix of the file sets its format, and the last state is the final result.
+def check_plot(path: Path) -> None:
+    """Check that a plot can be drawn and written; the suffix of the file sets its format.
 
     Raises:
-        InputError: matplotlib is not installed.
+        InputError: matplotlib is not installed, or the suffix or the folder cannot be used.
     """
     try:
-        from matplotlib.figure import Figure  # noqa: PLC0415 - the extra [plot]
+        from matplotlib.backend_bases import FigureCanvasBase  # noqa: PLC0415 - the extra [plot]
     except ImportError as error:
         text = "--plot needs matplotlib: pip install 'gyro-pipeline[plot]'"
         raise InputError(text) from error
+    suffixes = sorted(FigureCanvasBase.get_supported_filetypes())
+    if path.suffix[1:].lower() not in suffixes:
+        text = f"--plot: expected a file name that ends in .{', .'.join(suffixes)}, got {path}"
+        raise InputError(text)
+    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise InputError(f"--plot: expected a file that can be written, got {path}; give another")
+
+
+def plot(path: Path, states: Sequence[State]) -> None:
+    """Plot the running estimate with its limits, the history, the stop and motions that were cut.
+
+    The last state is the final result.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
+    from matplotlib.figure import Figure  # noqa: PLC0415 - the extra [plot]
+
     figure = Figure(figsize=(8, 7), layout="constrained")
     panels = figure.subplots(3, 1, sharex=True)
     target = target_mdps(states[-1])
@@ -182,7 +199,10 @@ def plot(path: Path, states: Sequence[State]) -> None:
             panel.axvline(stop, color="C2", linestyle="--", label=f"{target:g} mdps reached")
     panels[0].legend(loc="upper right", fontsize="small")
     panels[-1].set_xlabel("time, s")
-    figure.savefig(path)
+    try:
+        figure.savefig(path)
+    except OSError as error:
+        raise InputError(f"--plot {path}: not written: {error}; give another file") from error
 
 
 def _draw(panel: Any, states: Sequence[State], axis: int) -> None:

@@ -19,6 +19,7 @@ VERTICAL = 0.9
 """An axis counts as vertical where the cosine of its angle to the vertical is larger."""
 
 _UNIT_FACTOR = 15.0  # on the noise; a larger one means a wrong unit, not another device
+_WHITE = 4.0  # the noise of samples and of block means differs by a smaller factor at rest
 _WARMING_C = 1.0  # a larger change of temperature over a log is reported
 _MIN_FREEDOM = 6  # degrees of freedom of the noise, to recognise a unit by it
 _UNITS = {57.3: "rad/s", 1e3: "mdps", 3600.0: "deg/h", 6.0: "rpm"}
@@ -28,19 +29,20 @@ _SENTENCES = {  # by code, followed by a word where a code has several sentences
     "its resolution",
     "dead zero": "all samples are zero: a dead sensor; check its wiring",
     "dead not_finite": "no sample is a finite number; check the columns (--columns)",
-    "unit": "the noise is {ratio:.3g} times {way} that of {name}: a wrong unit? {unit} differ by "
-    "{near:g}; give --units, or another --type",
+    "unit": "the noise is {ratio:.3g} times {way} that of {name}: {motion}a wrong unit? {unit} "
+    "differ by {near:g}; give --units, or another --type",
     "cut": "a motion at {value:.1f} s was cut",
     "motion": "in motion up to {value:.1f} s; the stretch that knows most counts",
     "attitude": "the device was turned before {value:.1f} s; the stretch that knows most counts",
     "noise": "up to {value:.1f} s the rates scatter {factor:.1f} times as much as those of {name} "
-    "at rest: not at rest, or another --type",
+    "at rest: not at rest, or another --type or --units",
     "rotation": "the accelerometer sees a rotation of {rate:.2g} mdps (σ {sigma:.2g}) about a "
     "horizontal axis before {value:.1f} s: not at rest",
     "attitude history": "the attitude differs by {value:.0f}° from that of the history, which "
     "counts less",
     "heading": "the heading is not declared to repeat, so the history counts less on horizontal "
     "axes; declare it with --same-heading, or mounted = true in device.toml",
+    "knocked": "a knock was noted after the last calibration of the history, which counts less",
     "temperature unknown": "the temperature is not known; the history, recorded at {least:.1f} to "
     "{most:.1f} °C, counts less",
     "temperature beyond": "{value:.1f} °C is beyond the {least:.1f} to {most:.1f} °C of the "
@@ -85,20 +87,24 @@ def reason(
     )
 
 
-def unit_reason(factor: float, name: str) -> Reason | None:
-    """The reason ``unit`` where the noise is so far from that of the type that a unit is wrong."""
+def unit_reason(factor: float, name: str, inside: float | None = None) -> Reason | None:
+    """The reason ``unit`` where the noise is so far from that of the type that a unit is wrong.
+
+    Block means that scatter may be a motion; then ``inside`` is the factor of the samples. A wrong
+    unit raises both alike, and by about a known factor.
+    """
     if not 0 < factor < np.inf or 1 / _UNIT_FACTOR < factor < _UNIT_FACTOR:
         return None
-    ratio, way = max(factor, 1 / factor), "above" if factor > 1 else "below"
+    ratio, way, motion = max(factor, 1 / factor), "below", ""
+    if factor > 1:
+        way, motion = "above", "not at rest, or "
     near = min(_UNITS, key=lambda unit: abs(np.log(ratio / unit)))
-    words: dict[str, Any] = {
-        "ratio": ratio,
-        "way": way,
-        "name": name,
-        "near": near,
-        "unit": _UNITS[near],
-    }
-    return reason("unit", factor, _UNIT_FACTOR, **words)
+    if inside is not None:
+        white, known = inside / _WHITE < factor < inside * _WHITE, near / 2 < ratio < near * 2
+        if not (white and known):
+            return None
+    words: dict[str, Any] = {"ratio": ratio, "way": way, "name": name, "motion": motion}
+    return reason("unit", factor, _UNIT_FACTOR, **words, near=near, unit=_UNITS[near])
 
 
 def reasons_of(state: "State") -> Iterator[Reason]:

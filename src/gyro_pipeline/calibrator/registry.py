@@ -108,6 +108,10 @@ class Device:
                 stored.pop(line["of"], None)
         return stored
 
+    def knocks(self) -> int:
+        """Number of knocks that were noted."""
+        return sum(bool(line.get("knocked")) for line in self.lines())
+
     def history(self, without: str | None = None) -> list[Calibration]:
         """The calibrations that count, except that of one hash; only the bias typed in if any."""
         stored = self.calibrations()

@@ -42,7 +42,7 @@ class Blocks(NamedTuple):
 
 
 class Alarm(NamedTuple):
-    """An alarm with the rate in deg/s and its standard deviation, or the factor on the noise."""
+    """An alarm with a rate and its sigma, deg/s, or factors on the noise of means and samples."""
 
     code: str
     value: float = np.nan
@@ -92,7 +92,9 @@ class RestMonitor:
         if moved[k].any() or noisier[k].any():
             return after, k, Alarm(MOTION)
         if scattered[k]:
-            return after, k, Alarm(NOISE, float(np.nanmax(noise[k])))
+            axis = int(np.nanargmax(noise[k]))
+            inside = np.sqrt(blocks.variance[k, axis] / self.detector.size) / white[axis]
+            return after, k, Alarm(NOISE, float(noise[k, axis]), float(inside))
         return after, k, Alarm(ROTATION, float(rate[k]), float(sigma[k]))
 
     def _excess_noise(self, innovations: Array) -> Array:

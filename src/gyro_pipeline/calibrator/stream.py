@@ -123,7 +123,11 @@ class Parser:
 
     def _read_names(self, first: str) -> int:
         if first.startswith("{"):
-            self._names = list(json.loads(first))
+            try:
+                self._names = list(json.loads(first))
+            except ValueError as error:
+                text = f"expected a JSON object in the first line, got {first[:60]!r} ({error})"
+                raise InputError(f"stream: {text}; send whole lines, or start again") from error
             return 0
         self._separator = next((mark for mark in ",;\t" if mark in first), None)
         cells = [cell.strip() for cell in first.split(self._separator)]
