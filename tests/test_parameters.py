@@ -104,6 +104,13 @@ def test_what_sensors_cannot_give_stops_the_studies_that_ask_for_it_and_no_other
         ({"sensors": {"dot": {"recording_s": 20}}}, "real2real", "30 s windows needed.*, 20 s"),
         ({"only": {"sensor": "ng"}}, "augmentation", "'ng'} matches nothing in augmentation"),
         (study("unseen_devices", estimators=["lstm"]), "unseen_devices", "lstm cannot be judged"),
+        # the report would take them for seeds
+        (
+            study("real2real", strides_s=[10, 1]),
+            "real2real",
+            "expected one protocol and one stride",
+        ),
+        (study("real2real", also={"k_fold": ["cnn"]}), "real2real", "one protocol and one stride"),
     ):
         parameters = Parameters(**loaded(**changes))
         with pytest.raises(InputError, match=said):

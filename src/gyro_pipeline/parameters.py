@@ -565,7 +565,7 @@ class Study(Parameter):
         """The settings of training, with the study's changes."""
         return Training.model_validate(base.model_dump() | self.training)
 
-    def splits(self, base: Splits) -> Splits:
+    def splits_of(self, base: Splits) -> Splits:
         """The settings of the splits, with the study's changes.
 
         Where the study sets a stride for the windows of all roles, it applies to training as well.

@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import product
-from typing import Any
+from typing import Any, Self
 
 import pandas as pd
 
@@ -29,9 +29,10 @@ LEFT_OUT = "left_out"
 
 @dataclass(frozen=True)
 class RunSpec:
-    """An estimator, its sensor, window and training set: one MLflow run.
+    """An estimator, its sensor, window and training set: a row of a study, or a run.
 
-    The fields are stored as parameters of the run, under the same names.
+    :func:`run_spec` reduces a row to its run. The fields are stored as parameters of the run, under
+    the same names.
     """
 
     study: str
@@ -60,6 +61,11 @@ class RunSpec:
     def names(cls) -> list[str]:
         """Names of the fields, in order."""
         return [field.name for field in fields(cls)]
+
+    @classmethod
+    def of_row(cls, row: Mapping[Any, Any]) -> Self:
+        """The spec of a row of a plan, which has further columns."""
+        return cls(**{name: row[name] for name in cls.names()})
 
 
 def study_rows(  # noqa: PLR0917 - the axes of a grid
@@ -164,10 +170,7 @@ def run_spec(row: RunSpec, unseen_devices: bool) -> RunSpec:
 def possible_runs(plan: pd.DataFrame) -> dict[str, RunSpec]:
     """The possible runs of a plan, by fingerprint."""
     possible = plan[plan[LEFT_OUT].isna() | (plan[LEFT_OUT] == "")]
-    return {
-        row["fingerprint"]: RunSpec(**{name: row[name] for name in RunSpec.names()})
-        for row in possible.to_dict("records")
-    }
+    return {row["fingerprint"]: RunSpec.of_row(row) for row in possible.to_dict("records")}
 
 
 def used_sensors(parameters: Parameters) -> dict[str, list[str]]:
@@ -215,6 +218,12 @@ def check_possible(parameters: Parameters, pipelines: Sequence[str]) -> None:
             "sensor, see conf/base/parameters/studies.yml"
         )
     for study, sensors in studies.items():
+        settings = parameters.studies[study]
+        if study != LEAKAGE and (settings.also or len(settings.strides_s or ()) > 1):
+            raise InputError(
+                f"studies.{study}: expected one protocol and one stride, as the report has no "
+                f"column for several; make a study for each (also and strides_s are for {LEAKAGE})"
+            )
         for sensor in sensors:
             parameters.check_sensor(f"studies.{study}", sensor)
             _check_rows(parameters, study, sensor)
@@ -265,7 +274,7 @@ def run_params(
         splits: How recordings are split, and which windows train.
         virtual_gyros: How virtual gyroscopes are drawn, for runs that use them.
     """
-    split = study.splits(splits).model_dump(exclude={"folds"})  # logged as the actual number
+    split = study.splits_of(splits).model_dump(exclude={"folds"})  # logged as the actual number
     params: dict[str, Any] = asdict(spec) | split
     if spec.virtual_gyros:
         params |= {f"virtual_{name}": value for name, value in virtual_gyros.model_dump().items()}

@@ -5,7 +5,7 @@ are the fields of its run spec and the hyper-parameters; its metrics are listed 
 :class:`EvaluatedRun`. Users query these names, so changing one breaks their notebooks.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -97,7 +97,7 @@ class EvaluatedRun:
             of the last epoch; ``accuracy_gain_pct_first`` and ``time_saving_pct_first``: over the
             first window of each recording, the paper's way.
         tags: Tags, including EVALUATED_WITH.
-        artifacts: Artifacts by file name: SCORES, ERRORS.
+        artifacts: Artifacts by file name: SCORES, ERRORS and, of the running mean, CURVE.
     """
 
     run_id: str
@@ -135,3 +135,8 @@ class StoredRun:
     def fingerprint(self) -> str:
         """Hash of everything that the fits depend on."""
         return self.tags[FINGERPRINT]
+
+
+def by_fingerprint(runs: Sequence[StoredRun]) -> dict[str, StoredRun]:
+    """The newest run with each fingerprint, from runs as the store lists them: newest first."""
+    return {run.fingerprint: run for run in reversed(runs)}

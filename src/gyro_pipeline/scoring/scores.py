@@ -82,8 +82,9 @@ def squared_errors(errors: pd.DataFrame, truth: str, windows: str) -> SquaredErr
     """Squared errors by recording (or device, see :func:`clusters`), in order.
 
     Args:
-        errors: Columns ``recording, window, truth, error_dps, truth_variance``; several runs of
-            the same windows (seeds, folds) may be concatenated.
+        errors: Columns ``recording, truth, error_dps, truth_variance`` and ``window``, the position
+            among the windows of the recording that test; several runs of the same windows (seeds,
+            folds) may be concatenated.
         truth: Name of the truth.
         windows: ``first`` or ``all``.
     """

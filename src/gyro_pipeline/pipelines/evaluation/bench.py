@@ -54,7 +54,7 @@ SIGMAS = {"coverage_1sigma_pct": 1.0, "coverage_2sigma_pct": 2.0, "coverage_95_p
 
 TARGETS = (RECORDING_MEAN, BIAS)
 
-Estimates = Callable[[str], tuple[np.ndarray, ArrayLike]]
+EstimatesByTruth = Callable[[str], tuple[np.ndarray, ArrayLike]]
 """Biases and sigma of the windows of a recording, (windows, 3), deg/s, for each truth."""
 
 _MIN_CORRELATED = 5
@@ -124,7 +124,7 @@ class Bench:
         """
         fits = {fold: self._with_calibrations(str(fold), fit) for fold, fit in estimators.items()}
 
-        def estimates(recording: TestRecording) -> Estimates:
+        def estimates(recording: TestRecording) -> EstimatesByTruth:
             by_target = self._estimates(fits, recording, imus)
             return lambda truth: by_target[TARGET_OF[truth]]
 
@@ -137,7 +137,7 @@ class Bench:
             )
         return errors
 
-    def _table(self, estimates_of: Callable[[TestRecording], Estimates]) -> pd.DataFrame:
+    def _table(self, estimates_of: Callable[[TestRecording], EstimatesByTruth]) -> pd.DataFrame:
         """Errors of the estimates for each test recording against all truths."""
         parts = []
         for recording, truths in zip(self.test_recordings, self._truths, strict=True):
@@ -216,7 +216,7 @@ class Bench:
         if not self.device.labels:
             return None
 
-        def constants(recording: TestRecording) -> Estimates:
+        def constants(recording: TestRecording) -> EstimatesByTruth:
             rows = self._rows(recording).sort_values("start").drop_duplicates("start")
             biases = np.stack([self.device.labels[fold].mean(axis=0) for fold in rows.fold])
             return lambda _: (biases, np.nan)
@@ -248,7 +248,7 @@ class Bench:
         return tests[(tests.imu == recording.imu) & (tests.recording == recording.number)]
 
     def _oracle_estimates(self, recording: TestRecording, truth: str) -> np.ndarray:
-        """Estimates of the oracle, which knows the drawn values, (windows, 3), deg/s."""
+        """EstimatesByTruth of the oracle, which knows the drawn values, (windows, 3), deg/s."""
         device, size = self.device, self.size
         if device.models is None:
             assert device.unit_bias is not None

@@ -19,7 +19,15 @@ from gyro_pipeline.pipelines.evaluation.device import TestDevice, describe_devic
 from gyro_pipeline.scoring.scorer import MISSING, Scores, read_scores
 from gyro_pipeline.scoring.truths import CURVE_STEP_S
 from gyro_pipeline.studies import MEAN, RunSpec, possible_runs
-from gyro_pipeline.tracking import CURVE, ERRORS, EVALUATED_WITH, SCORES, EvaluatedRun, StoredRun
+from gyro_pipeline.tracking import (
+    CURVE,
+    ERRORS,
+    EVALUATED_WITH,
+    SCORES,
+    EvaluatedRun,
+    StoredRun,
+    by_fingerprint,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -70,7 +78,7 @@ def evaluate(
         data_hash(allan.allan_variance.load().to_numpy(), None),
     ]
     evaluated_with = fingerprint([code_hash(__name__), truths])
-    specs, stored = possible_runs(plan), {run.fingerprint: run for run in reversed(runs)}
+    specs, stored = possible_runs(plan), by_fingerprint(runs)
     pending = {
         key: spec
         for key, spec in sorted(specs.items(), key=lambda item: _windows_of(item[1]))

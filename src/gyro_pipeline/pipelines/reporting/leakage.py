@@ -44,14 +44,18 @@ def pool_leakage(
             of_stride = [(spec, run) for spec, run in runs if spec.window_stride_s == stride_s]
             rows += [row | {"hops": stride_s / hop_s} for row in _rows_of_stride(of_stride)]
     results = pd.DataFrame(rows)
+    if results.empty:
+        return {"results": results}
     checked = results.beats_oracle_p.notna()
     results.loc[checked, "beats_oracle_p"] = holm(results.beats_oracle_p[checked].tolist())
     return {"results": results}
 
 
 def _rows_of_stride(stored: Sequence[tuple[RunSpec, StoredRun]]) -> list[dict[str, Any]]:
-    """A row for each way of training, with its seeds pooled."""
+    """A row for each way of training, with its seeds pooled; none without mean and constant."""
     by_name = {spec.estimator: run for spec, run in stored}
+    if not {MEAN, CONSTANT} <= by_name.keys():
+        return []
     mean, constant, first = by_name[MEAN], by_name[CONSTANT], stored[0][0]
     scorer = Scorer(errors_of([mean]), mean.load(CURVE), first.window_s)
     shared = {

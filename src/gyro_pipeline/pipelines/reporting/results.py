@@ -34,7 +34,7 @@ from gyro_pipeline.studies import (
     run_specs,
     study_rows,
 )
-from gyro_pipeline.tracking import CURVE, ERRORS, FINGERPRINT, SCORES, StoredRun
+from gyro_pipeline.tracking import CURVE, ERRORS, FINGERPRINT, SCORES, StoredRun, by_fingerprint
 
 logger = logging.getLogger(__name__)
 
@@ -118,11 +118,11 @@ def planned_outcomes(
     plan: pd.DataFrame, runs: Sequence[StoredRun]
 ) -> dict[RunSpec, StoredRun | str]:
     """The run of each planned spec, or why there is none; of several runs the first counts."""
-    newest = {run.fingerprint: replace(run, load=cache(run.load)) for run in reversed(runs)}
+    finished = [replace(run, load=cache(run.load)) for run in runs if run.finished]
+    newest = by_fingerprint(finished)
     outcomes: dict[RunSpec, StoredRun | str] = {}
     for row in plan.fillna({LEFT_OUT: ""}).to_dict("records"):
-        spec = RunSpec(**{name: row[name] for name in RunSpec.names()})
-        outcomes[spec] = row[LEFT_OUT] or newest.get(row[FINGERPRINT], NOT_RUN)
+        outcomes[RunSpec.of_row(row)] = row[LEFT_OUT] or newest.get(row[FINGERPRINT], NOT_RUN)
     return outcomes
 
 
@@ -130,7 +130,7 @@ def planned_outcomes(
 class Cell:
     """The results of a sensor and window length, which share a running mean."""
 
-    specs: Sequence[RunSpec]  # rows of the study, a spec for every seed, the running mean first
+    rows: Sequence[RunSpec]  # of the study, one for every seed, the running mean first
     study: Study
     outcomes: Mapping[RunSpec, StoredRun | str]  # from planned_outcomes
 
@@ -138,13 +138,14 @@ class Cell:
     def _rows(self) -> list[tuple[RunSpec, list[StoredRun], str]]:
         """Each result by its first seed, with the runs of all seeds, or none and the reason."""
         rows = []
-        for _, group in groupby(self.specs, lambda spec: [getattr(spec, name) for name in ROW]):
-            specs = list(group)
-            needed = run_specs(specs, self.study.unseen_devices)
+        for _, group in groupby(self.rows, lambda row: [getattr(row, name) for name in ROW]):
+            seeds = list(group)
+            # rows whose estimator uses the same part of the training set share a run
+            needed = run_specs(seeds, self.study.unseen_devices)
             outcomes = [self.outcomes.get(spec, NOT_RUN) for spec in needed]
             runs = [outcome for outcome in outcomes if isinstance(outcome, StoredRun)]
             problem = next((outcome for outcome in outcomes if isinstance(outcome, str)), "")
-            rows.append((specs[0], [] if problem else runs, problem))
+            rows.append((seeds[0], [] if problem else runs, problem))
         return rows
 
     @cached_property
@@ -166,7 +167,7 @@ class Cell:
     def _scorer(self) -> Scorer:
         assert self.mean is not None
         errors, curve = self._errors_compared[MEAN], self.mean.load(CURVE)
-        return Scorer(errors, curve, self.specs[0].window_s)
+        return Scorer(errors, curve, self.rows[0].window_s)
 
     def results(self) -> list[dict[str, Any]]:
         """A result for each row; all need the running mean, which they are compared with."""
@@ -177,14 +178,13 @@ class Cell:
                 results.append(name | {"status": problem or NOT_RUN, "run_ids": None})
                 continue
             results.append(name | self._result(spec, runs) | self._added(spec, runs))
-            best = [best_epoch(run) for run in runs if spec.estimator == CNN]
-            if best and all(len(run.load(ERRORS)) for run in best):
-                results.append(results[-1] | self._pooled(best) | {"estimator": CNN_BEST})
+            if spec.estimator == CNN and all(len(errors_of([run], BEST)) for run in runs):
+                results.append(results[-1] | self._pooled(runs, BEST) | {"estimator": CNN_BEST})
         return results
 
     def curves(self) -> pd.DataFrame:
         """RMSE of the running mean against its length, for first and for all windows."""
-        parts, spec = [], self.specs[0]
+        parts, spec = [], self.rows[0]
         for windows in (FIRST, ALL):
             curve = self._scorer.curves[PAPER, windows]
             points = {"windows": windows, "time_s": curve.times_s, "rmse_dps": curve.rmse[0]}
@@ -216,13 +216,13 @@ class Cell:
             **_provenance(runs),
         }
 
-    def _pooled(self, runs: Sequence[StoredRun]) -> dict[str, Any]:
+    def _pooled(self, runs: Sequence[StoredRun], epoch: str = LAST) -> dict[str, Any]:
         """Scores of all seeds pooled, with intervals over recordings.
 
         Squared errors are averaged over seeds; ``_seed_sd`` is the standard deviation of the scores
         of single seeds, None for one seed.
         """
-        errors = [errors_of([run]) for run in runs]
+        errors = [errors_of([run], epoch) for run in runs]
         places = self._errors_compared[MEAN].reindex(columns=["imu", "recording"], fill_value=0)
         row: dict[str, Any] = {"seeds": len(errors), "recordings": len(places.drop_duplicates())}
         for windows in (ALL, FIRST):
@@ -234,7 +234,7 @@ class Cell:
                 values = [scores[base].value for scores in single]
                 spread = np.std(values, ddof=1) if values and np.isfinite(values).all() else None
                 row[f"{name}_seed_sd"] = spread
-        return row | self._differences(runs)
+        return row | self._differences(runs, epoch)
 
     def _scores(self, errors: pd.DataFrame, windows: str) -> dict[str, Estimate]:
         view = PAPER, windows
@@ -261,14 +261,14 @@ class Cell:
                 row |= with_ends(f"added_{count}_pct", change)
         return row
 
-    def _differences(self, runs: Sequence[StoredRun]) -> dict[str, Any]:
+    def _differences(self, runs: Sequence[StoredRun], epoch: str = LAST) -> dict[str, Any]:
         """Errors less those of the references on the same windows, paired over recordings.
 
         ``less_<name>_dps`` is a difference of RMSEs against the mean of the recording, and
         ``less_<name>_dps2_<truth>`` a difference of mean squares against another truth: less the
         noise of that truth, a mean square may be negative.
         """
-        table = errors_of(runs)
+        table = errors_of(runs, epoch)
         row: dict[str, Any] = {}
         for truth in table.truth.unique():
             squares = squared_errors(table, truth, ALL)
@@ -302,13 +302,6 @@ def mean_row(mean: StoredRun) -> dict[str, Any]:
     for windows, name in product((ALL, FIRST), _OF_THE_MEAN):
         row |= with_ends(column(name, windows), scores.get((name, windows), MISSING))
     return row
-
-
-def best_epoch(run: StoredRun) -> StoredRun:
-    """The run with the errors at its best validation epoch in place of those at its last."""
-    errors = run.load(ERRORS)
-    errors = errors[errors.weights == BEST].assign(weights=LAST)
-    return replace(run, load={ERRORS: errors}.__getitem__)
 
 
 def errors_of(runs: Iterable[StoredRun], epoch: str = LAST) -> pd.DataFrame:

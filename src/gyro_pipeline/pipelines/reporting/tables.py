@@ -51,6 +51,10 @@ PAPER_TABLES = {
 """Titles of the result tables of the paper."""
 
 _HOUR_S = 3600
+_ORACLE = "oracle, on the same windows"
+_ORACLE_A = "Oracle A %"
+_WARM_UP = "Warm-up needed mdps"
+_DEFAULT_A = f"{label(DEFAULT).capitalize()} A %"
 _AT_DATASHEET = "At the datasheet's rate h"
 _SUMMARY = (
     "Windows of 10 s; S and A in percent, over all windows, with 95 % intervals over recordings. "
@@ -75,7 +79,7 @@ def paper_results(material: Material, table: str) -> Exhibit | None:
         return None
     claims = material.published.of_table(table)
     results = pd.DataFrame(_result_row(material, claim) for claim in claims)
-    columns = ["Sensor", "Gyroscopes", "Published S/A %", "S %", "A %", "Constant A %", _BEST_A]
+    columns = ["Sensor", "Gyroscopes", "Published S/A %", "S %", "A %", "Constant A %", _DEFAULT_A]
     columns += ["Ceiling A %", *[_ORACLE_A] * material.simulated, "Paper's way A %", _WARM_UP]
     columns += ["Note"] if results["Note"].notna().any() else []
     return Exhibit(f"{study}_{table}", PAPER_TABLES[table], _SUMMARY, results, columns)
@@ -118,12 +122,6 @@ def _first_and_all(
     }
 
 
-_ORACLE = "oracle, on the same windows"
-_ORACLE_A = "Oracle A %"
-_WARM_UP = "Warm-up needed mdps"
-_BEST_A = f"{label(DEFAULT).capitalize()} A %"
-
-
 def _result_row(material: Material, claim: PublishedResult) -> dict[str, Any]:
     row, residual, constant, default = (
         material.result(claim, name) for name in (CNN, RESIDUAL_NETWORK, CONSTANT, DEFAULT)
@@ -146,7 +144,7 @@ def _result_row(material: Material, claim: PublishedResult) -> dict[str, Any]:
         "Residual network S %": interval(residual, "time_saving_pct"),
         "Residual network A %": interval(residual, "accuracy_gain_pct"),
         "Constant A %": interval(constant, "accuracy_gain_pct"),
-        _BEST_A: interval(default, "accuracy_gain_pct"),
+        _DEFAULT_A: interval(default, "accuracy_gain_pct"),
         "Ceiling S %": interval(row, "ceiling_time_saving_pct"),
         "Ceiling A %": interval(row, "ceiling_accuracy_gain_pct"),
         _ORACLE_A: interval(row, "oracle_accuracy_gain_pct"),

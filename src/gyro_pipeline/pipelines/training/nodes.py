@@ -41,7 +41,14 @@ from gyro_pipeline.studies import (
     run_specs,
     study_rows,
 )
-from gyro_pipeline.tracking import FINGERPRINT, HISTORY, FittedRun, RunIdentity, StoredRun
+from gyro_pipeline.tracking import (
+    FINGERPRINT,
+    HISTORY,
+    FittedRun,
+    RunIdentity,
+    StoredRun,
+    by_fingerprint,
+)
 from gyro_pipeline.windows import window_size
 
 logger = logging.getLogger(__name__)
@@ -230,9 +237,13 @@ def _problem(spec: RunSpec, folds: Mapping[str, TrainingSet], settings: Training
 
 
 def _missing_imu(spec: RunSpec, sets: TrainingSets) -> str:
-    """The reason why a recording cannot test: an IMU side by side with the tested one lacks it."""
+    """The reason why IMUs side by side are not the same in training and in all tests."""
     if spec.method != 1:
         return ""
+    first = tuple(sets.recordings.imu.to_numpy()[: spec.real_imus].tolist())
+    for fold, training_set in sets.of(spec).items():
+        if training_set.side_by_side != first:
+            return f"{fold}: expected IMUs {first} to train, got {training_set.side_by_side}"
     tests = _tests(sets.table_of(spec)).recording.unique()
     samples = sets.recordings["samples"].isel(imu=slice(spec.real_imus)).sel(recording=tests)
     lacking = tests[(samples == 0).any("imu").to_numpy()]
@@ -276,8 +287,8 @@ def train(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
     sets, settings = TrainingSets(windows, recordings, virtual), study.training_of(training)
     specs = possible_runs(plan)
     _check_plan(specs, sets, settings)
-    in_study = {run.fingerprint: run for run in reversed(all_runs) if run.study == study.experiment}
-    trained = {run.fingerprint: run for run in reversed(all_runs) if run.trained}
+    in_study = by_fingerprint([run for run in all_runs if run.study == study.experiment])
+    trained = by_fingerprint([run for run in all_runs if run.trained])
     missing = {
         key: [f for f in sets.of(spec) if key not in in_study or f not in in_study[key].fits]
         for key, spec in specs.items()

@@ -139,9 +139,10 @@ def split_windows(  # noqa: PLR0917 - a node's arguments are its datasets
         InputError: No window can be used, or the table breaks its protocol.
     """
     sensor, source = recordings.attrs["sensor"], recordings.attrs["source"]
-    rows = study_rows(study, sensor, source, windows_s, [only.seed or 0], only)
+    seed = only.seed or 0  # windows have no seed, but rows must match the filter
+    rows = study_rows(study, sensor, source, windows_s, [seed], only)
     drawn_from = [] if virtual is None else np.atleast_1d(virtual.attrs["drawn_from"]).tolist()
-    splits = study.splits(splits)
+    splits = study.splits_of(splits)
     tables = []
     for protocol, window_s, stride_s in dict.fromkeys(
         (row.protocol, row.window_s, row.window_stride_s) for row in rows
@@ -189,9 +190,13 @@ def _real_windows(  # noqa: PLR0917 - everything that a table depends on
     label = f"{study.experiment} {recordings.attrs['sensor']}, {size / rate_hz:g} s windows"
     if losses := describe_losses(contents, samples, size):
         logger.warning("%s: %s", label, losses)
-    split, imu = _split(recordings) if study.recordings is None else None, tested_imu(recordings)
+    split, imu, used = _split(recordings), tested_imu(recordings), contents
+    if study.recordings is not None:
+        split, used = None, _first_recordings(contents, samples, size, imu, study)
+    windows = usable_windows(used, samples, size, stride)
+    numbers = sorted(windows.recording[windows.imu == imu].unique().tolist())
 
-    def table(windows: pd.DataFrame) -> pd.DataFrame:
+    def in_folds(windows: pd.DataFrame) -> pd.DataFrame:
         candidates = Candidates(windows, split, imu, numbers, splits)
         folds = [
             windows[roles != UNUSED].assign(fold=fold, role=roles[roles != UNUSED])
@@ -199,12 +204,7 @@ def _real_windows(  # noqa: PLR0917 - everything that a table depends on
         ]
         return pd.concat(folds, ignore_index=True).assign(origin=ORIGIN_REAL)
 
-    used = contents
-    if study.recordings is not None:
-        used = _first_recordings(contents, samples, size, imu, study)
-    windows = usable_windows(used, samples, size, stride)
-    numbers = sorted(windows.recording[windows.imu == imu].unique().tolist())
-    tested = table(windows)
+    tested = in_folds(windows)
     if not (tested.role == TEST).any():
         raise InputError(
             f"{label}: no test recording has a usable window; lower windows_s of the study, or "
@@ -217,7 +217,7 @@ def _real_windows(  # noqa: PLR0917 - everything that a table depends on
         first = trained.groupby(["fold", *_KEYS]).start.transform("min") == trained.start
         return pd.concat([trained[first], tested[tested.role == TEST]])
     training_stride = round(splits.training_windows * rate_hz)
-    trained = table(usable_windows(used, samples, size, max(training_stride, 1)))
+    trained = in_folds(usable_windows(used, samples, size, max(training_stride, 1)))
     return pd.concat([trained[trained.role != TEST], tested[tested.role == TEST]])
 
 
