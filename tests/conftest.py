@@ -60,17 +60,13 @@ class Project:
 
     def start(self, *arguments):
         """``kedro run`` in a process group of its own, as a shell would start it."""
+        command = [sys.executable, "-m", "kedro", "run", *arguments]
+        given = {"cwd": self.folder, "env": dict(os.environ) | {"PYTHONPATH": str(ROOT / "src")}}
+        # children inherit that a shell's background jobs ignore Ctrl-C
+        given["preexec_fn"] = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
         with self.log.open("wb") as output:
-            return subprocess.Popen(
-                [sys.executable, "-m", "kedro", "run", *arguments],
-                cwd=self.folder,
-                env=dict(os.environ) | {"PYTHONPATH": str(ROOT / "src")},
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-                # children inherit that a shell's background jobs ignore Ctrl-C
-                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-            )
+            told = {"stdout": output, "stderr": subprocess.STDOUT}
+            return subprocess.Popen(command, start_new_session=True, **given, **told)
 
     def kedro_run(self, *arguments):
         """``kedro run`` to its end, in a process of its own."""

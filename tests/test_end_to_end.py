@@ -150,9 +150,7 @@ def test_reporting_trains_nothing_and_says_in_rows_what_is_missing(smoke, smoke_
     assert "| kedro run --env=smoke |" in page.partition("### What was not made")[2]
 
 
-def test_another_setting_trains_anew_and_a_whole_run_shares_what_another_study_has(
-    smoke, smoke_copy
-):
+def test_another_setting_trains_anew_and_a_whole_run_shares_what_a_study_has(smoke, smoke_copy):
     smoke_copy.amend("smoke", studies={"real2real": {"estimators": ["cnn"]}})
     only = "only.sensor=sparkfun,only.window_s=10,only.real_gyros=3"
     whole = smoke_copy.command("--env=smoke", f"--params={only}")

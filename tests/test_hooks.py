@@ -16,10 +16,7 @@ from gyro_pipeline.session import Session
     [
         ({"only_missing_outputs": True}, "--only-missing-outputs: .* type kedro run without it"),
         # one that was made starts a process
-        (
-            {"runner": object.__new__(ParallelRunner)},
-            "ParallelRunner: .*execution.workers=N",
-        ),
+        ({"runner": object.__new__(ParallelRunner)}, "ParallelRunner: .*execution.workers=N"),
         ({"runner": SequentialRunner(is_async=True)}, "--async: .* type kedro run without it"),
     ],
 )

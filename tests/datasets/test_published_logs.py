@@ -166,9 +166,7 @@ def test_a_wrong_or_an_endless_file_is_refused_and_nothing_of_it_is_kept(server,
 
 
 @pytest.mark.parametrize(("code", "tries"), [(404, 1), (503, 5)])
-def test_a_busy_server_is_asked_again_for_a_while_and_another_answer_is_final(
-    server, path, code, tries
-):
+def test_a_busy_server_is_asked_again_and_another_answer_is_final(server, path, code, tries):
     server.faults = [server.status(code)] * 5
     message = refusal(server, path)
     assert f"cannot fetch made.npy from {server.address}{URL_PATH}: {code} " in message

@@ -123,9 +123,7 @@ for uri in sys.argv[2:]:
 """
 
 
-def test_the_model_of_a_class_from_outside_the_package_brings_its_code(
-    store, tmp_path, monkeypatch
-):
+def test_the_model_of_a_class_from_outside_brings_its_code(store, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path / "code")
     source = Path(sys.modules["constant"].__file__).read_text()
     importing = "import theirs_file\nclass Constant(theirs_file.Constant):\n    pass\n"
@@ -417,9 +415,7 @@ def test_what_two_projects_train_at_once_is_stored_once(store, monkeypatch, tmp_
     assert len(one.load()) == 1
 
 
-def test_fits_that_a_server_does_not_take_are_stored_once_it_answers(
-    store, monkeypatch, tmp_path, caplog
-):
+def test_fits_without_a_server_are_stored_once_it_answers(store, monkeypatch, tmp_path, caplog):
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{store}")
     runs, folds = tracked(tmp_path / "mlflow.db", study="real2real"), ("fold 0", "fold 1", MODEL)
     runs.check_reachable()

@@ -17,9 +17,8 @@ RATE, SAMPLES, SIZE = 20.0, 800, 200
 N, TAU = 5 * MDPS, 1 * MDPS
 WHITE = model_of(SAMPLES, RATE, NoiseFigures(N, 0, 0), 0.0, TAU)
 COLOURED = model_of(SAMPLES, RATE, NoiseFigures(N, 5 * MDPS, 0.3 * MDPS), 0.0, TAU)
-WARMING = RecordingModel(
-    SAMPLES, RATE, WHITE.noise, np.array([0.0, 20 * MDPS]), np.diag([TAU**2, TAU**2]), 15.0
-)
+PRIOR = np.array([0.0, 20 * MDPS]), np.diag([TAU**2, TAU**2])
+WARMING = RecordingModel(SAMPLES, RATE, WHITE.noise, *PRIOR, time_constant_s=15.0)
 
 
 def rms(errors):
@@ -110,9 +109,7 @@ def test_history_goes_on_with_calibrations_made_since_the_fit(simulate, training
 
 
 @pytest.mark.slow
-def test_a_fallback_costs_little_where_the_prior_holds_and_saves_where_it_does_not(
-    simulate, judged, training_set
-):
+def test_a_fallback_costs_little_and_saves_where_the_prior_fails(simulate, judged, training_set):
     training, tested = halves(simulate(WHITE, 80, seed=4), 40)
     turned = tested.copy(deep=True)
     turned["angular_rate"] = turned.angular_rate + np.float32(15 * MDPS)
@@ -143,9 +140,7 @@ def test_ridge_regression_solves_its_normal_equations():
 
 
 @pytest.mark.slow
-def test_ridge_of_the_same_time_copes_with_a_warm_up_and_of_nothing_is_the_constant(
-    simulate, judged, training_set
-):
+def test_ridge_copes_with_a_warm_up_and_of_nothing_is_the_constant(simulate, judged, training_set):
     long = replace(WARMING, samples=2 * SAMPLES)
     training, tested = halves(simulate(long, 100, seed=6), 70)
     same, any_time = (

@@ -34,9 +34,7 @@ def with_heater(recordings, generator):
 
 
 @pytest.mark.slow
-def test_it_finds_a_drift_that_the_linear_model_lacks_and_else_adds_next_to_nothing(
-    simulate, judged, training_set
-):
+def test_it_finds_what_the_linear_model_lacks_and_else_adds_little(simulate, judged, training_set):
     def judge(recordings):
         training, tested = (recordings.isel(recording=part) for part in np.split(np.arange(80), 2))
         network = ResidualNetwork(warm_up=False).fit(training_set(training))

@@ -10,7 +10,6 @@ N = 5 * MDPS
 T = 87.0
 MU = 20 * MDPS
 DRAWS = 200_000
-R_Q = [(0.05, 0.05), (10 / 87, 0.1), (0.5, 10.0)]
 
 
 @pytest.mark.parametrize(("r", "q"), [(0.05, 0.05), (10 / 87, 0.1), (0.5, 10.0)])
@@ -21,11 +20,8 @@ def test_monte_carlo_agrees_with_the_closed_forms(r, q):
     bias = generator.normal(MU, tau, DRAWS)
     inside = bias + generator.normal(0, N / np.sqrt(window), DRAWS)
     outside = bias + generator.normal(0, N / np.sqrt(T - window), DRAWS)
-    for truth, aim in {
-        PAPER: r * inside + (1 - r) * outside,
-        DISJOINT: outside,
-        TRUE: bias,
-    }.items():
+    aims = {PAPER: r * inside + (1 - r) * outside, DISJOINT: outside, TRUE: bias}
+    for truth, aim in aims.items():
         own_noise = N**2 / (T - window) if truth == DISJOINT else 0.0
         best = limits.oracle(inside, MU, tau, N, window, T, truth)
         for estimate, expected in (

@@ -119,12 +119,8 @@ def stored_runs(fitted, **changes):
             estimator.losses = None  # which is an artifact of its own
         history = [fit.estimator.losses for fit in fits.values() if fit.is_model]
         run = StoredRun(
-            run_id=f"run{number}",
-            experiment_id="1",
-            study=identity.study,
-            finished=False,
-            trained=set(fits) == set(identity.folds),
-            started_ms=0,
+            **{"run_id": f"run{number}", "experiment_id": "1", "study": identity.study},
+            **{"finished": False, "trained": set(fits) == set(identity.folds), "started_ms": 0},
             params={name: str(value) for name, value in identity.params.items()},
             tags={**identity.tags, FINGERPRINT: key, "mlflow.runName": identity.name},
             metrics={"train_loss": 0.0} if history and history[0] is not None else {},

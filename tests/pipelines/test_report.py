@@ -136,9 +136,7 @@ def test_datasheets_and_signals_are_shown_from_the_recordings(report, recordings
     assert "N = " in allan.texts[0].get_text()
 
 
-def test_the_warm_up_that_a_published_gain_would_need_is_in_the_answer(
-    described, report, parameters
-):
+def test_the_warm_up_that_a_published_gain_needs_is_in_the_answer(described, report, parameters):
     p = parameters("base")
     own = described["sparkfun/description"]()
     own[[f"white_dps_rts_{axis}" for axis in "xyz"]] = 0.0033
@@ -161,10 +159,8 @@ def test_the_page_needs_no_other_file_and_a_list_links_to_all_reports(tmp_path):
     page = ReportPage(str(tmp_path / "simulated" / "report.html"), str(tmp_path / "report.html"))
     figure = ReportFigure(str(tmp_path / "simulated" / "figures" / "<i>dot 3.png"))
     figure.save(plt.subplots()[0])
-    hostile = (
-        "<img src=x onerror=alert(1)> ![x](http://evil/x) [y](javascript:alert(1)) &lt; `c` *b*"
-    )
-    table = pipe_table(pd.DataFrame({"File": [hostile, "# _a_ | b"], "n": [1.25, np.nan]}))
+    evil = "<img src=x onerror=alert(1)> ![x](http://evil/x) [y](javascript:alert(1)) &lt; `c` *b*"
+    table = pipe_table(pd.DataFrame({"File": [evil, "# _a_ | b"], "n": [1.25, np.nan]}))
     page.save(f"# A title\n\n## The answer\n\n{table}\n![a plot](figures/%3Ci%3Edot%203.png)\n")
     html = (tmp_path / "simulated" / "report.html").read_text()
     (picture,) = re.findall(r'src="([^"]*)"', html)

@@ -120,10 +120,7 @@ def test_of_unseen_devices_every_fold_trains_on_all_others(strange, make_study):
     study = make_study("some", [f"{THEIRS}:Own"], real_gyros=[3])
     unseen = replace(strange, study=study.model_copy(update={"protocol": "leave_one_device_out"}))
     fits = {fit.fold: fit for fit in unseen.train() if fit.run.params["estimator"] != MEAN}
-    places = {
-        fold: {(imu, number) for _, _, imu, number, _ in fit.estimator.given}
-        for fold, fit in fits.items()
-    }
+    places = {fold: {row[2:4] for row in fit.estimator.given} for fold, fit in fits.items()}
     numbers = range(1, 11)  # others were made together with those that test
     assert places["without IMU 1"] == {(2, number) for number in numbers}
     assert places["without IMU 2"] == {(1, number) for number in numbers}
@@ -233,9 +230,7 @@ def test_a_fingerprint_knows_no_study_and_changes_with_no_narrowing(varied, make
         ("splits", {"fold_validation_recordings": 1}, lambda key: False),  # this is a hold-out
     ],
 )
-def test_a_setting_changes_the_runs_that_depend_on_it_and_no_others(
-    varied, group, change, affected
-):
+def test_a_setting_changes_the_runs_that_depend_on_it_and_no_other(varied, group, change, affected):
     """Reports find runs by fingerprint, so that the others are found whatever they carry."""
     settings = getattr(varied, group).model_copy(update=change)
     expected = {key for key in varied.fingerprints if affected(key)}

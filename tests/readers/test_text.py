@@ -127,9 +127,7 @@ def test_what_cannot_be_read_safely_is_refused(case, good, table):
         (",0,1,2,3,4,5\n", "|0|1|2|3|4|5", ""),
     ],
 )  # fmt: skip
-def test_rows_of_a_header_are_joined_and_lines_above_are_the_preamble(
-    header, names, preamble, table
-):
+def test_rows_of_a_header_are_joined_and_lines_above_are_a_preamble(header, names, preamble, table):
     log = table(header + "0.1,1,2,3,4,5,6\n" * 9)
     assert ("|".join(log.names), log.preamble) == (names, preamble)
     assert len(log.columns[0]) == 9
@@ -181,9 +179,8 @@ BOOT = ["ets Jun  8 2016 00:22:57", "rst:0x1 (POWERON_RESET)", "", "I2C ok"]
 
 
 def written(form):
-    rows = [
-        form.format(k=k, t=k / 100, x=x, y=y, z=z) for k, (x, y, z) in enumerate(VALUES.tolist())
-    ]
+    values = enumerate(VALUES.tolist())
+    rows = [form.format(k=k, t=k / 100, x=x, y=y, z=z) for k, (x, y, z) in values]
     return "\n".join([*BOOT, *rows[:20], "brown-out, 3 times", *rows[20:]]) + "\n"
 
 
