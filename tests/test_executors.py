@@ -23,9 +23,7 @@ from gyro_pipeline.parameters import Execution
 
 SERIAL = Execution(executor="serial", workers=None)
 PAIR = Execution(executor="processes", workers=2)
-
 pytestmark = pytest.mark.slow
-
 LONG_S = 120.0
 SOON_S = 60.0
 """Start-up of a worker on a busy machine included; a fraction of ``LONG_S``."""

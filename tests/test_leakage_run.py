@@ -9,11 +9,8 @@ WRITTEN = {
 BY_RECORDING = [("k_fold", name) for name in ("mean", "training_mean", "cnn", "cnn_shuffled")]
 WAYS = {
     **dict.fromkeys(BY_RECORDING, 3),  # of fits: two folds, and all recordings
-    **{
-        ("window_split", "cnn"): 2,
-        ("test_in_training", "cnn"): 1,
-        ("best_epoch_on_test", "cnn"): 2,
-    },
+    **dict.fromkeys((("window_split", "cnn"), ("best_epoch_on_test", "cnn")), 2),
+    ("test_in_training", "cnn"): 1,
 }
 
 

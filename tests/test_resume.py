@@ -19,11 +19,7 @@ WAYS = [(signal.SIGKILL, TRAINED, SOME), (signal.SIGINT, FINISHED, 1)]
 
 
 def stop(project, how, query, at_least):
-    """Start the run, stop it when the store shows so much progress, and look around.
-
-    Returns:
-        What it said, and the runs that were left.
-    """
+    """Start the run and stop it at so much progress: what it said, and the runs that are left."""
     process = project.start(*COMMAND)
     try:
         deadline = time.monotonic() + PATIENCE_S

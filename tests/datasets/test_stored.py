@@ -33,7 +33,6 @@ def stored(request, tmp_path):
 
 
 def test_what_is_not_what_was_written_is_refused_and_can_be_made_again(stored):
-    """A changed bit, a byte less, and a record that is gone or spoiled."""
     dataset, data, path = stored
     content, record = path.read_bytes(), path.with_name(f"{path.name}.made.json")
     flipped = bytearray(content)

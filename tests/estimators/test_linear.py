@@ -31,14 +31,6 @@ def halves(recordings, count):
     return tuple(recordings.isel(recording=part) for part in parts)
 
 
-def walking(simulate, count, seed, walk_seed):
-    """Recordings whose biases walk."""
-    recordings = simulate(WHITE, count, seed)
-    walk = np.random.default_rng(walk_seed).normal(0, 2 * MDPS, (1, count, 3)).cumsum(axis=1)
-    recordings["angular_rate"] = recordings.angular_rate + walk[..., None]
-    return recordings
-
-
 @pytest.mark.slow
 def test_it_is_the_dense_conditional_mean_given_training_and_window(simulate, training_set):
     """One normal distribution of training recordings and the new one, with a diffuse mean."""
@@ -90,7 +82,9 @@ def test_each_place_of_a_window_has_its_own_weights(simulate, training_set):
 
 @pytest.mark.slow
 def test_history_goes_on_with_calibrations_made_since_the_fit(simulate, training_set):
-    recordings = walking(simulate, 12, 0, 1)
+    recordings = simulate(WHITE, 12, 0)
+    walk = np.random.default_rng(1).normal(0, 2 * MDPS, (1, 12, 3)).cumsum(axis=1)
+    recordings["angular_rate"] = recordings.angular_rate + walk[..., None]
     labels = recordings.angular_rate.mean("sample", dtype=np.float64).to_numpy()[0]
     windows = recordings.angular_rate.to_numpy()[0, 11:, :, :SIZE]
     for estimator in (BestLinear(history=True), LastCalibration()):
@@ -101,9 +95,8 @@ def test_history_goes_on_with_calibrations_made_since_the_fit(simulate, training
         # its own calibration and later ones do not count
         other = fitted.with_calibrations(np.arange(9, 13), labels[8:] + [[0], [0], [0], [9]])
         np.testing.assert_array_equal(other.estimate(windows, recording=12)[0], current)
-        np.testing.assert_array_equal(
-            told.estimate(windows, recording=5)[0], fitted.estimate(windows, recording=5)[0]
-        )
+        early, before = (one.estimate(windows, recording=5)[0] for one in (told, fitted))
+        np.testing.assert_array_equal(early, before)
     mean = TrainingMean().fit(training_set(recordings))
     assert mean.with_calibrations(np.arange(9, 13), labels[8:]) is mean
 

@@ -20,6 +20,7 @@ SETTINGS = Training(
     **{"epochs": 6, "batch_size": 8, "learning_rate": 1e-3, "decay": 0.1, "decay_every": 4},
 )
 ROLES = {9: VALIDATE, 10: VALIDATE}
+PAPER = "gyro_pipeline.learning.network:CalibrationNetwork"
 
 
 @pytest.fixture(scope="module")
@@ -30,9 +31,6 @@ def recordings(simulate):
 @pytest.fixture(scope="module")
 def training(training_set, recordings):
     return training_set(recordings, roles=ROLES)
-
-
-PAPER = "gyro_pipeline.learning.network:CalibrationNetwork"
 
 
 def network(seed=0, shuffled=False, **changes):

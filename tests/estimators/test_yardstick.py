@@ -9,7 +9,6 @@ from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.recording_model import RecordingModel, best_linear
 
 pytestmark = pytest.mark.slow
-
 SAMPLES, RECORDING_S = 650, 87.0  # a twentieth of SparkFun's rate: what matters is N, not sigma
 RATE = SAMPLES / RECORDING_S
 N, TAU = 3.3 * MDPS, 0.31 * MDPS

@@ -104,7 +104,6 @@ def test_times_before_the_shortest_have_no_influence_and_variances_are_positive(
 
 
 def test_real_memsense_white_noise(real_file):
-    """Of recordings (recording, axis, sample) at 250 Hz."""
-    recordings = np.load(real_file("memsense_test_real.npy"))
+    recordings = np.load(real_file("memsense_test_real.npy"))  # (recording, axis, sample), 250 Hz
     white = [fit_mean(recordings[:, axis], 250.0).white for axis in range(3)]
     np.testing.assert_allclose(white, np.array([5.3, 4.7, 6.0]) * MDPS, rtol=0.05)

@@ -24,10 +24,10 @@ from gyro_pipeline.tracking import CURVE, ERRORS, EVALUATED_WITH, FINGERPRINT
 from gyro_pipeline.tracking import SCORES as TABLE
 
 WINDOW_S, SIZE, RECORDING_S = 10.0, 200, 52.0
-
 pytestmark = pytest.mark.slow
 TESTED = (11, 12, 13, 14)
 STARTS = range(0, 801, 200)
+SEVERAL = [MEAN, CNN, "best_linear", "empirical_bayes", "ridge_same_time", "last_calibration"]
 
 
 def table_of(learned, tested, imu=1, fold="hold-out"):
@@ -438,9 +438,6 @@ def test_unseen_devices_are_judged_one_by_one_and_nothing_is_better_than_the_mea
     half = 4.302653 * np.sqrt(2 * left.var())
     ends = np.log([row.lo, row.hi])
     np.testing.assert_allclose(ends, np.log(row.value) + [-half, half], rtol=1e-5)
-
-
-SEVERAL = [MEAN, CNN, "best_linear", "empirical_bayes", "ridge_same_time", "last_calibration"]
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ from gyro_pipeline.pipelines.reporting.leakage import pool_leakage
 from gyro_pipeline.studies import CNN, CNN_SHUFFLED
 
 pytestmark = pytest.mark.slow
+SPREAD = 5e-3
 
 
 @pytest.fixture(scope="module")
@@ -40,9 +41,6 @@ def leak_study(make_world, make_study, parameters, as_stored):
         return pool_leakage(*given, **stored)["results"].set_index(["leak", "estimator"])
 
     return run
-
-
-SPREAD = 5e-3
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,6 @@ TEXT = (Path(__file__).parents[2] / "docs" / "extending.md").read_text()
 NETWORK, LINES = (
     re.search(rf"```{kind}\n(.*?)```", TEXT, re.DOTALL)[1] for kind in ("python", "yaml")
 )
-
 pytestmark = pytest.mark.slow
 
 

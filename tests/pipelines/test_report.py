@@ -18,8 +18,6 @@ from gyro_pipeline.pipelines.reporting.recordings import describe, drift, start_
 
 SENSORS = ("dot", "sparkfun", "ng")
 WARM_UP_S, AMPLITUDE = 5.0, 0.02
-
-
 pytestmark = pytest.mark.slow
 
 
@@ -58,9 +56,6 @@ def report(described, parameters):
     p = parameters("base")
     given = p.published, p.ground_truth, p.studies, {name: {} for name in p.sensors}
     return write_report("test", Only(), *given, described)
-
-
-# recordings
 
 
 def test_drift_shows_a_warm_up_that_all_power_ons_share_and_none_where_there_is_none(recordings):
@@ -150,9 +145,6 @@ def test_the_warm_up_that_a_published_gain_needs_is_in_the_answer(described, rep
     page = write_report("test", Only(), *given, {"sparkfun/description": lambda: simulated})[2]
     assert "on measured data, bounds a warm-up" in page
     assert "a warm-up (SparkFun " in report[2] and "; NG " in report[2]
-
-
-# the page
 
 
 def test_the_page_needs_no_other_file_and_a_list_links_to_all_reports(tmp_path):

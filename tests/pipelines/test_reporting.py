@@ -28,12 +28,9 @@ SCORED = {
 
 
 def curve(recordings):
-    rows = [
-        (recording, "paper", windows, time_s, count * rmse**2, count)
-        for recording in recordings
-        for windows, count in (("first", 3), ("all", 6))
-        for time_s, rmse in zip(TIMES_S, MEAN_RMSE, strict=True)
-    ]
+    points = zip(TIMES_S, MEAN_RMSE, strict=True)
+    each = product(recordings, (("first", 3), ("all", 6)), points)
+    rows = [(r, "paper", windows, t, n * rmse**2, n) for r, (windows, n), (t, rmse) in each]
     columns = ["recording", "truth", "windows", "time_s", "sum_sq", "count"]
     return pd.DataFrame(rows, columns=columns)
 
@@ -71,13 +68,9 @@ def study_of(name="augmentation", estimators=(CNN,), real=(3,), virtual=(0,), se
 
 
 @pytest.fixture(scope="module")
-def base(parameters):
-    return parameters("base")
-
-
-@pytest.fixture(scope="module")
-def make_run(base):
+def make_run(parameters):
     """A finished run of a row of a study."""
+    base = parameters("base")
 
     def make(run_id, table, study=None, tags=(), oracle_p=0.5, **row):
         study = study or study_of()
@@ -145,8 +138,9 @@ def pool():
 
 
 @pytest.fixture(scope="module")
-def write(base):
+def write(parameters):
     """The report of some tables, by their addresses."""
+    base = parameters("base")
 
     def make(stored, source="simulated", only=None, **fresh):
         # each as its CSV file gives it back
@@ -161,9 +155,6 @@ def write(base):
 
 def stored_as(study, pooled_tables):
     return {f"{study}/{name}": table for name, table in pooled_tables.items()}
-
-
-# pooling
 
 
 def test_a_result_is_computed_from_the_errors_of_its_run(make_run, mean, pool):
@@ -229,9 +220,6 @@ def test_results_of_an_earlier_version_are_not_read_as_those_of_this_one(grid, w
     earlier = results.rename(columns={"test_rmse_dps": "test_rmse_dps_all"})
     page = write({"augmentation/results": earlier})[2]
     assert "There is no finished run with the current settings yet" in page
-
-
-# the tables and figures of the paper
 
 
 @pytest.fixture(scope="module")
@@ -368,9 +356,6 @@ def test_the_forest_has_a_row_for_each_published_result_of_the_sensors(grid, rep
         published = [one for one in ax.lines if one.get_label() == "published"]
         gains = [float(one.get_xdata()[0]) for one in published]
         assert gains == [57, 79, 88, 77, 87]
-
-
-# words
 
 
 def test_what_beats_the_oracle_is_called_a_defect(make_run, mean, pool, write, report):

@@ -12,7 +12,6 @@ from gyro_pipeline.pipelines.windowed_splits.protocols import check_table
 from gyro_pipeline.splits import split_recordings
 
 RATE_HZ = 20.0
-
 pytestmark = pytest.mark.slow
 
 

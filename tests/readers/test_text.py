@@ -1,4 +1,7 @@
-"""Delimited texts, odd and damaged ones: each is the table that it should be, or a message."""
+"""Delimited texts, odd and damaged ones: each is the table that it should be, or a message.
+
+That of lines that are no table shows an expression, and pasted, it reads them.
+"""
 
 import re
 
@@ -165,8 +168,6 @@ def test_one_row_in_a_hundred_may_be_unreadable_but_no_more_and_takes_no_other_w
         assert "row 19 (line 21)" in log.findings[0].detail
         assert len(log.columns[0]) == 29
 
-
-# lines that are no table: the refusal shows an expression, and pasted, it reads them
 
 VALUES = np.random.default_rng(3).normal(0, 20, (40, 3)).round(3)
 LINES = {  # how a line is written, and the groups that the expression has
