@@ -12,6 +12,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+from collections import namedtuple
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,12 +38,10 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)
 
 
-@dataclass(frozen=True)
-class Done:
-    """What a command left on the terminal."""
-
-    code: int
-    output: str
+Done = namedtuple("Done", "code output")
+"""What a command left on the terminal."""
+Ran = namedtuple("Ran", "project done runs changes")
+"""A finished run of the smoke environment, which changes of the parameters make small."""
 
 
 @dataclass(frozen=True)
@@ -61,17 +60,13 @@ class Project:
 
     def start(self, *arguments):
         """``kedro run`` in a process group of its own, as a shell would start it."""
+        command = [sys.executable, "-m", "kedro", "run", *arguments]
+        given = {"cwd": self.folder, "env": dict(os.environ) | {"PYTHONPATH": str(ROOT / "src")}}
+        # children inherit that a shell's background jobs ignore Ctrl-C
+        given["preexec_fn"] = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
         with self.log.open("wb") as output:
-            return subprocess.Popen(
-                [sys.executable, "-m", "kedro", "run", *arguments],
-                cwd=self.folder,
-                env=dict(os.environ) | {"PYTHONPATH": str(ROOT / "src")},
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-                # children inherit that a shell's background jobs ignore Ctrl-C
-                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-            )
+            told = {"stdout": output, "stderr": subprocess.STDOUT}
+            return subprocess.Popen(command, start_new_session=True, **given, **told)
 
     def kedro_run(self, *arguments):
         """``kedro run`` to its end, in a process of its own."""
@@ -105,8 +100,11 @@ class Project:
     def _here(self, run):
         from kedro.framework.startup import bootstrap_project
 
-        code = 0
-        with _logged() as log, contextlib.chdir(self.folder):
+        code, log, logger = 0, io.StringIO(), logging.getLogger("gyro_pipeline")
+        handler, level = logging.StreamHandler(log), logger.level
+        logger.addHandler(handler)
+        logger.setLevel(logging.INFO)
+        with contextlib.chdir(self.folder):
             try:
                 bootstrap_project(self.folder)
                 run()
@@ -114,6 +112,9 @@ class Project:
                 code = 1
                 with contextlib.redirect_stderr(log):  # where a traceback would go
                     sys.excepthook(type(error), error, error.__traceback__)
+            finally:
+                logger.removeHandler(handler)
+                logger.setLevel(level)
         return Done(code, log.getvalue())
 
     def amend(self, env, **parameters):
@@ -153,21 +154,6 @@ class Project:
         paths = sorted(path for path in (self.folder / part).rglob("*") if path.is_file())
         paths = [path for path in paths if path.name != "run.lock"]
         return {str(path.relative_to(self.folder)): path.read_bytes() for path in paths}
-
-
-@contextlib.contextmanager
-def _logged():
-    """What the project says on the terminal."""
-    log = io.StringIO()
-    handler, logger = logging.StreamHandler(log), logging.getLogger("gyro_pipeline")
-    level = logger.level
-    logger.addHandler(handler)
-    try:
-        logger.setLevel(logging.INFO)
-        yield log
-    finally:
-        logger.removeHandler(handler)
-        logger.setLevel(level)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -243,17 +229,6 @@ def new_project(tmp_path_factory, made_once):
     return make
 
 
-@dataclass(frozen=True)
-class Ran:
-    """A finished run of the smoke environment. Nothing changes it: see ``smoke_copy``."""
-
-    project: Project
-    done: Done
-    runs: list
-    changes: dict
-    """Of the parameters, which are fewer."""
-
-
 @pytest.fixture(autouse=True, scope="module")
 def own_workers():
     """Workers that outlive a file of tests do not find the modules of the next one."""
@@ -266,7 +241,7 @@ def own_workers():
 
 @pytest.fixture(scope="session")
 def smoke(made_once):
-    """``kedro run --pipeline=augmentation --env=smoke`` in a project without anything."""
+    """``kedro run --pipeline=augmentation --env=smoke``, once; to change it, see ``smoke_copy``."""
 
     def make(folder):
         project = configured(folder)

@@ -12,18 +12,15 @@ NAME = "gyro_pipeline"
 STAGES = [path.name for path in (PACKAGE / "pipelines").iterdir() if (path / "nodes.py").exists()]
 
 # What the modules of each part may import of this package, besides their own part.
-WORDS = {
-    "conventions": "",
-    "fingerprints": "",
-    "units": "",
-    "markup": "",
+WORDS = dict.fromkeys(("conventions", "fingerprints", "units", "markup", "pipelines"), "")
+WORDS |= dict.fromkeys(("__init__", "__main__"), "")
+WORDS |= dict.fromkeys(("logs", "physics", "boundary", "run_lock", "store"), "conventions")
+WORDS |= {
     "parameters": "conventions units",
     "executors": "conventions parameters",
     "studies": "conventions estimators parameters",
-    "logs": "conventions",
     "readers": "conventions logs parameters units",
     "tracking": "conventions estimators",
-    "physics": "conventions",
     "estimators": "conventions executors learning parameters physics",
     "quality": "conventions logs parameters physics",
     "calibrator": "__init__ conventions parameters physics quality readers units",
@@ -34,17 +31,11 @@ WORDS = {
     "learning": "conventions executors parameters physics",
     "datasets": "conventions estimators fingerprints logs markup parameters physics readers "
     "tracking",
-    "pipelines": "",
     "pipeline_registry": "parameters pipelines.assembly",
-    "boundary": "conventions",
-    "run_lock": "conventions",
     "runner": "conventions datasets estimators fingerprints",
     "session": "boundary conventions parameters pipeline_registry run_lock runner",
     "hooks": "boundary conventions datasets parameters session studies",
     "settings": "hooks session",
-    "store": "conventions",
-    "__init__": "",
-    "__main__": "",
 }
 OF_A_STAGE = (
     "conventions estimators executors fingerprints learning logs markup parameters "
@@ -52,10 +43,8 @@ OF_A_STAGE = (
 )
 ALLOWED = {part: set(words.split()) for part, words in WORDS.items()}
 ALLOWED |= {f"pipelines.{stage}": set(OF_A_STAGE.split()) for stage in STAGES}
-ALLOWED["pipelines.assembly"] = {
-    *("parameters", "pipelines", "studies"),
-    *(f"pipelines.{stage}" for stage in STAGES),
-}
+STAGE_PARTS = {f"pipelines.{stage}" for stage in STAGES}
+ALLOWED["pipelines.assembly"] = {"parameters", "pipelines", "studies"} | STAGE_PARTS
 
 
 @cache
@@ -118,11 +107,8 @@ def violations(name, package, source):
     """Imports that point the wrong way."""
     own = part_of(name)
     targets = {target: part_of(target) for target in imported(source, package)}
-    return {
-        target
-        for target, part in targets.items()
-        if part not in {None, own} | ALLOWED.get(own, set())
-    }
+    allowed = {None, own} | ALLOWED.get(own, set())
+    return {target for target, part in targets.items() if part not in allowed}
 
 
 def test_imports_point_one_way_between_seven_stages_and_all_else():

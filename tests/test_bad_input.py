@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 
 FILES, FOLDER = "memsense.raw_logs.files", "data/01_raw/mine"
-
-
 ENVIRONMENT = {
     "globals": "{source: mine, sensors: {memsense: {samples: 1300}}}",
     "parameters": "only: {sensor: memsense, real_gyros: 3}",

@@ -33,18 +33,12 @@ KINDS = {
     "reporting.report": "reports.ReportPage",
 }
 TYPOS = {
-    "sparkfun.ground_thruth.bias",
-    "augmentation.sparkfun.training.run",
-    "augmentation.sparkfun.windowed_splits.window",
-    "augmentation.reporting.result",
-    "reporting.table",
+    *("sparkfun.ground_thruth.bias", "augmentation.sparkfun.training.run", "reporting.table"),
+    *("augmentation.sparkfun.windowed_splits.window", "augmentation.reporting.result"),
 }
 
 # The package says so itself, but pytest sets filters of its own.
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.filterwarnings("ignore:One or more dataset names contain"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:One or more dataset names")]
 
 
 @cache

@@ -33,6 +33,20 @@ FIGURES = {
     *("mg_convergence", "augmentation_sparkfun_3_real", "augmentation_sparkfun_12_real"),
     *("augmentation_dot_3_real", "augmentation_dot_12_real"),
 }
+LARGEST = """
+import numpy as np
+from gyro_pipeline.conventions import ALL
+from gyro_pipeline.estimators.base import Estimator
+
+class Largest(Estimator):
+    "Says how many IMUs it was fitted to."
+    uses = ALL
+    def _fit(self, training):
+        self.imus = len(training.imus)
+    def _estimate(self, windows):
+        return self.imus, np.nan
+"""
+UP_TO_DATE = r"(\d+) of (\d+) nodes are up to date and not run again \((.*)\)"
 
 
 def report(project):
@@ -150,9 +164,7 @@ def test_reporting_trains_nothing_and_says_in_rows_what_is_missing(smoke, smoke_
     assert "| kedro run --env=smoke |" in page.partition("### What was not made")[2]
 
 
-def test_another_setting_trains_anew_and_a_whole_run_shares_what_another_study_has(
-    smoke, smoke_copy
-):
+def test_another_setting_trains_anew_and_a_whole_run_shares_what_a_study_has(smoke, smoke_copy):
     smoke_copy.amend("smoke", studies={"real2real": {"estimators": ["cnn"]}})
     only = "only.sensor=sparkfun,only.window_s=10,only.real_gyros=3"
     whole = smoke_copy.command("--env=smoke", f"--params={only}")
@@ -190,25 +202,7 @@ def test_another_setting_trains_anew_and_a_whole_run_shares_what_another_study_h
     assert f"{own.partition('/')[0]}/report.html" in done.output
 
 
-LARGEST = """
-import numpy as np
-from gyro_pipeline.conventions import ALL
-from gyro_pipeline.estimators.base import Estimator
-
-class Largest(Estimator):
-    "Says how many IMUs it was fitted to."
-    uses = ALL
-    def _fit(self, training):
-        self.imus = len(training.imus)
-    def _estimate(self, windows):
-        return self.imus, np.nan
-"""
-UP_TO_DATE = r"(\d+) of (\d+) nodes are up to date and not run again \((.*)\)"
-
-
-def test_an_estimator_of_ones_own_is_trained_on_what_rows_name_and_only_what_changed_runs_again(
-    new_project, monkeypatch
-):
+def test_an_estimator_of_ones_own_is_trained_and_only_changes_run_again(new_project, monkeypatch):
     project = new_project()
     (project.folder / "src/of_a_stranger.py").write_text(LARGEST)
     asked = {

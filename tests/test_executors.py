@@ -23,9 +23,7 @@ from gyro_pipeline.parameters import Execution
 
 SERIAL = Execution(executor="serial", workers=None)
 PAIR = Execution(executor="processes", workers=2)
-
 pytestmark = pytest.mark.slow
-
 LONG_S = 120.0
 SOON_S = 60.0
 """Start-up of a worker on a busy machine included; a fraction of ``LONG_S``."""
@@ -140,9 +138,7 @@ def test_a_worker_that_is_killed_is_an_error_and_no_endless_wait(here, tmp_path)
             list(run_jobs(jobs, here.sleeps, PAIR, "killed"))
 
 
-def test_a_stopped_worker_is_named_and_finishes_its_job_when_it_continues(
-    here, tmp_path, monkeypatch, caplog
-):
+def test_a_stopped_worker_is_named_and_can_continue(here, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(executors, "_LOG_EVERY_S", 0.1)
     jobs = [here.Job("long", 1.0, str(tmp_path)), here.Job("short", 0.1, str(tmp_path))]
 
@@ -161,14 +157,10 @@ def test_a_stopped_worker_is_named_and_finishes_its_job_when_it_continues(
 @pytest.fixture
 def program(tmp_path):
     """This file as a program in a process group of its own, with workers at work."""
-    process = subprocess.Popen(
-        [sys.executable, __file__, str(tmp_path)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        start_new_session=True,
-        # A shell lets what it runs in the background ignore Ctrl-C, and children inherit that.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
+    told = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "start_new_session": True}
+    # A shell lets what it runs in the background ignore Ctrl-C, and children inherit that.
+    told["preexec_fn"] = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.Popen([sys.executable, __file__, str(tmp_path)], **told)
     try:
         soon(lambda: len(list(tmp_path.glob("*.pid"))) == 2, "its workers have not started")
         yield process
@@ -203,10 +195,8 @@ def cluster(here, tmp_path):
         started.append(process)
         return process
 
-    scheduler = start(
-        *("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"),
-        *("--no-dashboard", "--scheduler-file", str(address)),
-    )
+    settings = "--host 127.0.0.1 --port 0 --no-dashboard --scheduler-file".split()
+    scheduler = start("distributed.cli.dask_scheduler", *settings, str(address))
     soon(address.exists, "no scheduler")
     settings = "--nthreads 1 --no-dashboard --no-nanny --scheduler-file".split()
     workers = [start("distributed.cli.dask_worker", *settings, str(address)) for _ in range(2)]
@@ -232,9 +222,7 @@ def test_a_cluster_gives_what_processes_give_also_where_a_worker_is_killed(here,
     assert begun.count("long") == 2
 
 
-def test_a_scheduler_that_is_killed_or_was_never_there_is_an_error(
-    here, tmp_path, cluster, monkeypatch
-):
+def test_a_scheduler_that_is_killed_or_not_there_is_an_error(here, tmp_path, cluster, monkeypatch):
     scheduler, _, address = cluster
     jobs = [here.Job("long", LONG_S, str(tmp_path)), here.Job("short", 0.1, str(tmp_path))]
     results = run_jobs(jobs, here.sleeps, on(address), "cluster")

@@ -9,6 +9,7 @@ import gyro_pipeline
 from gyro_pipeline import fingerprints
 from gyro_pipeline.fingerprints import code_hash, data_hash, fingerprint
 
+ARRAY = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
 CODE = '''"""A module."""
 
 import math
@@ -99,9 +100,6 @@ def test_an_installed_module_counts_by_its_version(monkeypatch):
         code_hash.cache_clear()
         assert (code_hash("numpy.linalg:norm") == before) == same
     forget()
-
-
-ARRAY = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
 
 
 def test_data_hash_sees_values_shape_type_and_labels_but_no_memory_layout():

@@ -10,22 +10,17 @@ from gyro_pipeline.datasets.tracked_runs import TrackedRuns
 from gyro_pipeline.hooks import Provenance
 from gyro_pipeline.session import Session
 
+PARALLEL = object.__new__(ParallelRunner)  # one that is made starts a process
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
+
+def test_ways_to_run_that_cannot_end_well_are_refused():
+    for options, words in (
         ({"only_missing_outputs": True}, "--only-missing-outputs: .* type kedro run without it"),
-        # one that was made starts a process
-        (
-            {"runner": object.__new__(ParallelRunner)},
-            "ParallelRunner: .*execution.workers=N",
-        ),
+        ({"runner": PARALLEL}, "ParallelRunner: .*execution.workers=N"),
         ({"runner": SequentialRunner(is_async=True)}, "--async: .* type kedro run without it"),
-    ],
-)
-def test_ways_to_run_that_cannot_end_well_are_refused(options, words):
-    with pytest.raises(InputError, match=words):
-        object.__new__(Session).run(**options)
+    ):
+        with pytest.raises(InputError, match=words):
+            object.__new__(Session).run(**options)
 
 
 def test_new_runs_are_marked_with_who_made_them_by_which_command(tmp_path, monkeypatch):

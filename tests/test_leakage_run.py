@@ -6,14 +6,11 @@ WRITTEN = {
     *(f"tables/leakage_results.{ending}" for ending in ("csv", "md", "tex")),
     *(f"figures/leakage_accuracy_against_stride.{ending}" for ending in ("png", "svg")),
 }
+BY_RECORDING = [("k_fold", name) for name in ("mean", "training_mean", "cnn", "cnn_shuffled")]
 WAYS = {
-    ("k_fold", "mean"): 3,  # of fits: two folds, and all recordings
-    ("k_fold", "training_mean"): 3,
-    ("k_fold", "cnn"): 3,
-    ("k_fold", "cnn_shuffled"): 3,
-    ("window_split", "cnn"): 2,
+    **dict.fromkeys(BY_RECORDING, 3),  # of fits: two folds, and all recordings
+    **dict.fromkeys((("window_split", "cnn"), ("best_epoch_on_test", "cnn")), 2),
     ("test_in_training", "cnn"): 1,
-    ("best_epoch_on_test", "cnn"): 2,
 }
 
 

@@ -98,7 +98,6 @@ SWING = X + [0, 20, 0] * np.sin(2 * np.pi * S / 3)[:, None]
 LEVEL = np.array([0.3, -0.2, 0.1])
 FREED = still(bias=(0, 0, 0))
 STEPS = np.random.default_rng(0).normal(10, 0.3, N)
-
 RAMP = still((2, 0.03, 0.3))
 RAMP[:12, 0] = np.linspace(-0.3, 2, 12)
 

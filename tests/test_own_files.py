@@ -13,7 +13,6 @@ from gyro_pipeline.parameters import ReaderOptions
 BIAS, NOISE, RATE_HZ = (0.7, -0.4, 0.15), 0.05, 100
 HEADER = "time (s),gx (rad/s),gy (rad/s),gz (rad/s)"
 FOLDER = "data/01_raw/mine"
-
 ENVIRONMENT = {
     "globals": "source: mine\nsensors: {device: {}}\n",
     "parameters": "only: {sensor: device}\n",

@@ -13,6 +13,7 @@ from gyro_pipeline.settings import CONFIG_LOADER_ARGS
 from gyro_pipeline.studies import check_possible
 
 CONF = str(Path(__file__).parents[1] / "conf")
+METHOD_1 = {"sparkfun": {"virtual_gyros": [12]}}
 
 
 @pytest.fixture
@@ -67,9 +68,6 @@ def test_a_number_of_steps_decides_the_epochs_of_any_number_of_windows(parameter
 
 def study(name, **changes):
     return {"studies": {name: changes}}
-
-
-METHOD_1 = {"sparkfun": {"virtual_gyros": [12]}}
 
 
 @pytest.mark.parametrize(

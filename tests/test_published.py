@@ -22,11 +22,6 @@ def text(real_file):
     return (folder / PAPER).read_text()
 
 
-@pytest.fixture(scope="module")
-def published(parameters):
-    return parameters("base").published
-
-
 def table(text, label):
     """Cells of the rows of one table, without what only sets it."""
     (body,) = [
@@ -39,8 +34,9 @@ def table(text, label):
 
 
 @pytest.mark.parametrize("label", RESULTS)
-def test_results_are_the_papers(text, published, label):
-    results = zip(table(text, label), published.of_table(RESULTS[label]), strict=True)
+def test_results_are_the_papers(text, parameters, label):
+    rows = parameters("base").published.of_table(RESULTS[label])
+    results = zip(table(text, label), rows, strict=True)
     for (approach, gyroscopes, saving, gain), row in results:
         if label == "tab:generalization":
             assert row.sensor == SENSORS[approach]
@@ -55,8 +51,8 @@ def test_results_are_the_papers(text, published, label):
         assert row.section.startswith("IV-G")
 
 
-def test_specifications_and_hours_are_the_papers(text, published):
-    specifications = table(text, "sensor_specifications")
+def test_specifications_and_hours_are_the_papers(text, parameters):
+    published, specifications = parameters("base").published, table(text, "sensor_specifications")
     for (name, rate, *figures), row in zip(specifications, published.specifications, strict=True):
         assert row.name == name
         ends = [float(end) for end in rate.split("-")]

@@ -10,11 +10,8 @@ import pytest
 
 PATIENCE_S = 300
 SENSOR = "dot"
-COMMAND = (
-    "--pipeline=augmentation",
-    "--env=smoke",
-    f"--params=only.sensor={SENSOR},only.real_gyros=3",
-)
+ONLY = f"--params=only.sensor={SENSOR},only.real_gyros=3"
+COMMAND = ("--pipeline=augmentation", "--env=smoke", ONLY)
 TRAINED = "select count(*) from tags where key = 'trained'"
 FINISHED = "select count(*) from runs where status = 'FINISHED'"
 RUNS, SOME = 7, 2
@@ -22,11 +19,7 @@ WAYS = [(signal.SIGKILL, TRAINED, SOME), (signal.SIGINT, FINISHED, 1)]
 
 
 def stop(project, how, query, at_least):
-    """Start the run, stop it when the store shows so much progress, and look around.
-
-    Returns:
-        What it said, and the runs that were left.
-    """
+    """Start the run and stop it at so much progress: what it said, and the runs that are left."""
     process = project.start(*COMMAND)
     try:
         deadline = time.monotonic() + PATIENCE_S
@@ -62,9 +55,7 @@ def number(words, output):
     return int(re.search(rf"(\d+) {words}", output)[1])
 
 
-def test_what_was_made_is_not_made_again_and_in_the_end_it_is_as_if_nothing_had_stopped_it(
-    smoke, new_project
-):
+def test_what_was_made_is_not_made_again_and_ends_as_if_nothing_had_stopped_it(smoke, new_project):
     """Killed while it trains, and interrupted while it evaluates."""
     project = new_project()
     project.amend("smoke", **smoke.changes)

@@ -16,7 +16,6 @@ def runs(folder):
 
 
 def test_after_a_move_the_artifacts_are_found_again(smoke, tmp_path, capsys):
-    """Of a smoke run's store, also where a server has them."""
     folder = tmp_path / "moved here"  # a space is written as %20
     folder.mkdir()
     shutil.copytree(smoke.project.folder / "mlruns", folder / "mlruns")

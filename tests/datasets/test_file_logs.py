@@ -57,9 +57,7 @@ def test_files_behind_links_count_and_circles_end(tmp_path):
         logs.load().entries[1].read()
 
 
-def test_odd_names_are_shown_escaped_and_what_is_no_file_is_rejected(
-    tmp_path, caplog, read_logs, parameters
-):
+def test_odd_names_are_escaped_and_a_pipe_is_rejected(tmp_path, caplog, read_logs, parameters):
     caplog.set_level(logging.INFO, "gyro_pipeline")
     names = [b"1_\xff.csv", "2_ü<b>=x\n.csv".encode(), b"3_.csv"]
     put(tmp_path, *map(os.fsdecode, names[:2]))

@@ -20,6 +20,7 @@ from gyro_pipeline.datasets.published_logs import PublishedLogs
 CONTENT = np.random.default_rng(0).bytes(300_000)
 HALF = len(CONTENT) // 2
 URL_PATH = "/data/made.npy"
+SMALL = {"sparkfun": ("sf", 4), "dot": ("dots", 4), "ng": ("ng", 2), "memsense": ("memsense", 2)}
 
 
 class Server:
@@ -166,9 +167,7 @@ def test_a_wrong_or_an_endless_file_is_refused_and_nothing_of_it_is_kept(server,
 
 
 @pytest.mark.parametrize(("code", "tries"), [(404, 1), (503, 5)])
-def test_a_busy_server_is_asked_again_for_a_while_and_another_answer_is_final(
-    server, path, code, tries
-):
+def test_a_busy_server_is_asked_again_and_another_answer_is_final(server, path, code, tries):
     server.faults = [server.status(code)] * 5
     message = refusal(server, path)
     assert f"cannot fetch made.npy from {server.address}{URL_PATH}: {code} " in message
@@ -258,13 +257,7 @@ def test_the_real_file_has_the_blob_id_that_the_environment_asks_for(real_file):
     assert f"{path.name}, blob: {blob_id(path)}" in catalog.read_text()
 
 
-# the environment
-
-SMALL = {"sparkfun": ("sf", 4), "dot": ("dots", 4), "ng": ("ng", 2), "memsense": ("memsense", 2)}
-
-
 def test_the_environment_reads_the_published_files_of_all_sensors(server, new_project):
-    """The environment ``published`` asks for the blob ids of small files."""
     project = new_project()
     conf, raw = project.folder / "conf/published", project.folder / "data/01_raw"
     sensors = dict.fromkeys(SMALL, {"samples": 1300})  # a tenth of the rate

@@ -6,22 +6,16 @@ import pandas as pd
 
 from gyro_pipeline.datasets.reports import ReportFigure, ReportTable
 
-TABLE = pd.DataFrame(
-    {
-        "row_name": ["3 real & 12_virtual", "[1.2, 3.4] | 50 %"],
-        "RMSE, mdps": [1.58541234, np.nan],
-        "n": [1, 20],
-        "samples": [13000.0, 1494.0],
-    }
-)
+TABLE = pd.DataFrame({"row_name": ["3 real & 12_virtual", "[1.2, 3.4] | 50 %"]})
+TABLE[["RMSE, mdps", "n", "samples"]] = [1.58541234, 1, 13000.0], [np.nan, 20, 1494.0]
+TABLE = TABLE.astype({"n": int})
 
 
 def test_a_table_is_written_in_three_formats_and_read_with_all_digits(tmp_path):
     report = ReportTable(str(tmp_path / "new" / "window_0.5s.csv"))
     report.save(TABLE)
-    assert sorted(os.listdir(tmp_path / "new")) == [
-        f"window_0.5s{suffix}" for suffix in (".csv", ".md", ".tex")
-    ]
+    names = [f"window_0.5s.{kind}" for kind in ("csv", "md", "tex")]
+    assert sorted(os.listdir(tmp_path / "new")) == names
     pd.testing.assert_frame_equal(report.load(), TABLE, check_exact=True)
     assert (tmp_path / "new" / "window_0.5s.md").read_text() == (
         "| row_name | RMSE, mdps | n | samples |\n"

@@ -36,17 +36,14 @@ def recordings(source):
     return drawn.assign(angular_rate=labelled)
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
+def test_what_it_takes_to_simulate_a_sensor_is_named(tmp_path):
+    for changes, words in (
         ({"imus": None, "simulated": None}, "dot has no files: .*globals.yml: imus, s"),
         ({"rate_hz": 90}, "rate_hz is 90, samples / recording_s 100; correct one"),
         ({"model": {"warm_up": WARM_UP | {"time_constant_s": [2, 1]}}}, "time_constant_s"),
-    ],
-)
-def test_what_it_takes_to_simulate_a_sensor_is_named(tmp_path, changes, words):
-    with pytest.raises(InputError, match=words):
-        simulated(tmp_path, **changes)
+    ):
+        with pytest.raises(InputError, match=words):
+            simulated(tmp_path, **changes)
 
 
 def test_files_have_the_published_layout_and_changed_ones_are_refused(tmp_path):

@@ -105,9 +105,7 @@ def test_masked_samples_hardly_matter_and_recordings_that_a_device_lacks_are_lef
         np.testing.assert_allclose(bias, make(name).fit(training_set(fewer)).estimate(windows)[0])
 
 
-def test_averages_are_those_of_numpy_and_scipy_and_need_no_fit_but_for_the_sigma(
-    recordings, windows, training_set
-):
+def test_averages_are_numpys_and_only_the_sigma_needs_a_fit(recordings, windows, training_set):
     exact = windows.astype(np.float64)
     for name, expected in {
         "mean": exact.mean(axis=-1),
@@ -132,9 +130,7 @@ def test_the_constant_is_the_mean_of_the_labels(recordings, labels, windows, tra
     np.testing.assert_allclose(sigma[0], labels.std(axis=0, ddof=1) * np.sqrt(1 + 1 / 12))
 
 
-def test_the_last_calibration_is_that_of_the_recording_before(
-    recordings, labels, windows, training_set
-):
+def test_the_last_calibration_is_of_the_recording_before(recordings, labels, windows, training_set):
     estimator = make("last_calibration").fit(training_set(recordings.sel(recording=[2, 7, 4])))
     for number, stored in {3: 2, 4: 2, 5: 4, 7: 4, 8: 7, None: 7}.items():
         bias, _ = estimator.estimate(windows[:1], recording=number)

@@ -60,18 +60,15 @@ def jobs_of(training, names, seeds=(0,)):
     ]
 
 
-@pytest.mark.parametrize(
-    ("name", "told"),
-    [
+def test_a_name_of_no_estimator_is_refused(stranger):
+    for name, told in (
         ("kalman", "unknown estimator 'kalman'; expected one of mean, .* package.module:Class"),
         ("not_there:Mine", "No module named 'not_there'; expected package.module:Class"),
         ("a_strangers_file:Other", "has no attribute 'Other'"),
         ("a_strangers_file:NoEstimator", "expected a subclass of .*Estimator or of torch.nn.Mod"),
-    ],
-)
-def test_a_name_of_no_estimator_is_refused(stranger, name, told):
-    with pytest.raises(InputError, match=told):
-        estimator_class(name)
+    ):
+        with pytest.raises(InputError, match=told):
+            estimator_class(name)
 
 
 @pytest.mark.slow

@@ -17,9 +17,8 @@ RATE, SAMPLES, SIZE = 20.0, 800, 200
 N, TAU = 5 * MDPS, 1 * MDPS
 WHITE = model_of(SAMPLES, RATE, NoiseFigures(N, 0, 0), 0.0, TAU)
 COLOURED = model_of(SAMPLES, RATE, NoiseFigures(N, 5 * MDPS, 0.3 * MDPS), 0.0, TAU)
-WARMING = RecordingModel(
-    SAMPLES, RATE, WHITE.noise, np.array([0.0, 20 * MDPS]), np.diag([TAU**2, TAU**2]), 15.0
-)
+PRIOR = np.array([0.0, 20 * MDPS]), np.diag([TAU**2, TAU**2])
+WARMING = RecordingModel(SAMPLES, RATE, WHITE.noise, *PRIOR, time_constant_s=15.0)
 
 
 def rms(errors):
@@ -30,14 +29,6 @@ def halves(recordings, count):
     """The first recordings, which train, and the others, which test."""
     parts = slice(count), slice(count, None)
     return tuple(recordings.isel(recording=part) for part in parts)
-
-
-def walking(simulate, count, seed, walk_seed):
-    """Recordings whose biases walk."""
-    recordings = simulate(WHITE, count, seed)
-    walk = np.random.default_rng(walk_seed).normal(0, 2 * MDPS, (1, count, 3)).cumsum(axis=1)
-    recordings["angular_rate"] = recordings.angular_rate + walk[..., None]
-    return recordings
 
 
 @pytest.mark.slow
@@ -91,7 +82,9 @@ def test_each_place_of_a_window_has_its_own_weights(simulate, training_set):
 
 @pytest.mark.slow
 def test_history_goes_on_with_calibrations_made_since_the_fit(simulate, training_set):
-    recordings = walking(simulate, 12, 0, 1)
+    recordings = simulate(WHITE, 12, 0)
+    walk = np.random.default_rng(1).normal(0, 2 * MDPS, (1, 12, 3)).cumsum(axis=1)
+    recordings["angular_rate"] = recordings.angular_rate + walk[..., None]
     labels = recordings.angular_rate.mean("sample", dtype=np.float64).to_numpy()[0]
     windows = recordings.angular_rate.to_numpy()[0, 11:, :, :SIZE]
     for estimator in (BestLinear(history=True), LastCalibration()):
@@ -102,17 +95,14 @@ def test_history_goes_on_with_calibrations_made_since_the_fit(simulate, training
         # its own calibration and later ones do not count
         other = fitted.with_calibrations(np.arange(9, 13), labels[8:] + [[0], [0], [0], [9]])
         np.testing.assert_array_equal(other.estimate(windows, recording=12)[0], current)
-        np.testing.assert_array_equal(
-            told.estimate(windows, recording=5)[0], fitted.estimate(windows, recording=5)[0]
-        )
+        early, before = (one.estimate(windows, recording=5)[0] for one in (told, fitted))
+        np.testing.assert_array_equal(early, before)
     mean = TrainingMean().fit(training_set(recordings))
     assert mean.with_calibrations(np.arange(9, 13), labels[8:]) is mean
 
 
 @pytest.mark.slow
-def test_a_fallback_costs_little_where_the_prior_holds_and_saves_where_it_does_not(
-    simulate, judged, training_set
-):
+def test_a_fallback_costs_little_and_saves_where_the_prior_fails(simulate, judged, training_set):
     training, tested = halves(simulate(WHITE, 80, seed=4), 40)
     turned = tested.copy(deep=True)
     turned["angular_rate"] = turned.angular_rate + np.float32(15 * MDPS)
@@ -143,9 +133,7 @@ def test_ridge_regression_solves_its_normal_equations():
 
 
 @pytest.mark.slow
-def test_ridge_of_the_same_time_copes_with_a_warm_up_and_of_nothing_is_the_constant(
-    simulate, judged, training_set
-):
+def test_ridge_copes_with_a_warm_up_and_of_nothing_is_the_constant(simulate, judged, training_set):
     long = replace(WARMING, samples=2 * SAMPLES)
     training, tested = halves(simulate(long, 100, seed=6), 70)
     same, any_time = (

@@ -20,6 +20,7 @@ SETTINGS = Training(
     **{"epochs": 6, "batch_size": 8, "learning_rate": 1e-3, "decay": 0.1, "decay_every": 4},
 )
 ROLES = {9: VALIDATE, 10: VALIDATE}
+PAPER = "gyro_pipeline.learning.network:CalibrationNetwork"
 
 
 @pytest.fixture(scope="module")
@@ -32,9 +33,6 @@ def training(training_set, recordings):
     return training_set(recordings, roles=ROLES)
 
 
-PAPER = "gyro_pipeline.learning.network:CalibrationNetwork"
-
-
 def network(seed=0, shuffled=False, **changes):
     return ModuleEstimator(PAPER, SETTINGS.model_copy(update=changes), seed, shuffled)
 
@@ -45,9 +43,8 @@ def test_every_imu_is_a_device_and_the_first_alone_validates(training):
     assert all(device.numbers == tuple(range(1, 9)) for device in job.devices)
     assert all(starts.tolist() == [0, 200, 400] for starts in job.devices[0].starts)
     assert (job.validation.imus, job.validation.numbers) == ((1,), (9, 10))
-    np.testing.assert_array_equal(
-        job.devices[1].biases, training.real.recording_mean.to_numpy()[1, :8]
-    )
+    means = training.real.recording_mean.to_numpy()[1, :8]
+    np.testing.assert_array_equal(job.devices[1].biases, means)
 
 
 def test_side_by_side_a_window_is_used_if_all_have_it(training):
@@ -63,9 +60,7 @@ def test_side_by_side_a_window_is_used_if_all_have_it(training):
     np.testing.assert_array_equal(device.biases, means.transpose(1, 0, 2).reshape(8, 9))
 
 
-def test_it_learns_says_what_it_learned_and_is_saved_with_the_weights_of_both_epochs(
-    recordings, training, tmp_path
-):
+def test_it_learns_and_is_saved_with_the_weights_of_both_epochs(recordings, training, tmp_path):
     fitted = network(epochs=60, learning_rate=1e-2, decay_every=60).fit(training)
     assert fitted.engine in {"fused", "cpu"}
     windows = recordings.angular_rate.to_numpy()[0, :8, :, :SIZE]
@@ -139,8 +134,7 @@ def test_every_network_learns_is_saved_and_estimates_again(training, recordings,
         fitted = make_estimator(name, settings, 0).fit(training)
         fitted.save(tmp_path / name)
         estimates[name] = fitted.estimate(windows)[0]
-        np.testing.assert_array_equal(
-            Estimator.load(tmp_path / name).estimate(windows)[0], estimates[name]
-        )
+        loaded = Estimator.load(tmp_path / name)
+        np.testing.assert_array_equal(loaded.estimate(windows)[0], estimates[name])
     distinct = {values.tobytes() for values in estimates.values()}
     assert len(distinct) == len(estimates)

@@ -27,13 +27,8 @@ def drawn(imus=3, recordings=6, seed=0):
 
 def table(*rows):
     """Rows of role, origin, IMU, recordings and starts."""
-    columns = ["role", "origin", "imu", "recording", "start"]
-    return (
-        pd.DataFrame(rows, columns=columns)
-        .explode("recording")
-        .explode("start")
-        .astype({"recording": int, "start": int})
-    )
+    made = pd.DataFrame(rows, columns=["role", "origin", "imu", "recording", "start"])
+    return made.explode("recording").explode("start").astype({"recording": int, "start": int})
 
 
 WINDOWS = table(
@@ -63,13 +58,8 @@ def test_the_device_comes_first_virtual_imus_last_and_a_part_is_what_an_estimato
     unseen = TrainingSet(training.real, training.virtual, WINDOWS, SIZE, device=9)
     assert training.labels[0].tolist() == [1, 3, 6]
     assert unseen.labels[0].tolist() == [2, 1, 3, 6, 4, 5]
-    for one, uses, imus in (
-        (training, "nothing", []),
-        (training, "own", [2]),
-        (training, "real", [2, 1, 3]),
-        (unseen, "own", [1, 2, 3]),
-        (unseen, "real", [1, 2, 3]),
-    ):
+    cases = [(training, "nothing", []), (training, "own", [2]), (training, "real", [2, 1, 3])]
+    for one, uses, imus in [*cases, (unseen, "own", [1, 2, 3]), (unseen, "real", [1, 2, 3])]:
         part = one.part(uses)
         assert [imu for _, imu, _ in places(part)] == imus
         assert {origin for origin, *_ in places(part)} <= {"real"}
@@ -88,9 +78,7 @@ def test_keys_tell_training_sets_and_recordings_apart(training):
     assert other(moved).recordings_key == training.recordings_key
 
 
-def test_recordings_of_a_file_are_read_once_for_all_folds_and_go_to_a_worker_as_references(
-    tmp_path, monkeypatch
-):
+def test_recordings_are_read_once_for_all_folds_and_pickled_as_references(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "_FILE_CACHE", module._array_cache())
     drawn().to_netcdf(tmp_path / "recordings.nc", engine="h5netcdf")
     filed = xr.open_dataset(tmp_path / "recordings.nc", engine="h5netcdf")

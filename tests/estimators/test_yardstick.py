@@ -9,18 +9,12 @@ from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.recording_model import RecordingModel, best_linear
 
 pytestmark = pytest.mark.slow
-
 SAMPLES, RECORDING_S = 650, 87.0  # a twentieth of SparkFun's rate: what matters is N, not sigma
 RATE = SAMPLES / RECORDING_S
 N, TAU = 3.3 * MDPS, 0.31 * MDPS
-WARMING = RecordingModel(
-    SAMPLES,
-    RATE,
-    NoiseFigures(N, 3 * MDPS, 0.1 * MDPS),
-    np.array([0.0, 20 * MDPS]),
-    np.diag([TAU**2, (5 * MDPS) ** 2]),
-    time_constant_s=30.0,
-)
+NOISE = NoiseFigures(N, 3 * MDPS, 0.1 * MDPS)
+PRIOR = np.array([0.0, 20 * MDPS]), np.diag([TAU**2, (5 * MDPS) ** 2])
+WARMING = RecordingModel(SAMPLES, RATE, NOISE, *PRIOR, time_constant_s=30.0)
 
 
 class Oracle:

@@ -35,9 +35,8 @@ def recorded():
 
     def made(imus=2, recordings=12, samples=83, spread=1.0, noise=0.3, seed=0):
         generator = np.random.default_rng(seed)
-        bias = 5 * generator.normal(size=(imus, 1, 3)) + spread * generator.normal(
-            size=(imus, recordings, 3)
-        )
+        units = 5 * generator.normal(size=(imus, 1, 3))
+        bias = units + spread * generator.normal(size=(imus, recordings, 3))
         rates = bias[..., None] + noise * generator.normal(size=(*bias.shape, samples))
         numbers = np.arange(1, recordings + 1)
         coords = {"imu": np.arange(1, imus + 1), "recording": numbers, "axis": list("xyz")}

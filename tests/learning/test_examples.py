@@ -42,10 +42,8 @@ def test_imus_side_by_side_are_in_order_of_imu_then_axis(recorded, device):
 def test_examples_are_the_windows_of_each_recording_in_turn_scaled_by_hand(drawn, device, centring):
     """The second device has fewer recordings, and counts less where all have one centre."""
     recordings = drawn()
-    devices = [
-        device(*recordings, (1,), (1, 2, 3), WINDOW),
-        device(*recordings, (2,), (4, 2), WINDOW),
-    ]
+    places = ((1,), (1, 2, 3)), ((2,), (4, 2))
+    devices = [device(*recordings, *place, WINDOW) for place in places]
     examples, scaling = training_examples(devices, ONE_IMU, centring)
     assert examples.inputs.dtype == examples.targets.dtype == np.float32
     rates, bias = (one.to_numpy() for one in recordings)
@@ -102,9 +100,7 @@ def test_other_recordings_are_scaled_as_the_test_device_in_training(drawn, devic
     np.testing.assert_allclose(other.targets, [wanted] * 2, rtol=1e-5)
 
 
-def test_windows_may_be_named_by_their_starts_and_masked_samples_are_the_mean_of_theirs(
-    drawn, device
-):
+def test_windows_may_be_named_by_starts_and_masked_samples_are_the_mean_of_theirs(drawn, device):
     rates, bias = drawn()
     rates[0, 1, :, 8] = np.nan  # in the only window of recording 2
     starts = (np.array([0, 3, 30]), np.array([7]), np.array([5, 5]))

@@ -156,9 +156,7 @@ def test_without_a_compiler_it_is_said_once_and_training_goes_on(monkeypatch, ca
     assert "no C compiler: no-such-compiler -O1 not found" in refusal(caplog)
 
 
-def test_a_source_that_does_not_compile_or_cannot_be_kept_is_no_error(
-    monkeypatch, caplog, tmp_path
-):
+def test_a_source_that_does_not_compile_or_is_not_kept_is_no_error(monkeypatch, caplog, tmp_path):
     broken = 'case "$*" in *-dM*) exit 0;; esac; echo "error: what is a vector" >&2; exit 1'
     (tmp_path / "cc").write_text(f"#!/bin/sh\n{broken}\n")
     (tmp_path / "cc").chmod(0o755)
@@ -180,9 +178,7 @@ def test_a_step_that_computes_something_else_is_not_used(monkeypatch, caplog):
 
 @needs_compiler
 @pytest.mark.slow
-def test_what_is_compiled_is_kept_for_the_next_process_of_the_same_processor_and_compiler(
-    monkeypatch, tmp_path
-):
+def test_what_is_compiled_is_kept_for_the_same_processor_and_compiler(monkeypatch, tmp_path):
     monkeypatch.delenv("GYRO_PIPELINE_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert fused.available()

@@ -104,9 +104,8 @@ def test_the_seed_decides_the_initial_weights_and_leaves_the_global_state_alone(
     sizes = {"channels": 5, "kernel": 12, "stride": 5, "pool": 3, "hidden": 7}
     design = Design(f"{HERE}.network:CalibrationNetwork", 3, 123, sizes)
     before = torch.random.get_rng_state()
-    first, same, other = (
-        nn.utils.parameters_to_vector(design.build(s).parameters()) for s in (0, 0, 1)
-    )
+    vector = nn.utils.parameters_to_vector
+    first, same, other = (vector(design.build(seed).parameters()) for seed in (0, 0, 1))
     assert torch.equal(first, same)
     assert not torch.isclose(first, other).any()
     assert torch.equal(torch.random.get_rng_state(), before)

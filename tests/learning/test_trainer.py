@@ -98,16 +98,12 @@ def test_a_training_ends_once_the_rates_to_come_sum_to_less_than_asked(schedule)
 def learners(make=lambda: CalibrationNetwork(**vars(SIZES)), n=75, watched=21, **how):
     """Two sets of examples, each with two seeds."""
     dtype = getattr(torch, np.dtype(how.get("dtype", np.float32)).name)
-    return [
-        Learner(
-            network(seed, make).to(dtype),
-            drawn(n, at, **how),
-            drawn(watched, 9 + at, **how) if watched else None,
-            shuffled(seed),
-        )
-        for at in (0, 1)
-        for seed in (0, 1)
-    ]
+
+    def learner(at, seed):
+        data = drawn(n, at, **how), drawn(watched, 9 + at, **how) if watched else None
+        return Learner(network(seed, make).to(dtype), *data, shuffled(seed))
+
+    return [learner(at, seed) for at in (0, 1) for seed in (0, 1)]
 
 
 def together(given, training, device=CPU):
@@ -169,9 +165,7 @@ def test_so_are_other_networks_that_vmap_can_batch_and_what_cannot_be_batched_is
     ("changes", "watched"),
     [({"steps": 23}, 3), ({"epochs": 6, "stop_below": 1.5e-4}, None), ({"batch_size": 500}, 40)],
 )
-def test_every_schedule_is_that_of_one_network_with_and_without_validation(
-    changes, watched, schedule
-):
+def test_every_schedule_is_that_of_one_with_and_without_validation(changes, watched, schedule):
     assert_those_alone(learners(watched=watched), schedule(**changes))
 
 

@@ -2,6 +2,7 @@
 
 import logging
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -113,12 +114,10 @@ def test_a_stored_network_estimates_its_outputs_scaled_back(make, recorded, imus
 
 def grid(make, recorded, path=PAPER):
     """Two numbers of devices and two splits, each with two seeds."""
-    data = recorded(imus=2)
+    data, trains = recorded(imus=2), (range(1, 9), range(2, 10))
     return [
         make(data, imus, train, seed=seed, path=path, cell=(len(imus), train))
-        for imus in (((1,),), ((1,), (2,)))
-        for train in (range(1, 9), range(2, 10))
-        for seed in (0, 1)
+        for imus, train, seed in product((((1,),), ((1,), (2,))), trains, (0, 1))
     ]
 
 

@@ -60,9 +60,8 @@ def test_masked_samples_part_stretches_that_are_pooled_by_their_counts():
     samples[150:170] = np.nan
     factors = np.array([1, 8, 90, 200])
     variance, counts = allan.allan_variance(samples, 1.0, factors)
-    first, second = (
-        allan.allan_variance(part, 1.0, factors) for part in (samples[:150], samples[170:])
-    )
+    parts = samples[:150], samples[170:]
+    first, second = (allan.allan_variance(part, 1.0, factors) for part in parts)
     expected = allan.mean_variance(np.stack([first[0], second[0]]), np.stack([first[1], second[1]]))
     np.testing.assert_allclose(variance[:3], expected[:3], rtol=1e-13)
     assert np.isnan(first[0][2])  # too short
@@ -105,7 +104,6 @@ def test_times_before_the_shortest_have_no_influence_and_variances_are_positive(
 
 
 def test_real_memsense_white_noise(real_file):
-    """Of recordings (recording, axis, sample) at 250 Hz."""
-    recordings = np.load(real_file("memsense_test_real.npy"))
+    recordings = np.load(real_file("memsense_test_real.npy"))  # (recording, axis, sample), 250 Hz
     white = [fit_mean(recordings[:, axis], 250.0).white for axis in range(3)]
     np.testing.assert_allclose(white, np.array([5.3, 4.7, 6.0]) * MDPS, rtol=0.05)

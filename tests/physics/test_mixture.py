@@ -7,7 +7,6 @@ from gyro_pipeline.physics.mixture import log_e, log_ratios, mixture_posterior
 
 
 def test_one_axis_is_the_mixture_of_two():
-    """Against numerical integration of the posterior density."""
     x = np.linspace(-30, 30, 200_001)
     density = 0.95 * np.exp(-(x**2) / 2 / 0.3**2) / 0.3 + 0.05 * np.exp(-(x**2) / 2 / 5**2) / 5
     posterior = density * np.exp(-((3.0 - x) ** 2) / 2 / 1.1**2)

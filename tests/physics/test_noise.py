@@ -37,9 +37,8 @@ def test_every_axis_has_its_own_n_and_the_first_sample_is_like_all_others():
     noise = simulate_noise(np.random.default_rng(4), (2, 5, 3, 5000), RATE, per_axis)
     assert noise.dtype == np.float32
     sigma = noise.std(axis=-1, dtype=np.float64)
-    np.testing.assert_allclose(
-        sigma, np.broadcast_to(per_axis * np.sqrt(RATE), (2, 5, 3)), rtol=0.05
-    )
+    expected = np.broadcast_to(per_axis * np.sqrt(RATE), (2, 5, 3))
+    np.testing.assert_allclose(sigma, expected, rtol=0.05)
 
 
 @pytest.mark.parametrize("rate", [50.0, 250.0])

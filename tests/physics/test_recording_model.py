@@ -14,14 +14,8 @@ RATE, SAMPLES = 20.0, 1200
 N, B, K, TAU = 5 * MDPS, 3 * MDPS, 0.3 * MDPS, 1 * MDPS
 WHITE = models.constant_bias(SAMPLES, RATE, NoiseFigures(N, 0, 0), 0.02, TAU)
 COLOURED = models.constant_bias(SAMPLES, RATE, NoiseFigures(N, B, K), 0.02, TAU)
-WARMING = models.RecordingModel(
-    SAMPLES,
-    RATE,
-    NoiseFigures(N, B, K),
-    np.array([0.02, 0.015]),
-    np.diag([TAU**2, (5 * MDPS) ** 2]),
-    time_constant_s=20.0,
-)
+PRIOR = np.array([0.02, 0.015]), np.diag([TAU**2, (5 * MDPS) ** 2])
+WARMING = models.RecordingModel(SAMPLES, RATE, COLOURED.noise, *PRIOR, time_constant_s=20.0)
 MODELS = {"white": WHITE, "coloured": COLOURED, "warming": WARMING}
 TRUTHS = (PAPER, DISJOINT, TRUE)
 
@@ -32,9 +26,8 @@ def test_covariances_are_those_of_the_simulated_noise(part):
     levels, edges = np.eye(3)[part], [0, 10, 35, 36, 400, 1200]
     names = dict(zip(("flicker_dps", "random_walk_dps_rts"), levels[1:], strict=True))
     count = 2000
-    noise = simulate_noise(
-        np.random.default_rng(part), (count, SAMPLES), RATE, levels[0], **names
-    ).astype(np.float64)
+    generator = np.random.default_rng(part)
+    noise = simulate_noise(generator, (count, SAMPLES), RATE, levels[0], **names).astype(float)
     means = np.stack([noise[:, a:b].mean(axis=1) for a, b in zip(edges, edges[1:], strict=False)])
     expected = models.noise_covariances(np.array(edges), SAMPLES, RATE)[part]
     deviation = np.sqrt((np.outer(*2 * [np.diag(expected)]) + expected**2) / count)

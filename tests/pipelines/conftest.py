@@ -119,12 +119,8 @@ def stored_runs(fitted, **changes):
             estimator.losses = None  # which is an artifact of its own
         history = [fit.estimator.losses for fit in fits.values() if fit.is_model]
         run = StoredRun(
-            run_id=f"run{number}",
-            experiment_id="1",
-            study=identity.study,
-            finished=False,
-            trained=set(fits) == set(identity.folds),
-            started_ms=0,
+            **{"run_id": f"run{number}", "experiment_id": "1", "study": identity.study},
+            **{"finished": False, "trained": set(fits) == set(identity.folds), "started_ms": 0},
             params={name: str(value) for name, value in identity.params.items()},
             tags={**identity.tags, FINGERPRINT: key, "mlflow.runName": identity.name},
             metrics={"train_loss": 0.0} if history and history[0] is not None else {},
@@ -141,22 +137,10 @@ def study_of(name, estimators=("cnn",), **grid):
     return Study(experiment=name, estimators=list(estimators), sensors={"sparkfun": settings})
 
 
-@pytest.fixture(scope="session")
-def make_study():
-    """A study of one sensor: ``make_study(name, estimators, real_gyros=[...])``."""
-    return study_of
-
-
-@pytest.fixture(scope="session")
-def as_stored():
-    """What a store gives back of some fits."""
-    return stored_runs
-
-
-@pytest.fixture(scope="session")
-def make_quality():
-    """What the raw-logs stage says of recordings."""
-    return quality_of
+as_stored = pytest.fixture(lambda: stored_runs, scope="session")
+make_quality = pytest.fixture(lambda: quality_of, scope="session")
+make_study = pytest.fixture(lambda: study_of, scope="session")
+"""A study of one sensor: ``make_study(name, estimators, real_gyros=[...])``."""
 
 
 @pytest.fixture(scope="session")

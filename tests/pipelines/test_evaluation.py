@@ -24,10 +24,10 @@ from gyro_pipeline.tracking import CURVE, ERRORS, EVALUATED_WITH, FINGERPRINT
 from gyro_pipeline.tracking import SCORES as TABLE
 
 WINDOW_S, SIZE, RECORDING_S = 10.0, 200, 52.0
-
 pytestmark = pytest.mark.slow
 TESTED = (11, 12, 13, 14)
 STARTS = range(0, 801, 200)
+SEVERAL = [MEAN, CNN, "best_linear", "empirical_bayes", "ridge_same_time", "last_calibration"]
 
 
 def table_of(learned, tested, imu=1, fold="hold-out"):
@@ -59,9 +59,7 @@ class Off(Estimator):
     """Knows the mean of the whole recording and is off by a constant."""
 
     def __init__(self, bench, by):
-        self._means = {
-            r.number: r.samples.mean(axis=1, dtype=np.float64) for r in bench.test_recordings
-        }
+        self._means = {r.number: r.samples.mean(axis=1, dtype=float) for r in bench.test_recordings}
         self._by = by
 
     def _estimate(self, windows):
@@ -121,11 +119,8 @@ def test_the_running_means_scores_are_those_computed_by_hand(world, bench):
     assert scores[PAPER, FIRST, "test_rmse_dps"] == pytest.approx(np.sqrt(squares[..., 0].mean()))
     assert scores[PAPER, ALL, "accuracy_gain_pct"] == 0
     rest = (1040 * whole - SIZE * windows) / (1040 - SIZE)
-    noise = [
-        outside_noise(figures, 1040, 20.0, start, SIZE)
-        for figures in bench.device.figures
-        for start in STARTS
-    ]
+    figures = bench.device.figures
+    noise = [outside_noise(one, 1040, 20.0, start, SIZE) for one in figures for start in STARTS]
     white = bench.device.noise**2 / (RECORDING_S - WINDOW_S)
     assert np.mean(noise) == pytest.approx(white.mean(), rel=0.1)
     expected = ((windows - rest) ** 2).mean() - np.mean(noise)
@@ -445,9 +440,6 @@ def test_unseen_devices_are_judged_one_by_one_and_nothing_is_better_than_the_mea
     np.testing.assert_allclose(ends, np.log(row.value) + [-half, half], rtol=1e-5)
 
 
-SEVERAL = [MEAN, CNN, "best_linear", "empirical_bayes", "ridge_same_time", "last_calibration"]
-
-
 @pytest.fixture(scope="module")
 def damaged(world, make_world, make_study):
     """A few samples masked, a window lost, two recordings of IMU 1 gone, and IMUs 2 and 3."""
@@ -477,9 +469,7 @@ def test_masked_samples_and_lacking_recordings_stop_nothing(damaged):
     assert errors.start.unique().tolist() == [0, 400, 600, 800]
 
 
-def test_side_by_side_a_recording_that_one_imu_lacks_is_left_out_before_anything_is_trained(
-    damaged, make_study
-):
+def test_side_by_side_what_one_imu_lacks_is_left_out_before_training(damaged, make_study):
     """IMU 3 lacks a recording that tests, and both of them some that train."""
     channels = replace(damaged, study=make_study("input_channels", method=1, real_gyros=[6]))
     (problem,) = channels.plan.left_out[channels.plan.estimator == CNN]

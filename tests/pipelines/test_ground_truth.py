@@ -10,9 +10,7 @@ RATE_HZ, SAMPLES = 20.0, 1200
 TOLERANCE = GroundTruth(tolerance_mdps=2.0)
 
 
-def test_settling_times_and_noise_are_those_of_the_samples_and_what_is_missing_has_no_row(
-    make_recordings,
-):
+def test_settling_and_noise_are_those_of_samples_and_what_is_missing_has_no_row(make_recordings):
     """About large biases: sums in float32 would be off by more than the tolerances."""
     drawn = 300 + np.random.default_rng(1).uniform(-3, 3, (2, 12, 3))
     recordings = make_recordings(drawn, SAMPLES, RATE_HZ, NOISE)
@@ -35,9 +33,7 @@ def test_settling_times_and_noise_are_those_of_the_samples_and_what_is_missing_h
     assert (noise.instability_dps < 0.2 * NOISE).all()
 
 
-def test_each_recording_counts_with_its_own_length_and_unmasked_samples_in_float64(
-    make_recordings,
-):
+def test_each_recording_counts_with_its_own_length_and_unmasked_samples_in_float64(make_recordings):
     """IMUs 2 and 3 with recordings of 60, 40 and 50 s; ten samples of one are masked."""
     uneven = make_recordings(np.full((2, 3, 3), 300.0), SAMPLES, RATE_HZ, NOISE, seed=3)
     uneven = uneven.assign_coords(imu=[2, 3])

@@ -16,6 +16,7 @@ from gyro_pipeline.pipelines.reporting.leakage import pool_leakage
 from gyro_pipeline.studies import CNN, CNN_SHUFFLED
 
 pytestmark = pytest.mark.slow
+SPREAD = 5e-3
 
 
 @pytest.fixture(scope="module")
@@ -33,19 +34,13 @@ def leak_study(make_world, make_study, parameters, as_stored):
             training=base.model_copy(update={"epochs": 60, "learning_rate": 2e-3} | settings),
         )
         runs = as_stored(world.train())
-        judged = {run.run_id: run for run in world.evaluate(runs)}
-        evaluated = [
-            replace(run, load=judged[run.run_id].artifacts.__getitem__, finished=True)
-            for run in runs
-        ]
-        stored = {"sparkfun_plan": world.plan, "sparkfun_runs": evaluated}
+        made = {run.run_id: run.artifacts for run in world.evaluate(runs)}
+        judged = [replace(run, load=made[run.run_id].__getitem__, finished=True) for run in runs]
+        stored = {"sparkfun_plan": world.plan, "sparkfun_runs": judged}
         given = study, world.training, {"sparkfun": {"rate_hz": 25}}
         return pool_leakage(*given, **stored)["results"].set_index(["leak", "estimator"])
 
     return run
-
-
-SPREAD = 5e-3
 
 
 @pytest.fixture(scope="module")
@@ -71,9 +66,7 @@ def test_shuffled_labels_are_no_better_than_the_constant_and_a_networks_own_are(
     assert simulated.over_constant_dps2[K_FOLD, CNN] < -0.5 * SPREAD**2
 
 
-def test_leaks_look_better_than_a_split_by_recording_and_the_oracle_finds_the_largest(
-    simulated,
-):
+def test_leaks_look_better_than_a_split_by_recording_and_the_oracle_finds_the_largest(simulated):
     assert set(simulated.index) == set(LEAK_VARIANTS)
     assert set(simulated.windows) == {30 * 5}
     gains = simulated.accuracy_gain_pct

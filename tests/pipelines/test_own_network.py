@@ -16,7 +16,6 @@ TEXT = (Path(__file__).parents[2] / "docs" / "extending.md").read_text()
 NETWORK, LINES = (
     re.search(rf"```{kind}\n(.*?)```", TEXT, re.DOTALL)[1] for kind in ("python", "yaml")
 )
-
 pytestmark = pytest.mark.slow
 
 
@@ -35,9 +34,7 @@ def file(tmp_path, monkeypatch):
     sys.modules.pop(path.stem, None)
 
 
-def test_its_rows_differ_have_curves_weights_and_intervals_and_its_code_counts(
-    file, world, parameters, as_stored
-):
+def test_its_rows_differ_and_are_judged_and_its_code_counts(file, world, parameters, as_stored):
     estimators = parameters("smoke", **yaml.safe_load(LINES)).studies["augmentation"].estimators
     assert estimators[0] == CNN
     name = estimators[1]

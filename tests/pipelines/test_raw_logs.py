@@ -126,9 +126,7 @@ def test_masked_samples_are_nan_and_counted(inspected, monkeypatch):
     assert table.stop.dropna().tolist() == [1610] * 3
 
 
-def test_what_cannot_be_read_is_rejected_what_is_no_number_masked_and_other_errors_raised(
-    inspected,
-):
+def test_what_cannot_be_read_is_rejected_what_is_no_number_masked_other_errors_raised(inspected):
     samples = noise(7)
     samples[200, 1] = 1e300  # which overflows float32
     zip_file = InputError("2_1.csv: expected text, got a zip")

@@ -18,8 +18,6 @@ from gyro_pipeline.pipelines.reporting.recordings import describe, drift, start_
 
 SENSORS = ("dot", "sparkfun", "ng")
 WARM_UP_S, AMPLITUDE = 5.0, 0.02
-
-
 pytestmark = pytest.mark.slow
 
 
@@ -58,9 +56,6 @@ def report(described, parameters):
     p = parameters("base")
     given = p.published, p.ground_truth, p.studies, {name: {} for name in p.sensors}
     return write_report("test", Only(), *given, described)
-
-
-# recordings
 
 
 def test_drift_shows_a_warm_up_that_all_power_ons_share_and_none_where_there_is_none(recordings):
@@ -136,9 +131,7 @@ def test_datasheets_and_signals_are_shown_from_the_recordings(report, recordings
     assert "N = " in allan.texts[0].get_text()
 
 
-def test_the_warm_up_that_a_published_gain_would_need_is_in_the_answer(
-    described, report, parameters
-):
+def test_the_warm_up_that_a_published_gain_needs_is_in_the_answer(described, report, parameters):
     p = parameters("base")
     own = described["sparkfun/description"]()
     own[[f"white_dps_rts_{axis}" for axis in "xyz"]] = 0.0033
@@ -154,17 +147,12 @@ def test_the_warm_up_that_a_published_gain_would_need_is_in_the_answer(
     assert "a warm-up (SparkFun " in report[2] and "; NG " in report[2]
 
 
-# the page
-
-
 def test_the_page_needs_no_other_file_and_a_list_links_to_all_reports(tmp_path):
     page = ReportPage(str(tmp_path / "simulated" / "report.html"), str(tmp_path / "report.html"))
     figure = ReportFigure(str(tmp_path / "simulated" / "figures" / "<i>dot 3.png"))
     figure.save(plt.subplots()[0])
-    hostile = (
-        "<img src=x onerror=alert(1)> ![x](http://evil/x) [y](javascript:alert(1)) &lt; `c` *b*"
-    )
-    table = pipe_table(pd.DataFrame({"File": [hostile, "# _a_ | b"], "n": [1.25, np.nan]}))
+    evil = "<img src=x onerror=alert(1)> ![x](http://evil/x) [y](javascript:alert(1)) &lt; `c` *b*"
+    table = pipe_table(pd.DataFrame({"File": [evil, "# _a_ | b"], "n": [1.25, np.nan]}))
     page.save(f"# A title\n\n## The answer\n\n{table}\n![a plot](figures/%3Ci%3Edot%203.png)\n")
     html = (tmp_path / "simulated" / "report.html").read_text()
     (picture,) = re.findall(r'src="([^"]*)"', html)

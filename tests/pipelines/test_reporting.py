@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from io import StringIO
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -14,8 +15,6 @@ from gyro_pipeline.studies import CNN, CONSTANT, LEFT_OUT, MEAN, RunSpec, run_pa
 from gyro_pipeline.tracking import CURVE, ERRORS, FINGERPRINT, SCORES, StoredRun
 
 WINDOW_S = 10.0
-
-
 pytestmark = pytest.mark.slow
 TIMES_S = np.array([1.0, 5.0, 10.0, 20.0, 40.0])
 MEAN_RMSE = 0.01 / np.sqrt(TIMES_S)  # of the running mean
@@ -29,12 +28,9 @@ SCORED = {
 
 
 def curve(recordings):
-    rows = [
-        (recording, "paper", windows, time_s, count * rmse**2, count)
-        for recording in recordings
-        for windows, count in (("first", 3), ("all", 6))
-        for time_s, rmse in zip(TIMES_S, MEAN_RMSE, strict=True)
-    ]
+    points = zip(TIMES_S, MEAN_RMSE, strict=True)
+    each = product(recordings, (("first", 3), ("all", 6)), points)
+    rows = [(r, "paper", windows, t, n * rmse**2, n) for r, (windows, n), (t, rmse) in each]
     columns = ["recording", "truth", "windows", "time_s", "sum_sq", "count"]
     return pd.DataFrame(rows, columns=columns)
 
@@ -42,10 +38,9 @@ def curve(recordings):
 def errors(scale, seed=0, best=False):
     """Two windows of three axes each; what the best epoch and another truth gave is far off."""
     generator = np.random.default_rng(seed)
-    table = pd.DataFrame(
-        [(r, w, a) for r in RECORDINGS for w in (0, 1) for a in "xyz"],
-        columns=["recording", "window", "axis"],
-    ).assign(truth_variance=0.0, truth="paper", weights="last")
+    places = product(RECORDINGS, (0, 1), "xyz")
+    table = pd.DataFrame(places, columns=["recording", "window", "axis"])
+    table = table.assign(truth_variance=0.0, truth="paper", weights="last")
     table["error_dps"] = scale * generator.uniform(0.5, 1.5, len(table))
     decoys = [table.assign(truth="true", error_dps=9.0)]
     decoys += [table.assign(weights="best", error_dps=9.0)] if best else []
@@ -59,11 +54,8 @@ def rmse(tables, window=None):
 
 
 def scores(**changes):
-    rows = [
-        ("last", "paper", windows, name, value)
-        for name, value in (SCORED | changes).items()
-        for windows in ("first", "all")
-    ]
+    each = product((SCORED | changes).items(), ("first", "all"))
+    rows = [("last", "paper", windows, *score) for score, windows in each]
     decoy = ("best", "true", "all", "ceiling_rmse_dps", 9.0)
     names = ["weights", "truth", "windows", "score", "value"]
     return pd.DataFrame([*rows, decoy], columns=names).assign(lo=None, hi=None)
@@ -76,13 +68,9 @@ def study_of(name="augmentation", estimators=(CNN,), real=(3,), virtual=(0,), se
 
 
 @pytest.fixture(scope="module")
-def base(parameters):
-    return parameters("base")
-
-
-@pytest.fixture(scope="module")
-def make_run(base):
+def make_run(parameters):
     """A finished run of a row of a study."""
+    base = parameters("base")
 
     def make(run_id, table, study=None, tags=(), oracle_p=0.5, **row):
         study = study or study_of()
@@ -93,33 +81,22 @@ def make_run(base):
         params = run_params(spec, study, base.training, base.splits, base.virtual_gyros)
         artifacts = {ERRORS: table, CURVE: curve(RECORDINGS)}
         artifacts[SCORES] = scores(beats_oracle_p=oracle_p)
+        made = {"run_id": run_id, "experiment_id": "7", "study": spec.study, "metrics": {}}
+        made |= {"finished": True, "trained": True, "started_ms": 1_700_000_000_000}
         return StoredRun(
-            run_id=run_id,
-            experiment_id="7",
-            study=spec.study,
-            finished=True,
-            trained=True,
-            started_ms=1_700_000_000_000,
             params={name: str(value) for name, value in (params | {"folds": 1}).items()},
             tags={"simulated": "1", FINGERPRINT: run_id, "kedro_env": "smoke", **dict(tags)},
-            metrics={},
-            fits=frozenset(),
-            load=artifacts.__getitem__,
-            load_fit={}.__getitem__,
+            **{"fits": frozenset(), "load": artifacts.__getitem__, "load_fit": {}.__getitem__},
+            **made,
         )
 
     return make
 
 
-def test_seeds_are_pooled_what_is_added_is_paired_and_a_row_without_a_seed_says_so(
-    make_run, mean, pool
-):
+def test_seeds_are_pooled_additions_paired_and_a_row_without_a_seed_says_so(make_run, mean, pool):
     study = study_of(virtual=(0, 24))
     tables = {(v, s): errors(0.002 - v * 2e-5, 10 + v + s) for v in (0, 24) for s in (0, 1)}
-    runs = [
-        make_run(f"{v}-{s}", table, study, virtual_gyros=v, seed=s)
-        for (v, s), table in tables.items()
-    ]
+    runs = [make_run(f"{v}-{s}", tables[v, s], study, virtual_gyros=v, seed=s) for v, s in tables]
     pooled = pool([*runs, mean], study, seeds=(0, 1))["results"].set_index("virtual_gyros")
     row, mean_rmse = pooled.loc[24], rmse([mean.load(ERRORS)])
     few, more = (rmse([tables[v, 0], tables[v, 1]]) for v in (0, 24))
@@ -151,7 +128,7 @@ def plan_of(runs, left_out=None):
 
 
 @pytest.fixture(scope="module")
-def pool(base):
+def pool():
     def make(runs, study=None, seeds=(0,), plan=None, sensor="sparkfun"):
         given = study or study_of(), "simulated", [30.0], list(seeds), Only()
         stored = {f"{sensor}_plan": plan_of(runs) if plan is None else plan}
@@ -161,28 +138,23 @@ def pool(base):
 
 
 @pytest.fixture(scope="module")
-def write(base):
+def write(parameters):
     """The report of some tables, by their addresses."""
+    base = parameters("base")
 
     def make(stored, source="simulated", only=None, **fresh):
-        loaders = {address: lambda t=table: as_read(t) for address, table in stored.items()}
+        # each as its CSV file gives it back
+        texts = {address: table.to_csv(index=False) for address, table in stored.items()}
+        how = {"keep_default_na": False, "na_values": [""]}
+        loaders = {a: lambda t=text: pd.read_csv(StringIO(t), **how) for a, text in texts.items()}
         given = base.published, base.ground_truth, base.studies, {name: {} for name in base.sensors}
         return write_report(source, only or Only(), *given, loaders, **fresh)
 
     return make
 
 
-def as_read(table):
-    """A table as its CSV file gives it back."""
-    text = StringIO(table.to_csv(index=False))
-    return pd.read_csv(text, keep_default_na=False, na_values=[""])
-
-
 def stored_as(study, pooled_tables):
     return {f"{study}/{name}": table for name, table in pooled_tables.items()}
-
-
-# pooling
 
 
 def test_a_result_is_computed_from_the_errors_of_its_run(make_run, mean, pool):
@@ -250,9 +222,6 @@ def test_results_of_an_earlier_version_are_not_read_as_those_of_this_one(grid, w
     assert "There is no finished run with the current settings yet" in page
 
 
-# the tables and figures of the paper
-
-
 @pytest.fixture(scope="module")
 def grid(make_run, mean, pool):
     """SparkFun's networks of two studies of the paper, a constant and two more estimators."""
@@ -263,14 +232,11 @@ def grid(make_run, mean, pool):
     for name, (real, virtual) in counts.items():
         study = study_of(name, [CNN, *others], real, virtual)
         runs = [make_run(f"{name} mean", mean.load(ERRORS), study, estimator=MEAN)]
-        for r in real:
-            for v in virtual:
-                run_id, counted = f"{r}+{v}-0123456789", {"real_gyros": r, "virtual_gyros": v}
-                runs += [make_run(run_id, errors(0.002, r), study, **counted)]
-                runs += [
-                    make_run(f"{kind}{r}", table, study, estimator=kind, **counted)
-                    for kind, table in others.items()
-                ]
+        for r, v in product(real, virtual):
+            run_id, counted = f"{r}+{v}-0123456789", {"real_gyros": r, "virtual_gyros": v}
+            runs += [make_run(run_id, errors(0.002, r), study, **counted)]
+            for kind, table in others.items():
+                runs += [make_run(f"{kind}{r}", table, study, estimator=kind, **counted)]
         stored |= stored_as(name, pool(list({r.run_id: r for r in runs}.values()), study))
     return stored
 
@@ -325,9 +291,7 @@ def test_the_ends_of_the_curve_and_what_is_beyond_the_ceiling_are_said(grid, wri
     assert "Entire 95 % interval above the ceiling: network on sparkfun at 10 s" in page
 
 
-def test_on_simulated_data_the_oracle_stands_beside_and_chance_is_called_chance(
-    make_run, mean, pool, write
-):
+def test_the_oracle_stands_beside_and_chance_is_called_chance(make_run, mean, pool, write):
     conflict = "test recordings contradict the prior on x (p = 1e-05): turned; the mean gives 3"
     run = make_run("network", errors(0.002, 3), tags={"prior_conflict": conflict})
     made = pool([run, mean])
@@ -361,17 +325,16 @@ def test_figures_show_both_ways_with_all_windows_first(grid, report):
         main, beside = figures[f"augmentation_sparkfun_{real}_real"].axes
         assert main.get_title().startswith("all windows")
         assert "paper's way" in beside.get_title()
-        shown = {name.partition(",")[0]: one for name, one in points(main).items()}
+        lines = points(main)
+        shown = {name.partition(",")[0]: one for name, one in lines.items()}
         np.testing.assert_allclose(shown["running mean"].get_ydata(), MEAN_RMSE * 1e3)
-        (ceiling,) = [one for name, one in points(main).items() if name.startswith("ceiling")]
+        (ceiling,) = [lines[name] for name in lines if name.startswith("ceiling")]
         np.testing.assert_allclose(ceiling.get_ydata(), [1.0])
         # the published accuracy, on the mean's RMSE of the data at hand
-        (published,) = [
-            one for name, one in points(main).items() if name.startswith("published, 24 virtual")
-        ]
+        (published,) = [lines[name] for name in lines if name.startswith("published, 24 virtual")]
         expected = row.mean_rmse_dps * (1 - gain / 100) * 1e3
         np.testing.assert_allclose(published.get_ydata(), expected)
-        assert "network, 24 virtual, 95 % interval" in points(main)
+        assert "network, 24 virtual, 95 % interval" in lines
     bars = figures["real2real_gyroscopes_10s"].axes[0].patches
     real = grid["real2real/results"].query("estimator == 'cnn'").sort_values("real_gyros")
     np.testing.assert_allclose([bar.get_height() for bar in bars], real.test_rmse_dps * 1e3)
@@ -395,9 +358,6 @@ def test_the_forest_has_a_row_for_each_published_result_of_the_sensors(grid, rep
         assert gains == [57, 79, 88, 77, 87]
 
 
-# words
-
-
 def test_what_beats_the_oracle_is_called_a_defect(make_run, mean, pool, write, report):
     run = make_run("network", errors(0.002), oracle_p=1e-6)
     page = write(stored_as("augmentation", pool([run, mean])))[2]
@@ -410,9 +370,8 @@ def test_what_was_not_made_is_named_with_the_fewest_commands(grid, write, pool, 
     results.loc[results.estimator == CNN, "status"] = "not run"
     page = write(grid | {"augmentation/results": results}, only=Only(sensor="sparkfun"))[2]
     lines = page.partition("### What was not made")[2].strip().splitlines()[2:]
-    assert lines == [
-        "| kedro run --env=smoke | 4 of 17 results of augmentation, the study input_channels |",
-    ]
+    told = "| kedro run --env=smoke | 4 of 17 results of augmentation, the study input_channels |"
+    assert lines == [told]
     assert "- **Narrowed to**: sensor=sparkfun" in page
     untrained = pool([], plan=plan_of([mean, make_run("network", errors(1.0))]))
     tables, _, page = write(stored_as("augmentation", untrained))
@@ -423,9 +382,7 @@ def test_what_was_not_made_is_named_with_the_fewest_commands(grid, write, pool, 
     assert nothing[:2] == ({}, {})
 
 
-def test_a_study_of_ones_own_has_its_figure_and_only_findings_about_its_sensors(
-    make_run, pool, write
-):
+def test_a_study_of_ones_own_has_a_figure_and_only_findings_of_its_sensors(make_run, pool, write):
     study = study_of("mine", [MEAN, "best_linear"], sensor="<i>my_own_")
     given, tags = {"study": study, "sensor": "<i>my_own_"}, {"simulated": "0"}
     best_tags = tags | {"recommended": "True"}

@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -18,7 +19,6 @@ from gyro_pipeline.tracking import FINGERPRINT
 STARTS = range(0, 801, 200)
 PARTS = ("nothing", "own", "real", "all")
 THEIRS = "a_strangers_estimators"
-
 pytestmark = pytest.mark.slow
 STRANGER = """
 import numpy as np
@@ -92,17 +92,11 @@ def test_every_row_is_fitted_to_exactly_the_training_set_that_it_names(strange):
         part, fit = row.estimator.rpartition(":")[2].lower(), fits[runs[run_spec(row, False)]]
         real = {"nothing": 0, "own": 1}.get(part, row.real_gyros // 3)
         virtual = row.virtual_gyros // 3 if part == "all" else 0
-        expected = [
-            ("validation" if number > 8 else "train", "real", imu, number, start)
-            for imu in range(1, 1 + real)
-            for number in range(1, 11)
-            for start in STARTS
-        ] + [
-            ("train", "virtual", imu, number, start)
-            for imu in range(1, 1 + virtual)
-            for number in range(1, 6)
-            for start in STARTS
-        ]
+        roles = {number: "validation" if number > 8 else "train" for number in range(1, 11)}
+        places = product(range(1, 1 + real), roles, STARTS)
+        expected = [(roles[number], "real", imu, number, start) for imu, number, start in places]
+        places = product(range(1, 1 + virtual), range(1, 6), STARTS)
+        expected += [("train", "virtual", *place) for place in places]
         assert fit.estimator.given == expected, row
         assert (fit.estimator.size, fit.estimator.device) == (200, 1)
         # nothing of what was drawn
@@ -120,10 +114,7 @@ def test_of_unseen_devices_every_fold_trains_on_all_others(strange, make_study):
     study = make_study("some", [f"{THEIRS}:Own"], real_gyros=[3])
     unseen = replace(strange, study=study.model_copy(update={"protocol": "leave_one_device_out"}))
     fits = {fit.fold: fit for fit in unseen.train() if fit.run.params["estimator"] != MEAN}
-    places = {
-        fold: {(imu, number) for _, _, imu, number, _ in fit.estimator.given}
-        for fold, fit in fits.items()
-    }
+    places = {fold: {row[2:4] for row in fit.estimator.given} for fold, fit in fits.items()}
     numbers = range(1, 11)  # others were made together with those that test
     assert places["without IMU 1"] == {(2, number) for number in numbers}
     assert places["without IMU 2"] == {(1, number) for number in numbers}
@@ -224,22 +215,17 @@ def test_a_fingerprint_knows_no_study_and_changes_with_no_narrowing(varied, make
     assert len(set(varied.fingerprints.values())) == len(varied.fingerprints) == 1 + 1 + 1 + 2 + 4
 
 
-@pytest.mark.parametrize(
-    ("group", "change", "affected"),
-    [
+def test_a_setting_changes_the_runs_that_depend_on_it_and_no_other(varied):
+    """Reports find runs by fingerprint, so that the others are found whatever they carry."""
+    for group, change, affected in (
         ("training", {"hidden": 5}, lambda key: key[0] == CNN),
         ("virtual_gyros", {"seed": 1}, lambda key: key[2]),
         ("splits", {"training_windows": "first"}, lambda key: key[1]),
         ("splits", {"fold_validation_recordings": 1}, lambda key: False),  # this is a hold-out
-    ],
-)
-def test_a_setting_changes_the_runs_that_depend_on_it_and_no_others(
-    varied, group, change, affected
-):
-    """Reports find runs by fingerprint, so that the others are found whatever they carry."""
-    settings = getattr(varied, group).model_copy(update=change)
-    expected = {key for key in varied.fingerprints if affected(key)}
-    assert changed(varied, **{group: settings}) == expected
+    ):
+        settings = getattr(varied, group).model_copy(update=change)
+        expected = {key for key in varied.fingerprints if affected(key)}
+        assert changed(varied, **{group: settings}) == expected, change
 
 
 def test_everything_changes_with_the_recordings_their_labels_and_with_those_that_test(varied):
@@ -299,7 +285,8 @@ def test_runs_carry_what_they_are_and_an_example_of_their_windows(world, fitted)
         spec, params = world.specs[fit.run.fingerprint], fit.run.params
         assert vars(spec).items() <= params.items()
         assert params["folds"] == 1
-        assert fit.run.tags == {"data_hash": world.raw.data_hash, "simulated": "0"}
+        engine = {"engine": fit.estimator.engine} if fit.estimator.seeded else {}
+        assert fit.run.tags == {"data_hash": world.raw.data_hash, "simulated": "0"} | engine
         assert fit.dataset["digest"] == world.raw.data_hash
         assert f"{spec.real_gyros}+{spec.virtual_gyros} 10 s" in fit.run.name
         assert fit.example.shape == (1, 3, 200)

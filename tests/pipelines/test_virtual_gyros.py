@@ -50,9 +50,7 @@ def test_biases_and_noise_are_those_of_training_recordings(virtual, bias):
     assert successive / float((noise**2).mean()) == pytest.approx(0, abs=0.01)
 
 
-def test_a_gyroscope_keeps_one_bias_over_its_recordings_or_with_jitter_about_one(
-    virtual, real, bias
-):
+def test_a_gyroscope_keeps_one_bias_over_recordings_or_with_jitter_about_one(virtual, real, bias):
     over_recordings = virtual.recording_mean.std("recording", ddof=1)
     assert float(over_recordings.mean()) == pytest.approx(SIGMA / np.sqrt(SAMPLES), rel=0.1)
     assert np.unique(virtual.recording_mean.mean("recording").round(2)).size > 15

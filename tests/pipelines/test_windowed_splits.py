@@ -12,21 +12,16 @@ from gyro_pipeline.pipelines.windowed_splits.protocols import check_table
 from gyro_pipeline.splits import split_recordings
 
 RATE_HZ = 20.0
-
 pytestmark = pytest.mark.slow
 
 
-def test_the_seed_chooses_validation_recordings_and_the_source_or_its_order_those_that_test(
-    parameters,
-):
+def test_the_seed_chooses_validation_recordings_and_the_source_or_order_those_that_test(parameters):
     first, other = (
         split_recordings(range(100), range(100), parameters("base", splits=seed).splits)
         for seed in ({"split_seed": 1}, {"split_seed": 2})
     )
-    validation = [
-        {n for n, role in roles.items() if role == "validation"} for roles in (first, other)
-    ]
-    assert validation[0] != validation[1]
+    one, two = ({n for n in roles if roles[n] == "validation"} for roles in (first, other))
+    assert one != two
     assert all(first[n] == other[n] == "test" for n in range(80, 100))
     given = dict.fromkeys(range(1, 31), "train") | {1: "test", 5: "test", 7: "test"}
     without_7 = [n for n in range(1, 31) if n not in (3, 7)]
@@ -97,9 +92,7 @@ def numbers(table, role, fold="hold-out", imu=1):
 
 
 @pytest.mark.parametrize(("count", "folds", "validation"), [(4, 4, 0), (21, 5, 2)])
-def test_few_recordings_make_a_k_fold_that_tests_each_once(
-    make, table_of, count, folds, validation
-):
+def test_few_recordings_make_a_k_fold_that_tests_each(make, table_of, count, folds, validation):
     table = table_of(make(count))
     names = [f"fold {fold}" for fold in range(folds)]
     assert table.fold.unique().tolist() == [*names, "all recordings"]
@@ -212,9 +205,7 @@ def test_without_a_window_that_tests_a_study_says_so(make, table_of):
         table_of(make(4), strides_s=[0.01])
 
 
-def test_recordings_are_cut_to_the_length_that_keeps_most(
-    make_recordings, make_bias, make_quality, caplog
-):
+def test_recordings_are_cut_to_what_keeps_most(make_recordings, make_bias, make_quality, caplog):
     """Of 60, 35 and 50 s; IMU 2 lacks the second, and four samples are masked."""
     uneven = make_recordings(np.full((2, 3, 3), 3.0), 1200, RATE_HZ, 0.005)
     for number, length in ((1, 700), (2, 1000)):

@@ -118,9 +118,8 @@ CODED = put((SOME, 1), -0.46)
 def test_each_oddity_has_its_finding(still, quality, change, expected, words):
     inspected = inspect(Log(change(still)), RATE_HZ, quality)
     assert checks(inspected) == expected
-    assert inspected.outcome == max(
-        expected.values(), key=[KEPT, REPAIRED, REJECTED].index, default=KEPT
-    )
+    worst = max(expected.values(), key=[KEPT, REPAIRED, REJECTED].index, default=KEPT)
+    assert inspected.outcome == worst
     for word in words:
         assert word in "; ".join(f.detail for f in inspected.findings)
 
@@ -183,13 +182,8 @@ def test_what_is_masked_at_the_ends_is_cut(still, quality):
 
 
 def test_too_few_rows_or_too_small_a_share_reject(still, quality):
-    for rows, lost, outcome in (
-        (0, 0, REJECTED),
-        (999, 0, REJECTED),
-        (1000, 0, KEPT),
-        (ROWS, 1150, REPAIRED),
-        (ROWS, 1250, REJECTED),
-    ):
+    cases = [(0, 0, REJECTED), (999, 0, REJECTED), (1000, 0, KEPT)]
+    for rows, lost, outcome in [*cases, (ROWS, 1150, REPAIRED), (ROWS, 1250, REJECTED)]:
         samples = still[:rows].copy()
         samples[300 : 300 + lost] = np.nan
         inspected = inspect(Log(samples), RATE_HZ, quality)

@@ -18,18 +18,10 @@ def rates():
 @pytest.fixture(scope="session")
 def good(rates):
     """Text of a good file of each logger, by name."""
-    lines = list(enumerate(rates.tolist()))
-    dot = [
-        f"{k + 1},{4_000_000_000 + 8333 * k},0.1,0.2,9.8,{x:.5f},{y:.5f},{z:.5f},"
-        for k, (x, y, z) in lines
-    ]
-    angles = [
-        f"{k / 120:.15g},-0.93,2.46,13.57,-0.41,-0.14,9.95,{x:.5f},{y:.5f},{z:.5f}, "
-        for k, (x, y, z) in lines
-    ]
-    general = [
-        f"{10 * k};{25 + k / 8:.3f};{x:.5f};{y:.5f};{z:.5f}" for k, (x, y, z) in lines
-    ]  # fmt: skip
+    rows = [(k, ",".join(np.char.mod("%.5f", row))) for k, row in enumerate(rates)]
+    dot = [f"{k + 1},{4_000_000_000 + 8333 * k},0.1,0.2,9.8,{xyz}," for k, xyz in rows]
+    angles = [f"{k / 120:.15g},-0.93,2.46,13.57,-0.41,-0.14,9.95,{xyz}, " for k, xyz in rows]
+    general = [f"{10 * k};{25 + k / 8:.3f};{xyz.replace(',', ';')}" for k, xyz in rows]
     above = ["sep=,", "DeviceTag:,DOT 1", "OutputRate:,120Hz", ""]
     texts = {
         "dot": [*above, "PacketCounter,SampleTimeFine,Acc_X,Acc_Y,Acc_Z,x,y,z,", *dot],

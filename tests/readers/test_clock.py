@@ -69,14 +69,10 @@ def test_coarse_clocks_and_doubled_rows_make_no_gaps(rate, stamps, rel, said):
 
 @pytest.mark.parametrize(
     "lost",
-    [
-        [100, 101, 500],
-        np.flatnonzero(np.random.default_rng(0).random(N - 20) < 0.1),
-        np.arange(3000, 3200, 2),
-        np.arange(1000, 1400),
-    ],
+    [[100, 101, 500], np.flatnonzero(np.random.default_rng(0).random(N - 20) < 0.1),
+     np.arange(3000, 3200, 2), np.arange(1000, 1400)],
     ids=["some", "a tenth", "every other", "a block"],
-)
+)  # fmt: skip
 def test_lost_samples_are_gaps_and_do_not_change_the_rate(lost):
     jitter = np.random.default_rng(1).uniform(-5e-4, 5e-4, N)
     kept = np.setdiff1d(np.arange(N), lost)
@@ -126,11 +122,8 @@ def test_jumps_and_strays_do_not_spoil_the_rate_in_any_unit(rate, tick):
 
 
 def test_counters_of_time_and_midnight_are_unwrapped():
-    for period, step, unit_s, burst in (
-        (2**32, 8333, 1e-6, 1),
-        (2**16, 10, 1e-3, 5),
-        (86_400, 0.02, 1, 1),
-    ):
+    counters = (2**32, 8333, 1e-6, 1), (2**16, 10, 1e-3, 5), (86_400, 0.02, 1, 1)
+    for period, step, unit_s, burst in counters:
         samples = (np.arange(1000) // burst + 1) * burst
         timing = from_stamps(np.mod(period - 501 * step + step * samples, period), unit_s)
         assert timing.rate_hz == pytest.approx(1 / (step * unit_s), rel=1e-3)

@@ -73,9 +73,7 @@ def test_what_is_not_said_is_asked_for(header, options, words, read):
 
 
 @pytest.mark.parametrize(("header", "options", "words"), CONTRADICTED)
-def test_contradictions_are_refused_unless_the_options_are_trusted(
-    header, options, words, read, details
-):
+def test_contradictions_are_refused_unless_one_is_trusted(header, options, words, read, details):
     with pytest.raises(InputError, match=f"{words}.*trust: options {IN_READER}"):
         read(header, S, X / 100, **options)
     log = read(header, S, X / 100, trust="options", **options)

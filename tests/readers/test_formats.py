@@ -46,9 +46,7 @@ LOGGERS = [
 
 
 @pytest.mark.parametrize(("name", "header", "columns", "preamble", "g"), LOGGERS)
-def test_each_logger_is_told_by_its_header_and_read_in_deg_per_s(
-    name, header, columns, preamble, g, read
-):
+def test_loggers_are_told_by_header_and_read_in_deg_per_s(name, header, columns, preamble, g, read):
     log = read(header, *columns, preamble=preamble, rate_hz=100)
     np.testing.assert_allclose(log.samples, X, rtol=1e-9)
     assert log.rate_hz == pytest.approx(100)

@@ -142,16 +142,9 @@ def test_one_recording_by_hand():
     rmse, mean = np.sqrt(0.5), np.sqrt(5)
     time_s = 10 + 10 * (1 - rmse) / 0.5
     values = {name: estimate.value for name, estimate in scores.items()}
-    assert values == pytest.approx(
-        {
-            "test_mse_dps2": 0.5,
-            "test_rmse_dps": rmse,
-            "mean_rmse_dps": mean,
-            "equivalent_time_s": time_s,
-            "time_saving_pct": 100 * (1 - 2 / time_s),
-            "accuracy_gain_pct": 100 * (1 - rmse / mean),
-        }
-    )
+    expected = {"test_mse_dps2": 0.5, "test_rmse_dps": rmse, "mean_rmse_dps": mean}
+    expected |= {"equivalent_time_s": time_s, "time_saving_pct": 100 * (1 - 2 / time_s)}
+    assert values == pytest.approx(expected | {"accuracy_gain_pct": 100 * (1 - rmse / mean)})
     assert all(estimate.lo is None and estimate.hi is None for estimate in scores.values())
     for wrong, off in ((9.0, -np.inf), (0.1, np.inf)):  # off the curve
         scores = scoring.score(squares([wrong]), squares([2.0]), curve, 5.0, PLAIN)
@@ -266,16 +259,13 @@ def test_stored_scores_are_read_by_truth_and_epoch():
     assert read_scores(table, truth=TRUE) == {("a", ALL): estimate(4)}
 
 
-@pytest.mark.parametrize(
-    ("gain", "ceiling", "above"),
-    [
+def test_an_interval_lies_above_another_only_entirely():
+    for gain, ceiling, above in (
         ((70, 66, 74), (60, 55, 65), True),
         ((70, 64, 74), (60, 55, 65), False),
         ((70, 66, 74), (60, None, None), True),
         ((70, np.nan, np.nan), (60, 55, 65), False),
         ((70, None, None), (60, 55, 65), False),
         ((70, 66, 74), (np.nan, np.nan, np.nan), False),
-    ],
-)
-def test_an_interval_lies_above_another_only_entirely(gain, ceiling, above):
-    assert scoring.Estimate(*gain).lies_above(scoring.Estimate(*ceiling)) is above
+    ):
+        assert scoring.Estimate(*gain).lies_above(scoring.Estimate(*ceiling)) is above, gain

@@ -52,14 +52,9 @@ def test_truths_are_those_of_brute_force_wherever_the_windows_are(size, starts, 
 
 @pytest.mark.parametrize("figures", [NoiseFigures(1, 0, 0), NoiseFigures(1, 1, 0.5)])
 def test_the_disjoint_variance_is_what_that_truth_scatters_by(figures):
-    noise = simulate_noise(
-        np.random.default_rng(4),
-        (1000, 3, 48),
-        RATE_HZ,
-        np.full(3, figures.white),
-        flicker_dps=figures.instability,
-        random_walk_dps_rts=figures.random_walk,
-    )
+    given = np.random.default_rng(4), (1000, 3, 48), RATE_HZ, np.full(3, figures.white)
+    colour = {"flicker_dps": figures.instability, "random_walk_dps_rts": figures.random_walk}
+    noise = simulate_noise(*given, **colour)
     starts = np.array([0, 16, 32])
     found = [of(one, 3 * (figures,)).truths(starts, 16)[DISJOINT] for one in noise]
     scatter = np.array([value for value, _ in found]).var(axis=(0, 2))

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from gyro_pipeline.conventions import InputError
 from gyro_pipeline.estimators.base import Estimator
 
 
@@ -16,8 +15,3 @@ class Constant(Estimator):
 
     def _estimate(self, windows):
         return self.bias + windows.start_s[:, np.newaxis], 0.5
-
-
-class Unwritable(Constant):
-    def save(self, folder):
-        raise InputError("not to be written")
