@@ -144,7 +144,6 @@ def test_noise_that_is_not_known_makes_students_intervals_and_a_least_time():
 
 KNOCK = np.s_[1000:1030], 2 * np.sin(np.linspace(0, 2 * np.pi, 30))[:, None]
 TURN = np.s_[1000:1100], np.array([0, 0, 30.0])  # by 30 degrees
-SWAY = 20 * np.sin(np.arange(2000) / 30)[:, None]
 HANDLED = np.s_[2000:], np.random.default_rng(4).normal(0, 20, (1000, 3))
 
 
@@ -161,16 +160,14 @@ def test_what_is_left_of_a_recording_with_a_motion(motion, code, least, most):
     assert least <= state.seconds_at_rest <= most
 
 
-def test_motion_throughout_is_not_at_rest():
+def test_motion_throughout_is_not_at_rest_and_not_taken_for_a_wrong_unit():
+    fast, slow, slower = (20 * np.sin(np.arange(2000) / n)[:, None] for n in (10, 30, 300))
     for kind in (KIND, UNKNOWN):
-        assert finished(still(20) + SWAY, kind=kind).rest == "moving"
-
-
-@pytest.mark.parametrize("samples_a_radian", [10, 300])
-def test_motion_is_not_taken_for_a_wrong_unit(samples_a_radian):
-    sway = 20 * np.sin(np.arange(2000) / samples_a_radian)[:, None]
-    state = finished(still(20) + sway, kind=read_type("memsense"))
-    assert (state.rest, "noise" in codes(state), "unit" in codes(state)) == ("moving", True, False)
+        assert finished(still(20) + slow, kind=kind).rest == "moving"
+    for sway in (fast, slower):
+        state = finished(still(20) + sway, kind=read_type("memsense"))
+        told = state.rest, "noise" in codes(state), "unit" in codes(state)
+        assert told == ("moving", True, False)
 
 
 def test_a_slow_rotation_is_seen_by_the_accelerometer_alone():
@@ -207,16 +204,10 @@ def test_warm_up_settles_and_is_said():
     assert "warm_up" in codes(state)
 
 
-def test_data_that_cannot_be_used_are_told():
-    for samples, code in (
-        (np.zeros((1000, 3)), "dead"),
-        (np.full((1000, 3), np.nan), "dead"),
-        (still(10) * np.degrees(1), "unit"),
-    ):
-        assert code in codes(finished(samples))
-
-
-def test_a_clock_that_jumps_is_said():
+def test_data_that_cannot_be_used_and_a_clock_that_jumps_are_told():
+    for dead in (np.zeros((1000, 3)), np.full((1000, 3), np.nan)):
+        assert "dead" in codes(finished(dead))
+    assert "unit" in codes(finished(still(10) * np.degrees(1)))
     time_s = np.arange(2000) / RATE
     time_s[700:] -= 1e6
     time_s[1400:] += 1e9

@@ -36,9 +36,8 @@ def test_what_is_stored_comes_back_in_order(device, tmp_path):
         assert device.append(line(number))
     assert not device.append(line(1))  # the same log
     given = opened("B17", tmp_path)
-    assert [tuple(c.mean) for c in given.setup.history] == [
-        (0.1, 1 / 3, n * 1e-3) for n in range(3)
-    ]
+    means = [tuple(calibration.mean) for calibration in given.setup.history]
+    assert means == [(0.1, 1 / 3, n * 1e-3) for n in range(3)]
     assert given.setup.device_type.type == "dot"
     assert len(opened("B17", tmp_path, without="0002").setup.history) == 2
 
