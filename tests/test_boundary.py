@@ -1,19 +1,24 @@
-"""Errors end in one line at one place, and passwords are shown nowhere."""
+"""What surrounds a run: options that are refused, errors in one line, no password, provenance."""
 
 import errno
 import logging
 import re
 import sys
 from concurrent.futures.process import BrokenProcessPool
+from types import SimpleNamespace
 
 import pytest
 from kedro.config import OmegaConfigLoader
-from kedro.io import DatasetError
+from kedro.io import DataCatalog, DatasetError
+from kedro.runner import ParallelRunner, SequentialRunner
 from mlflow.exceptions import MlflowException
 
 from gyro_pipeline import boundary
 from gyro_pipeline.boundary import explanation, mask_passwords
 from gyro_pipeline.conventions import InputError
+from gyro_pipeline.datasets.tracked_runs import TrackedRuns
+from gyro_pipeline.hooks import Provenance
+from gyro_pipeline.session import Session
 
 
 def raised(error, cause=None):
@@ -86,3 +91,25 @@ def test_a_defect_is_shown_whole_and_kept(tmp_path, capsys, caplog, monkeypatch)
     assert "KeyError: 'of ours'" in log
     assert log.partition("\n")[2] == capsys.readouterr().err
     assert f"report it with {tmp_path / 'data' / 'defect.log'}" in caplog.text
+
+
+def test_ways_to_run_that_cannot_end_well_are_refused():
+    for options, words in (
+        ({"only_missing_outputs": True}, "--only-missing-outputs: .* type kedro run without it"),
+        ({"runner": object.__new__(ParallelRunner)}, "ParallelRunner: .*execution.workers=N"),
+        ({"runner": SequentialRunner(is_async=True)}, "--async: .* type kedro run without it"),
+    ):
+        with pytest.raises(InputError, match=words):
+            object.__new__(Session).run(**options)
+
+
+def test_new_runs_are_marked_with_who_made_them_by_which_command(tmp_path, monkeypatch):
+    runs = TrackedRuns(str(tmp_path / "mlflow.db"))
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/kedro", "run", "--params=a b"])
+    monkeypatch.setenv("LOGNAME", "gauss")
+    pipeline = SimpleNamespace(datasets=lambda: {"dot.training.runs"})
+    run_params = {"project_path": str(tmp_path), "run_id": "1", "env": None}
+    Provenance().before_pipeline_run(run_params, pipeline, DataCatalog({"dot.training.runs": runs}))
+    assert runs.provenance["mlflow.user"] == "gauss"
+    assert runs.provenance["mlflow.source.name"] == "kedro run '--params=a b'"
+    assert runs.provenance["kedro_env"] == "base"

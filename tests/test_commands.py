@@ -1,11 +1,14 @@
-"""The commands that help and documentation name are there, and links lead somewhere."""
+"""What documents name is there, links lead somewhere, and notebooks run without stored results."""
 
 import re
+import shutil
 import subprocess
 from pathlib import Path
 
+import nbformat
 import pytest
 from markdown_it import MarkdownIt
+from nbclient import NotebookClient
 
 from gyro_pipeline.pipeline_registry import register_pipelines
 
@@ -54,3 +57,25 @@ def test_relative_links_lead_to_a_file_and_a_heading(path):
         page = (path.parent / name) if name else path
         assert page.exists(), target
         assert not anchor or anchor in anchors(page), target
+
+
+@pytest.mark.filterwarnings("ignore")  # of another process, the kernel
+@pytest.mark.parametrize(
+    "path", sorted(PROJECT.glob("notebooks/*.ipynb")), ids=lambda path: path.stem
+)
+def test_a_notebook_is_stored_without_results_and_runs_on_the_smoke_environment(
+    path, smoke, monkeypatch
+):
+    code = [cell for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
+    assert code
+    assert [(cell.outputs, cell.execution_count) for cell in code] == [([], None)] * len(code)
+    monkeypatch.setenv("KEDRO_ENV", "smoke")
+    monkeypatch.setenv("PYTHONPATH", str(PROJECT / "src"))
+    folder = smoke.project.folder / "notebooks"
+    folder.mkdir(exist_ok=True)
+    copy = nbformat.read(shutil.copy(path, folder), as_version=4)
+    NotebookClient(copy, timeout=120, resources={"metadata": {"path": str(folder)}}).execute()
+    outputs = [output for cell in copy.cells for output in cell.get("outputs", [])]
+    pictures = [output for output in outputs if "image/png" in output.get("data", {})]
+    assert pictures
+    assert "simulated" in str(copy.cells)
