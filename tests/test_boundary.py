@@ -93,14 +93,19 @@ def test_a_defect_is_shown_whole_and_kept(tmp_path, capsys, caplog, monkeypatch)
     assert f"report it with {tmp_path / 'data' / 'defect.log'}" in caplog.text
 
 
-def test_ways_to_run_that_cannot_end_well_are_refused():
+def test_ways_to_run_that_cannot_end_well_are_refused_in_one_line(monkeypatch, tmp_path):
+    installed = []
+    monkeypatch.setattr(boundary, "install", installed.append)
+    session = object.__new__(Session)
+    session._project_path = tmp_path
     for options, words in (
         ({"only_missing_outputs": True}, "--only-missing-outputs: .* type kedro run without it"),
         ({"runner": object.__new__(ParallelRunner)}, "ParallelRunner: .*execution.workers=N"),
         ({"runner": SequentialRunner(is_async=True)}, "--async: .* type kedro run without it"),
     ):
         with pytest.raises(InputError, match=words):
-            object.__new__(Session).run(**options)
+            session.run(**options)
+        assert installed.pop() == tmp_path  # it makes a line of the error
 
 
 def test_new_runs_are_marked_with_who_made_them_by_which_command(tmp_path, monkeypatch):

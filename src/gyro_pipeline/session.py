@@ -79,6 +79,32 @@ def parse_parameters(configuration: Mapping[str, Any]) -> "Parameters":
         raise InputError(_explanation(error)) from None
 
 
+def check_options(options: Mapping[str, Any]) -> None:
+    """Refuse options of ``kedro run`` that do not suit these pipelines.
+
+    Raises:
+        InputError: It names the option, and what to type.
+    """
+    from kedro.runner import ParallelRunner  # noqa: PLC0415
+
+    runner = options.get("runner")
+    if options.get("only_missing_outputs"):
+        raise InputError(
+            "--only-missing-outputs: Kedro cannot see which runs a run store lacks; type kedro run "
+            "without it, which makes only the runs that are not FINISHED"
+        )
+    if isinstance(runner, ParallelRunner):
+        raise InputError(
+            "--runner=ParallelRunner: each node starts its own processes; type kedro run without "
+            "it, and --params=execution.workers=N for N processes"
+        )
+    if getattr(runner, "_is_async", False):
+        raise InputError(
+            "--async: each result is saved as soon as it is computed, which Kedro cannot do in the "
+            "background; type kedro run without it"
+        )
+
+
 class Context(KedroContext):
     """A context that checks the parameters and selects the pipelines by them.
 
@@ -111,32 +137,17 @@ class Session(KedroSession):
         Raises:
             InputError: The runner or an option does not suit these pipelines.
         """
-        from kedro.runner import ParallelRunner, SequentialRunner  # noqa: PLC0415
+        from kedro.runner import SequentialRunner  # noqa: PLC0415
 
-        runner = options.get("runner")
-        if options.get("only_missing_outputs"):
-            raise InputError(
-                "--only-missing-outputs: Kedro cannot see which runs a run store lacks; type "
-                "kedro run without it, which makes only the runs that are not FINISHED"
-            )
-        if isinstance(runner, ParallelRunner):
-            raise InputError(
-                "--runner=ParallelRunner: each node starts its own processes; type kedro run "
-                "without it, and --params=execution.workers=N for N processes"
-            )
-        if getattr(runner, "_is_async", False):
-            raise InputError(
-                "--async: each result is saved as soon as it is computed, which Kedro cannot do in "
-                "the background; type kedro run without it"
-            )
         project = self._project_path
         boundary.install(project)
+        check_options(options)
         run_lock.check_folder(project)
         every_node = not any(map(options.get, _NAMES_NODES))
         interrupts = run_lock.Interrupts()
         self._hook_manager.register(interrupts)
         with self._in_project(), run_lock.only_run(project / "data" / "run.lock"):
-            if type(runner) in (SequentialRunner, NoneType) and every_node:
+            if type(options.get("runner")) in (SequentialRunner, NoneType) and every_node:
                 from gyro_pipeline.runner import ChangedNodesRunner  # noqa: PLC0415
 
                 options["runner"] = ChangedNodesRunner(project / "data" / "ended_nodes.json")
