@@ -403,6 +403,7 @@ def test_what_two_projects_train_at_once_is_stored_once(store, monkeypatch, tmp_
 
 def test_fits_without_a_server_are_stored_once_it_answers(store, monkeypatch, tmp_path, caplog):
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{store}")
+    monkeypatch.chdir(tmp_path)  # where this store puts its artifacts
     runs, folds = tracked(tmp_path / "mlflow.db", study="real2real"), ("fold 0", "fold 1", MODEL)
     runs.check_reachable()
     runs.save(fitted(fold="fold 0", folds=folds))
