@@ -419,7 +419,8 @@ def test_fits_without_a_server_are_stored_once_it_answers(store, monkeypatch, tm
             server.load()
     (run,) = TrackedRuns(str(tmp_path / "mlflow.db")).load()  # of all studies
     assert run.trained and run.fits == set(folds)
-    assert not [*tmp_path.rglob("*.pkl")]
+    assert (unsaved := tmp_path / "data/06_models/unsaved_fits").exists()
+    assert not [*unsaved.rglob("*.pkl")]
     assert len(runs.load()) == 1
 
 
