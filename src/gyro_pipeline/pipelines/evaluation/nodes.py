@@ -85,9 +85,15 @@ def evaluate(
         if not (stored[key].finished and stored[key].tags.get(EVALUATED_WITH) == evaluated_with)
     }
     tables = dict(iter(windows.groupby(_WINDOWS, observed=True)))
-    devices = Devices(recordings, bias, allan)
+    devices: dict[str, TestDevice] = {}  # the same for most windows
     for chosen, group in groupby(pending, key=lambda key: _windows_of(pending[key])):
-        bench = _bench(recordings, devices, tables[chosen])
+        table = tables[chosen]
+        tested = _tested(table)
+        if tested not in devices:
+            devices[tested] = describe_devices(recordings, bias, allan, table)
+        columns = ["fold", "imu", "recording", "start"]
+        tests = table[table.role == TEST][columns].astype({"fold": str})
+        bench = Bench(recordings, devices[tested], tests, float(table.window_s.iloc[0]))
         for key in group:
             yield _evaluate_run(stored[key], pending[key], bench, evaluated_with)
     label = recordings.attrs["sensor"]
@@ -102,31 +108,10 @@ def _windows_of(spec: RunSpec) -> tuple[Any, ...]:
     return tuple(getattr(spec, name) for name in _WINDOWS)
 
 
-def _bench(recordings: xr.Dataset, devices: "Devices", table: pd.DataFrame) -> Bench:
-    """The bench of a part of the windows table."""
-    columns = ["fold", "imu", "recording", "start"]
-    tests = table[table.role == TEST][columns].astype({"fold": str})
-    return Bench(recordings, devices.of(table), tests, float(table.window_s.iloc[0]))
-
-
-class Devices:
-    """The descriptions of tested devices, which are the same for most windows.
-
-    Args:
-        recordings, bias, allan: As :func:`evaluate` takes them.
-    """
-
-    def __init__(self, recordings: xr.Dataset, bias: pd.DataFrame, allan: xr.Dataset) -> None:
-        self._data = recordings, bias, allan
-        self._cache: dict[str, TestDevice] = {}
-
-    def of(self, table: pd.DataFrame) -> TestDevice:
-        """The description of the devices that are tested in a part of the windows table."""
-        roles = table[["fold", "role", "origin", "imu", "recording"]].drop_duplicates()
-        key = fingerprint(roles.astype(str).to_numpy().tolist())
-        if key not in self._cache:
-            self._cache[key] = describe_devices(*self._data, table)
-        return self._cache[key]
+def _tested(table: pd.DataFrame) -> str:
+    """A key that is equal for windows tables whose tested devices have the same description."""
+    roles = table[["fold", "role", "origin", "imu", "recording"]].drop_duplicates()
+    return fingerprint(roles.astype(str).to_numpy().tolist())
 
 
 def _evaluate_run(run: StoredRun, spec: RunSpec, bench: Bench, evaluated_with: str) -> EvaluatedRun:
