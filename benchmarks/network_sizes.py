@@ -84,7 +84,7 @@ def timed(job: TrainingJob):  # noqa: ANN201, D103
 
 def _row(job: TrainingJob, result: tuple) -> dict[str, float]:
     network, seconds = result
-    losses = network.history.val_loss
+    losses = network.losses.val_loss
     steps = job.settings.epochs * -(-job.windows // job.settings.batch_size)
     sizes = {name: job.design.options[name] for name in NAMES}
     return sizes | {

@@ -50,7 +50,7 @@ from gyro_pipeline.estimators.training import TrainingSet
 from gyro_pipeline.executors import run_jobs
 from gyro_pipeline.learning import fused
 from gyro_pipeline.learning.design import Design, options_of
-from gyro_pipeline.learning.examples import Device, Examples
+from gyro_pipeline.learning.examples import Examples, NetworkInput
 from gyro_pipeline.learning.fused import FusedEngine
 from gyro_pipeline.learning.jobs import (
     TrainingJob,
@@ -818,7 +818,7 @@ def _memory_job(
     for some in inputs:
         bias = data.recording_mean.sel(imu=list(some), recording=list(numbers))
         biases = bias.transpose("recording", "imu", "axis").to_numpy().reshape(len(numbers), -1)
-        devices.append(Device(data.angular_rate, some, numbers, biases, starts))
+        devices.append(NetworkInput(data.angular_rate, some, numbers, biases, starts))
     design = sized(parameters.training, devices[0].biases.shape[1], samples)
     return TrainingJob(design, devices, None, parameters.training, seed=0, cell=(method, imus))
 

@@ -387,7 +387,7 @@ def _draw_estimators(left: Axes, right: Axes, rows: pd.DataFrame) -> None:
     groups = rows.groupby(names, sort=False)
     for number, (name, results) in enumerate(groups):
         rmse = results.drop_duplicates("window_s").set_index("window_s").test_rmse_dps.sort_index()
-        look = estimator_look(results.estimator.iloc[0], bool(results.recommended.any()))
+        look = estimator_look(results.estimator.iloc[0], bool(results.recommended.any()), number)
         shift = 1 + 0.015 * (number - groups.ngroups / 2)
         ratio = rmse / means.test_rmse_dps.reindex(rmse.index)
         for ax, values in ((left, rmse / MDPS), (right, ratio)):

@@ -34,10 +34,13 @@ _FAMILIES = {
 """Estimators that share a colour; they differ in their markers. Others are grey."""
 
 
-def estimator_look(name: str, recommended: bool) -> dict[str, Any]:
-    """Style of the line of an estimator: a colour per family, filled markers if recommended."""
+def estimator_look(name: str, recommended: bool, number: int) -> dict[str, Any]:
+    """Style of the line of an estimator: a colour per family, filled markers if recommended.
+
+    Estimators without a family, such as those of a sweep, are grey with the marker of ``number``.
+    """
     families = [(c, names.index(name)) for c, names in _FAMILIES.items() if name in names]
-    colour, member = families[0] if families else ("grey", 0)
+    colour, member = families[0] if families else ("grey", number % len(MARKERS))
     return {
         "color": colour,
         "marker": MARKERS[member],
