@@ -25,12 +25,10 @@ from gyro_pipeline.physics.ceiling import (
     oracle,
     pooled,
     running_mean_rmse,
-    spread_draws,
-    turn_on_spread,
 )
 from gyro_pipeline.physics.history import BiasHistory
 from gyro_pipeline.physics.recording_model import constant_bias
-from gyro_pipeline.physics.reml import guarded_spread
+from gyro_pipeline.physics.turn_on import guarded_spread, spread_draws, turn_on_spread
 from gyro_pipeline.pipelines.evaluation.ceilings import with_draws
 from gyro_pipeline.scoring.scores import (
     Estimate,

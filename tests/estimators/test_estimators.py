@@ -12,7 +12,7 @@ from gyro_pipeline.estimators.shrinkage import EmpiricalBayes, PooledEmpiricalBa
 from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.ceiling import oracle, running_mean_rmse
 from gyro_pipeline.physics.recording_model import constant_bias
-from gyro_pipeline.physics.reml import guarded_spread
+from gyro_pipeline.physics.turn_on import guarded_spread
 
 RATE, SAMPLES, SIZE = 20.0, 800, 200
 N, TAU = 5 * MDPS, 1 * MDPS

@@ -112,11 +112,27 @@ def test_a_fallback_costs_little_and_saves_where_the_prior_fails(simulate, judge
     assert rms(errors) < 0.3 * rms(judged(plain, turned, 10)[0])
     assert np.mean(np.abs(errors) < 1.96 * sigma) > 0.85
     for wrong, told in (
-        ({"history": True, "fallback": True}, "expected no history"),
+        ({"history": True, "joint": True}, "expected at most one of"),
         ({"noise": "white"}, "expected 'reml' or 'allan', got 'white'"),
     ):
         with pytest.raises(InputError, match=told):
             BestLinear(**wrong)
+
+
+@pytest.mark.slow
+def test_correlated_axes_are_estimated_jointly(simulate, judged, training_set):
+    training, tested = halves(simulate(WARMING, 80, seed=5), 40)
+    alone, joint = (BestLinear(None, joint=j).fit(training_set(training)) for j in (False, True))
+    np.testing.assert_array_equal(judged(joint, tested, 10)[0], judged(alone, tested, 10)[0])
+    common = np.random.default_rng(6).normal(0, 3 * TAU, 80)[None, :, None]
+    for part, shift in zip((training, tested), np.split(common, 2, axis=1), strict=True):
+        part["angular_rate"] = part.angular_rate + np.float32(shift)[..., None]
+        part["true_bias"] = part.true_bias + shift
+    alone, joint = (BestLinear(None, joint=j).fit(training_set(training)) for j in (False, True))
+    for target in (RECORDING_MEAN, BIAS):
+        errors, sigma = judged(joint, tested, 10, target)
+        assert rms(errors) < 0.9 * rms(judged(alone, tested, 10, target)[0])
+        assert np.mean(np.abs(errors) < 1.96 * sigma) > 0.9
 
 
 def test_ridge_regression_solves_its_normal_equations():

@@ -40,28 +40,7 @@ def test_known_ceilings_at_ten_seconds_without_turn_on_spread():
         assert round(100 * limits.best_gain(rho).item()) == gain
 
 
-def test_turn_on_spread_by_hand_counts_present_recordings_only():
-    means = np.array([[1.0, 0.0], [3.0, 0.0], [np.nan, 1.0], [5.0, 1.0]])
-    # sample variances 4 and 1/3, averaging noise 2^2 / 4
-    np.testing.assert_allclose(limits.turn_on_spread(means, 2.0**2 / 4), [np.sqrt(3.0), 0.0])
-    with pytest.raises(InputError, match="at least 2 recordings"):
-        limits.turn_on_spread(means[1:3], N**2 / T)
+def test_axes_are_pooled_and_an_unknown_truth_is_refused():
     assert limits.pooled([3.0, 4.0, 5.0]) == pytest.approx(np.sqrt(50 / 3))
     with pytest.raises(InputError, match="expected 'paper', 'disjoint' or 'true', got 'mean'"):
         limits.running_mean_rmse(N, 10, T, "mean")
-
-
-def test_draws_of_the_spread_hold_it_as_often_as_they_say():
-    """Of 11 recordings, with little averaging noise, jointly over axes as well."""
-    generator, tau = np.random.default_rng(2), np.array([1.0, 2.0, 3.0])
-    held = []
-    for _ in range(300):
-        means = generator.normal(0, np.hypot(tau, 0.5), (11, 3))
-        draws = limits.spread_draws(means, 0.25, 200)
-        lo, hi = np.percentile(draws, [2.5, 97.5], axis=0)
-        held.append((lo <= tau) & (tau <= hi))
-    np.testing.assert_allclose(np.mean(held, axis=0), 0.95, atol=0.04)
-    joint = limits.joint_draws(means, np.full(3, 0.25), 200)
-    np.testing.assert_allclose(joint[0], np.cov(means.T) - 0.25 * np.eye(3), atol=0.3)
-    assert (np.linalg.eigvalsh(joint) > -1e-9).all()
-    assert np.median(joint[1:, 2, 2]) == pytest.approx(np.median(draws[:, 2] ** 2), rel=0.4)

@@ -8,7 +8,7 @@ from gyro_pipeline.conventions import MDPS, InputError
 from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.noise import simulate_noise, warm_up
 from gyro_pipeline.physics.recording_model import block_edges, block_means, constant_bias
-from gyro_pipeline.physics.reml import _Likelihood, fit_recording_model, guarded_spread
+from gyro_pipeline.physics.reml import _Likelihood, fit_recording_model
 
 RATE, SAMPLES = 20.0, 1600
 N, B, K, TAU = 5 * MDPS, 5 * MDPS, 0.5 * MDPS, 2 * MDPS
@@ -72,16 +72,7 @@ def test_the_likelihood_is_the_dense_one_of_all_contrasts():
     assert fast[1] - fast[0] == pytest.approx(dense(*points[1]) - dense(*points[0]), rel=1e-8)
 
 
-def test_the_guarded_spread_solves_its_equation_and_matters_with_few_recordings_only():
-    """The root of a quadratic in w = tau^2 + v for one group."""
-    squares, freedom, v = 30.0, 9, 2.0
-    b = squares + freedom * v
-    w = (b + np.sqrt(b**2 - 4 * (freedom - 1) * v * squares)) / (2 * (freedom - 1))
-    assert guarded_spread(squares, freedom, v) == pytest.approx(np.sqrt(w - v))
-    assert guarded_spread(0.5 * 4 * 4.0, 4, 4.0) > 0.3  # the plain estimate is 0
-    many = 10_000
-    assert guarded_spread(3 * many, many, 2.0) == pytest.approx(1.0, rel=1e-3)
-    assert guarded_spread(0.0, 5, 0.0) == 0
+def test_two_recordings_are_too_few():
     for count in (0, 2):
         with pytest.raises(InputError, match=f"at least 3 recordings of a gyroscope, got {count}"):
             fit_recording_model(recorded(3)[:count], RATE)

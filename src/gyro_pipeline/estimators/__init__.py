@@ -25,7 +25,7 @@ ESTIMATORS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "last_calibration": (f"{_HERE}shrinkage:LastCalibration", {}),
     "empirical_bayes": (f"{_HERE}shrinkage:EmpiricalBayes", {}),
     "empirical_bayes_pooled": (f"{_HERE}shrinkage:PooledEmpiricalBayes", {}),
-    "best_linear": (f"{_HERE}linear:BestLinear", {"warm_up": None}),
+    "best_linear": (f"{_HERE}linear:BestLinear", {"warm_up": None, "joint": True}),
     "best_linear_fallback": (f"{_HERE}linear:BestLinear", {"warm_up": None, "fallback": True}),
     "best_linear_allan": (f"{_HERE}linear:BestLinear", {"noise": "allan"}),
     "best_linear_warm_up": (f"{_HERE}linear:BestLinear", {"warm_up": True}),
@@ -47,8 +47,8 @@ A class is an :class:`~gyro_pipeline.estimators.base.Estimator`, or an ``nn.Modu
 """
 
 DEFAULT = "best_linear"
-"""The default choice: its sigma holds on coloured noise as well, and it models a warm-up if the
-recordings show one."""
+"""The default choice: its sigma holds on coloured noise as well, and it models a warm-up, and a
+correlation between axes, if the recordings show one."""
 
 ORIENTATION_NOTE = (
     "uses a stored prior, which holds only in the orientation and at the latitude it was learned in"

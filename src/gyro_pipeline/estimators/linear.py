@@ -1,6 +1,7 @@
 """Linear estimators on block means: the best linear predictor, and ridge regression."""
 
 import copy
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from typing import Any, ClassVar
@@ -21,8 +22,10 @@ from gyro_pipeline.physics.recording_model import (
     WindowModel,
     block_edges,
     block_means,
+    joint_prior,
 )
 from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, fit_recording_model
+from gyro_pipeline.physics.turn_on import axes_are_correlated, joint_draws
 
 _FLAT = 1e3
 """Standard deviation of a flat prior, deg/s."""
@@ -67,6 +70,8 @@ class _Linear(Estimator):
         variance = np.reshape([line.variance for line in lines], shape)
         sigma = np.sqrt(np.maximum(variance, 0.0))  # 0 for a whole recording, except rounding
         means = block_means(samples, lines[0].edges)
+        # a joint estimate has weights for the blocks of all axes
+        means = means.reshape(len(means), -1, weights.shape[-1])
         return np.sum(means * weights[which], axis=-1) + constants[which], sigma[which]
 
     def _cached_line(self, *key: *_Key) -> LinearEstimate:
@@ -82,7 +87,7 @@ class _Linear(Estimator):
 
 
 class BestLinear(_Linear):
-    """The best linear predictor under the fitted noise and prior, axis by axis.
+    """The best linear predictor under the fitted noise and prior.
 
     White noise, bias instability, rate random walk, the turn-on spread and, as an option, a warm-up
     of random amplitude are fitted to whole training recordings
@@ -90,6 +95,9 @@ class BestLinear(_Linear):
     given the block means of the window (:mod:`gyro_pipeline.physics.recording_model`), including
     the uncertainty of the prior mean. On white noise this is empirical Bayes; sigma holds on
     coloured noise as well. The start of the window, ``start_s``, matters.
+
+    Axes are estimated one by one, or jointly if the means of the recordings are correlated between
+    axes (:func:`gyro_pipeline.physics.turn_on.axes_are_correlated`).
 
     The bias is the settled one, without the warm-up and the random walk since power-on.
 
@@ -107,7 +115,9 @@ class BestLinear(_Linear):
         history: Whether the prior of a recording follows from the earlier calibrations of the
             device, in their order (:mod:`gyro_pipeline.physics.history`), for a bias that drifts
             from one recording to the next.
-        fallback: Whether the prior may be wrong; not together with ``history``.
+        fallback: Whether the prior may be wrong.
+        joint: Whether correlated axes are estimated jointly. At most one of ``history``,
+            ``fallback`` and ``joint`` may be set.
     """
 
     uses_prior = True
@@ -120,14 +130,15 @@ class BestLinear(_Linear):
         noise: str = "reml",
         history: bool = False,
         fallback: bool = False,
+        joint: bool = False,
     ) -> None:
-        if history and fallback:
-            raise InputError("fallback: expected no history; a prior that follows it is not tested")
+        if history + fallback + joint > 1:
+            raise InputError("expected at most one of history, fallback and joint")
         if noise not in ("reml", "allan"):
             raise InputError(f"noise: expected 'reml' or 'allan', got {noise!r}")
         self.recommended = noise == "reml"  # the Allan fit ignores a warm-up
         self._warm_up, self._allan, self._by_recording = warm_up, noise == "allan", history
-        self._fallback = fallback
+        self._fallback, self._joint = fallback, joint
 
     def _fit(self, training: TrainingSet) -> None:
         super()._fit(training)
@@ -139,6 +150,7 @@ class BestLinear(_Linear):
         ]
         """The fitted model of each axis."""
         self._histories: list[BiasHistory] = []
+        self._biases: NDArray[np.float64] | None = None  # their covariance, if it is joint
         if not training.seen:
             self.models = [_of_unseen(model, len(training.known_imus)) for model in self.models]
         elif self._by_recording:
@@ -147,6 +159,8 @@ class BestLinear(_Linear):
                 BiasHistory.fit(numbers, means, model)
                 for means, model in zip(labels.T, self.models, strict=True)
             ]
+        elif self._joint and axes_are_correlated(training.labels[1]):
+            self._biases = _joint_covariance(training.labels[1], self.models)
         self._windows: dict[tuple[int, int, int, str], WindowModel] = {}
         self._forget()
 
@@ -199,12 +213,20 @@ class BestLinear(_Linear):
     def _line(
         self, axis: int, start: int, size: int, target: str, recording: int | None
     ) -> LinearEstimate:
-        prior = self._prior(axis, recording)
-        key = axis, start, size, target
+        if self._biases is None:
+            prior = self._prior(axis, recording)
+            return self._window(axis, start, size, target).best(prior.mean, prior.covariance)
+        windows = [self._window(i, start, size, target) for i in range(len(self.models))]
+        mean = np.concatenate([model.mean for model in self.models])
+        covariance = joint_prior(self.models, self._biases)
+        return WindowModel.joint(windows, axis).best(mean, covariance)
+
+    def _window(self, *key: *tuple[int, int, int, str]) -> WindowModel:
+        axis, start, size, target = key
         if key not in self._windows:
             truth = PAPER if target == RECORDING_MEAN else TRUE
-            self._windows[key] = WindowModel.of(prior, start, size, truth)
-        return self._windows[key].best(prior.mean, prior.covariance)
+            self._windows[key] = WindowModel.of(self.models[axis], start, size, truth)
+        return self._windows[key]
 
     def _prior(self, axis: int, recording: int | None) -> RecordingModel:
         """The prior of a recording, from the calibrations before it if there is a history."""
@@ -222,6 +244,16 @@ def _of_unseen(model: RecordingModel, devices: int) -> RecordingModel:
     if devices < FEWEST_RECORDINGS:
         covariance[0, 0] = _FLAT**2
     return replace(model, covariance=covariance)
+
+
+def _joint_covariance(
+    means: NDArray[np.float64], models: Sequence[RecordingModel]
+) -> NDArray[np.float64]:
+    """Covariance of the biases of all axes; its variances are at least those of the models."""
+    covariance = joint_draws(means, [model.averaging_variance() for model in models], draws=0)[0]
+    variances = np.array([model.covariance[0, 0] for model in models])
+    missing = np.maximum(variances - np.diag(covariance), 0.0)
+    return np.asarray(covariance + np.diag(missing))
 
 
 def _with_spread(model: RecordingModel, spread: float) -> RecordingModel:

@@ -9,7 +9,8 @@ from gyro_pipeline.conventions import BIAS, REAL, RECORDING_MEAN
 from gyro_pipeline.estimators.base import Estimator, Windows
 from gyro_pipeline.estimators.training import TrainingSet, fitted_noise
 from gyro_pipeline.physics.history import merged_calibrations
-from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, guarded_spread
+from gyro_pipeline.physics.reml import FEWEST_RECORDINGS
+from gyro_pipeline.physics.turn_on import guarded_spread
 
 
 class TrainingMean(Estimator):
@@ -76,8 +77,8 @@ class EmpiricalBayes(Estimator):
 
     and the mean of the recording is r m + (1 - r) times that, r = T0 / T (Efron & Morris 1973; see
     :mod:`gyro_pipeline.physics.ceiling`). With few recordings tau may be 0 by chance, and every
-    estimate would be mu; therefore tau has a weak prior (:mod:`gyro_pipeline.physics.reml`). Sigma
-    is too small where noise is not white.
+    estimate would be mu; therefore tau has a weak prior (:mod:`gyro_pipeline.physics.turn_on`).
+    Sigma is too small where noise is not white.
 
     The prior of an unseen device is the mean and spread of the means of the known devices. With
     fewer than three labels the prior is flat, and the estimate is the running mean.

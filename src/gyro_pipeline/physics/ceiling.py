@@ -31,12 +31,9 @@ the pooled values.
 """
 
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from gyro_pipeline.conventions import DISJOINT, PAPER, TRUE, InputError
-
-_FEWEST_RECORDINGS = 2
 
 
 def running_mean_rmse(
@@ -144,79 +141,6 @@ def oracle(
     posterior_mean = mu + _posterior_weight(noise, turn_on_spread, window_s) * (m - mu)
     r = window_s / recording_s if _includes_window(truth) else 0.0
     return r * m + (1 - r) * posterior_mean
-
-
-def turn_on_spread(
-    recording_means: NDArray[np.floating], averaging: ArrayLike
-) -> NDArray[np.float64]:
-    """Turn-on spread tau: the scatter of the recordings' means beyond their averaging noise.
-
-    Args:
-        recording_means: (n, ...), deg/s; NaN where a recording is missing.
-        averaging: Variance of the averaging noise, (deg/s)^2, broadcast against the trailing shape:
-            N^2 / T if the noise is white.
-
-    Returns:
-        (...), deg/s; 0 where the means scatter less than their averaging noise.
-
-    Raises:
-        InputError: Fewer than two recordings.
-    """
-    present = np.isfinite(recording_means).sum(axis=0)
-    if np.any(present < _FEWEST_RECORDINGS):
-        raise InputError(
-            f"turn-on spread: expected at least {_FEWEST_RECORDINGS} recordings of every "
-            f"gyroscope, got {present}"
-        )
-    scatter = np.nanvar(recording_means, axis=0, ddof=1, dtype=np.float64)
-    return np.asarray(np.sqrt(np.maximum(0.0, scatter - np.asarray(averaging, np.float64))))
-
-
-def spread_draws(
-    recording_means: NDArray[np.floating], averaging: ArrayLike, draws: int
-) -> NDArray[np.float64]:
-    """Draws of the turn-on spread, whose quantiles are intervals.
-
-    For normal means, the scatter of n means is their variance times a chi-square variable of n - 1
-    degrees of freedom over n - 1. So the scatter is divided by draws of this variable (a
-    generalised pivot; Weerahandi 1993, Journal of the American Statistical Association 88), and the
-    averaging noise is subtracted.
-
-    Args:
-        recording_means: As for :func:`turn_on_spread`.
-        averaging: As for :func:`turn_on_spread`.
-        draws: Number of draws, from a fixed seed.
-
-    Returns:
-        (draws, ...), deg/s.
-    """
-    freedom = np.isfinite(recording_means).sum(axis=0) - 1
-    scatter = np.nanvar(recording_means, axis=0, ddof=1, dtype=np.float64)
-    generator = np.random.default_rng(0)
-    pivots = freedom / generator.chisquare(freedom, (draws, *scatter.shape))
-    variances = scatter * pivots - np.asarray(averaging, np.float64)
-    return np.asarray(np.sqrt(np.maximum(0.0, variances)))
-
-
-def joint_draws(
-    recording_means: NDArray[np.floating], averaging: ArrayLike, draws: int
-) -> NDArray[np.float64]:
-    """Covariance of the turn-on bias of all axes: the estimate, then draws.
-
-    Args:
-        recording_means: (n, axes), deg/s, of more recordings than axes.
-        averaging: Variance of their averaging noise, (axes,), (deg/s)^2.
-        draws: Number of draws, as by :func:`spread_draws`, but from a Wishart distribution.
-
-    Returns:
-        (1 + draws, axes, axes), (deg/s)^2; positive semidefinite.
-    """
-    scatter, freedom = np.cov(recording_means.T), len(recording_means) - 1
-    pivots = scipy.stats.wishart.rvs(freedom, np.eye(len(scatter)) / freedom, draws, random_state=0)
-    root = np.linalg.cholesky(scatter)
-    samples = root @ np.linalg.inv(pivots) @ root.T
-    values, vectors = np.linalg.eigh(np.concatenate([scatter[None], samples]) - np.diag(averaging))
-    return np.asarray((vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.swapaxes(1, 2))
 
 
 def pooled(rmse_per_axis: ArrayLike) -> NDArray[np.float64]:

@@ -85,7 +85,7 @@ class LinearEstimate:
 
     Attributes:
         edges: Edges of the blocks within the window, (m + 1,), samples.
-        weights: (m,).
+        weights: (m,); (axes m,) if it uses the windows of several axes.
         constant: deg/s.
         variance: Variance of the error, (deg/s)^2.
     """
@@ -201,7 +201,7 @@ def joint_squares(
     It is smaller than that of separate estimates if biases are correlated between axes.
 
     Args:
-        models: Models of the axes; their priors of the bias are not used.
+        models: Models of the axes.
         start: First sample of the window, counted from power-on.
         size: Samples of the window.
         truth: PAPER or TRUE.
@@ -211,19 +211,26 @@ def joint_squares(
         (n,), (deg/s)^2.
     """
     windows = [WindowModel.of(model, start, size, truth) for model in models]
-    firsts = np.concatenate([[0], np.cumsum([model.mean.size for model in models])])
-    priors = np.zeros((len(covariances), firsts[-1], firsts[-1]))
-    for model, first in zip(models, firsts[:-1], strict=True):
-        block = slice(first, first + model.mean.size)
-        priors[:, block, block] = np.diag(np.diag(model.covariance))
-    priors[:, firsts[:-1, None], firsts[:-1]] = covariances
-    information = scipy.linalg.block_diag(*(window.information for window in windows))
-    posterior = np.linalg.solve(np.eye(firsts[-1]) + priors @ information, priors)
-    of_axes = [
-        window.error_variance(posterior[:, first:stop, first:stop])
-        for window, first, stop in zip(windows, firsts[:-1], firsts[1:], strict=True)
-    ]
+    priors = np.stack([joint_prior(models, biases) for biases in covariances])
+    of_axes = [WindowModel.joint(windows, axis).variance(priors) for axis in range(len(models))]
     return np.asarray(np.mean(of_axes, axis=0))
+
+
+def joint_prior(
+    models: Sequence[RecordingModel], covariance: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Prior covariance of the constants c of all axes, for :meth:`WindowModel.joint`.
+
+    Args:
+        models: Models of the axes.
+        covariance: Covariance of their biases, (axes, axes), (deg/s)^2.
+    """
+    roots = [np.linalg.cholesky(model.covariance) for model in models]
+    firsts = np.cumsum([0, *map(len, roots[:-1])])
+    root, scales = scipy.linalg.block_diag(*roots), [root[0, 0] for root in roots]
+    inner = np.eye(len(root))
+    inner[np.ix_(firsts, firsts)] = covariance / np.outer(scales, scales)
+    return np.asarray(root @ inner @ root.T)
 
 
 @lru_cache(maxsize=1 << 16)  # curves of all recordings need the same values
@@ -301,6 +308,22 @@ class WindowModel:
             float(averaging @ noise @ averaging),
         )
 
+    @classmethod
+    def joint(cls, windows: Sequence["WindowModel"], axis: int) -> "WindowModel":
+        """The model of the block means of all axes and the truth of one, for a prior of all axes.
+
+        Noise is independent between axes. The block means of the axes follow one another.
+        """
+        chosen = windows[axis]
+        return cls(
+            chosen.edges,
+            scipy.linalg.block_diag(*(window.design for window in windows)),
+            np.concatenate([(i == axis) * w.coefficients for i, w in enumerate(windows)]),
+            scipy.linalg.block_diag(*(window.covariance for window in windows)),
+            np.concatenate([(i == axis) * w.shared for i, w in enumerate(windows)]),
+            chosen.truth_noise,
+        )
+
     @cached_property
     def _solved(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The inverse of the covariance of e times ``shared``, (m,), and times X."""
@@ -309,7 +332,7 @@ class WindowModel:
         return solved[:, 0], solved[:, 1:]
 
     @cached_property
-    def information(self) -> NDArray[np.float64]:
+    def _information(self) -> NDArray[np.float64]:
         """Fisher information of y about c."""
         return np.asarray(self.design.T @ self._solved[1])
 
@@ -320,14 +343,14 @@ class WindowModel:
 
     def _posterior(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
         """Covariance of c given y, for prior covariances (..., k, k)."""
-        shrinking = np.eye(self._sensitivity.size) + covariance @ self.information
+        shrinking = np.eye(self._sensitivity.size) + covariance @ self._information
         return np.asarray(np.linalg.solve(shrinking, covariance))
 
     def variance(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
         """Variance of the error of :meth:`best`, (...), for prior covariances (..., k, k)."""
-        return self.error_variance(self._posterior(covariance))
+        return self._error_variance(self._posterior(covariance))
 
-    def error_variance(self, posterior: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _error_variance(self, posterior: NDArray[np.float64]) -> NDArray[np.float64]:
         """Variance of the error, (...), for posterior covariances of c (..., k, k)."""
         explained = self._solved[0] @ self.shared
         of_c = posterior @ self._sensitivity @ self._sensitivity
@@ -343,8 +366,8 @@ class WindowModel:
         of_noise, of_design = self._solved
         posterior, sensitivity = self._posterior(covariance), self._sensitivity
         weights = of_noise + of_design @ (posterior @ sensitivity)
-        constant = sensitivity @ (mean - posterior @ self.information @ mean)
-        variance = self.error_variance(posterior)
+        constant = sensitivity @ (mean - posterior @ self._information @ mean)
+        variance = self._error_variance(posterior)
         return LinearEstimate(self.edges, weights, float(constant), float(variance))
 
 

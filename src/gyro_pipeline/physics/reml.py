@@ -22,7 +22,7 @@ from functools import lru_cache
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from gyro_pipeline.conventions import InputError
@@ -119,37 +119,6 @@ def _fit(  # noqa: PLR0917 - the arguments are the key of the cache
     noise = noise or NoiseFigures(*map(float, figures))
     model = RecordingModel(samples, rate_hz, noise, mean, covariance, time_constant_s)
     return _Fit(model, likelihood.criterion(x), not warm_up and likelihood.warms_up(x))
-
-
-def guarded_spread(scatter: ArrayLike, freedom: ArrayLike, averaging: ArrayLike) -> float:
-    """The turn-on spread tau from the means of recordings, with the same weak prior.
-
-    The means of group g (a gyroscope) scatter about their group's mean with variance tau^2 + v_g,
-    where v_g is the averaging noise of a mean. The result maximises the restricted likelihood times
-    tau.
-
-    Args:
-        scatter: (groups,), sum of the squared deviations from the mean, (deg/s)^2.
-        freedom: (groups,), number of means less one; the sum is at least 2.
-        averaging: (groups,), v, (deg/s)^2, such as N^2 / T.
-
-    Returns:
-        A common tau of all groups, deg/s; 0 only if scatter and averaging noise are 0.
-    """
-    arguments = (scatter, freedom, averaging)
-    squares, nu, v = (np.atleast_1d(np.asarray(value, np.float64)) for value in arguments)
-    largest = squares.sum() + (nu * v).sum()
-    if largest == 0:
-        return 0.0
-
-    def slope(log_variance: float) -> float:
-        variance = np.exp(log_variance)
-        share = variance / (variance + v)
-        return float(np.sum(share * (nu - squares / (variance + v)))) - 1
-
-    # the slope is negative at a negligible tau, and positive at one beyond all scatter
-    limits = np.log(largest) + np.array([-60.0, 5.0])
-    return float(np.exp(scipy.optimize.brentq(slope, *limits) / 2))
 
 
 class _Likelihood:

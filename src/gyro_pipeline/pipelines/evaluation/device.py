@@ -10,10 +10,10 @@ import xarray as xr
 from gyro_pipeline.conventions import AXES, ORIGIN_REAL, TEST
 from gyro_pipeline.physics.allan import SHORTEST_FIT_SAMPLES, NoiseFigures, fit_noise, mean_variance
 from gyro_pipeline.physics.bias import fill_masked
-from gyro_pipeline.physics.ceiling import joint_draws, spread_draws, turn_on_spread
 from gyro_pipeline.physics.history import BiasHistory
 from gyro_pipeline.physics.recording_model import RecordingModel
 from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, fit_recording_model
+from gyro_pipeline.physics.turn_on import joint_draws, spread_draws, turn_on_spread
 
 UNIT_SPREAD = 1.0
 """Standard deviation of the bias from unit to unit, deg/s; 0.7 to 1.9 on the public DOT files."""

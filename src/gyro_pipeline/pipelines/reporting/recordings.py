@@ -13,8 +13,8 @@ from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED
 from gyro_pipeline.parameters import GroundTruth
 from gyro_pipeline.physics.allan import FLICKER_FLOOR, SHORTEST_FIT_SAMPLES
 from gyro_pipeline.physics.bias import fill_masked, settling_time_s
-from gyro_pipeline.physics.ceiling import turn_on_spread
 from gyro_pipeline.physics.recording_model import block_edges, block_means
+from gyro_pipeline.physics.turn_on import turn_on_spread
 from gyro_pipeline.physics.warm_up import LAST, fit_common_warm_up, settling
 from gyro_pipeline.recordings import iterate_recordings, tested_imu
 
