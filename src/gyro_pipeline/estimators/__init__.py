@@ -25,7 +25,7 @@ ESTIMATORS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "last_calibration": (f"{_HERE}shrinkage:LastCalibration", {}),
     "empirical_bayes": (f"{_HERE}shrinkage:EmpiricalBayes", {}),
     "empirical_bayes_pooled": (f"{_HERE}shrinkage:PooledEmpiricalBayes", {}),
-    "best_linear": (f"{_HERE}linear:BestLinear", {"warm_up": None, "joint": True}),
+    "best_linear": (f"{_HERE}linear:BestLinear", {"warm_up": None}),
     "best_linear_fallback": (f"{_HERE}linear:BestLinear", {"warm_up": None, "fallback": True}),
     "best_linear_allan": (f"{_HERE}linear:BestLinear", {"noise": "allan"}),
     "best_linear_warm_up": (f"{_HERE}linear:BestLinear", {"warm_up": True}),

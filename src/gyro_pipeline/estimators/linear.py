@@ -96,13 +96,14 @@ class BestLinear(_Linear):
     the uncertainty of the prior mean. On white noise this is empirical Bayes; sigma holds on
     coloured noise as well. The start of the window, ``start_s``, matters.
 
-    Axes are estimated one by one, or jointly if the means of the recordings are correlated between
-    axes (:func:`gyro_pipeline.physics.turn_on.axes_are_correlated`).
-
     The bias is the settled one, without the warm-up and the random walk since power-on.
 
     For an unseen device the model is fitted to the recordings of all known devices, whose spread is
     that from unit to unit. With fewer than three known devices the prior is flat.
+
+    If the means of the recordings are correlated between axes
+    (:func:`gyro_pipeline.physics.turn_on.axes_are_correlated`), the estimate of an axis uses the
+    windows of all axes. For an unseen device, with a history and with a fallback it does not.
 
     With a fallback, the prior is wrong with a probability of 5 %: it is then wide on some axes, as
     for a device that was turned or knocked (:mod:`gyro_pipeline.physics.mixture`). Each window
@@ -115,9 +116,7 @@ class BestLinear(_Linear):
         history: Whether the prior of a recording follows from the earlier calibrations of the
             device, in their order (:mod:`gyro_pipeline.physics.history`), for a bias that drifts
             from one recording to the next.
-        fallback: Whether the prior may be wrong.
-        joint: Whether correlated axes are estimated jointly. At most one of ``history``,
-            ``fallback`` and ``joint`` may be set.
+        fallback: Whether the prior may be wrong; not together with ``history``.
     """
 
     uses_prior = True
@@ -130,15 +129,14 @@ class BestLinear(_Linear):
         noise: str = "reml",
         history: bool = False,
         fallback: bool = False,
-        joint: bool = False,
     ) -> None:
-        if history + fallback + joint > 1:
-            raise InputError("expected at most one of history, fallback and joint")
+        if history and fallback:
+            raise InputError("fallback: expected no history; a prior that follows it is not tested")
         if noise not in ("reml", "allan"):
             raise InputError(f"noise: expected 'reml' or 'allan', got {noise!r}")
         self.recommended = noise == "reml"  # the Allan fit ignores a warm-up
         self._warm_up, self._allan, self._by_recording = warm_up, noise == "allan", history
-        self._fallback, self._joint = fallback, joint
+        self._fallback = fallback
 
     def _fit(self, training: TrainingSet) -> None:
         super()._fit(training)
@@ -159,7 +157,7 @@ class BestLinear(_Linear):
                 BiasHistory.fit(numbers, means, model)
                 for means, model in zip(labels.T, self.models, strict=True)
             ]
-        elif self._joint and axes_are_correlated(training.labels[1]):
+        elif not self._fallback and axes_are_correlated(training.labels[1]):
             self._biases = _joint_covariance(training.labels[1], self.models)
         self._windows: dict[tuple[int, int, int, str], WindowModel] = {}
         self._forget()

@@ -70,7 +70,7 @@ class ResidualNetwork(Estimator):
     uses_prior = True
 
     def __init__(self, warm_up: bool | None = None) -> None:
-        self._linear = BestLinear(warm_up=warm_up, joint=True)
+        self._linear = BestLinear(warm_up=warm_up)
 
     def _fit(self, training: TrainingSet) -> None:
         self._linear.fit(training)

@@ -43,7 +43,7 @@ def train_perceptrons(
     targets: NDArray[np.float64],
     used: NDArray[np.bool_],
 ) -> Perceptrons:
-    """Train networks with squared errors and AdamW, on the one-cycle learning rate.
+    """Train networks with squared errors and AdamW, with one-cycle learning rates.
 
     Args:
         inputs: (n, d), of the order of 1.
