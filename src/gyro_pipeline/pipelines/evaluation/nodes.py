@@ -178,8 +178,9 @@ def ceiling_warning(table: pd.DataFrame) -> dict[str, str]:
     if not beyond:
         return {}
     return {
-        "beyond_ceiling": f"{'; '.join(beyond)}: the interval of A lies wholly beyond the ceiling. "
-        f"Its premise does not hold ({PREMISE}), or test information has reached the training"
+        "beyond_ceiling": f"{'; '.join(beyond)}: the interval of A lies wholly beyond the ceiling, "
+        f"by chance, because its premise does not hold ({PREMISE}), or because test information "
+        "has reached the training"
     }
 
 

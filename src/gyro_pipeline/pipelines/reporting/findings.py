@@ -200,15 +200,18 @@ def _beyond_ceiling(rows: pd.DataFrame) -> str:
     ]
     if not any(flagged):
         return ""
+    rows = rows[flagged].drop_duplicates(["estimator", "sensor", "window_s"])
     names = ", ".join(
-        f"{label(row.estimator)} on {row.sensor} at {row.window_s:g} s"
-        for _, row in rows[flagged].iterrows()
+        f"{label(row.estimator)} on {row.sensor} at {row.window_s:g} s" for _, row in rows.iterrows()
     )
-    return (
-        f"Entire 95 % interval above the ceiling: {names}. The ceiling is the linear "
-        "optimum, axis by axis, for exchangeable power-ons; correlated axes, biases that follow "
-        "one another or other noise leave more to gain."
+    reason = (
+        "The ceiling is the linear optimum, axis by axis, for exchangeable power-ons; correlated "
+        "axes, biases that follow one another or other noise leave more to gain"
     )
+    if _ORACLE_GAIN in rows and rows[_ORACLE_GAIN].notna().any():
+        oracle = _range(rows[_ORACLE_GAIN].dropna())
+        reason = f"The ceiling is an expected value; on these windows the oracle has {oracle} %"
+    return f"Entire 95 % interval above the ceiling: {names}. {reason}."
 
 
 def _prior_conflicts(rows: pd.DataFrame) -> str:
