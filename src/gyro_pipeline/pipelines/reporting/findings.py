@@ -64,18 +64,18 @@ def _networks(rows: pd.DataFrame) -> str:
     window_s = networks.window_s.min()
     shortest = where(rows, window_s=window_s)
     words = {
-        CNN: f"Over all windows of {window_s:g} s, the paper's network is {{}} % more accurate "
-        "than the mean of the window",
-        CONSTANT: "a constant, the mean of the device's training recordings, {} %",
-        DEFAULT: f"the {label(DEFAULT)} predictor {{}} %",
+        CNN: f"Over all windows of {window_s:g} s, the gain in accuracy over the mean of the window "
+        "is {} % for the paper's network",
+        CONSTANT: "{} % for a constant, the mean of the device's training recordings",
+        DEFAULT: f"{{}} % for the {label(DEFAULT)} predictor",
     }
     gains = {name: where(shortest, estimator=name)[_GAIN] for name in words}
     parts = [words[name].format(_range(gain)) for name, gain in gains.items() if len(gain)]
     if _ORACLE_GAIN in shortest and shortest[_ORACLE_GAIN].notna().any():
         oracle = _range(shortest[_ORACLE_GAIN].dropna())
-        parts.append(f"the oracle, which knows the drawn values, {oracle} %")
+        parts.append(f"{oracle} % for the oracle, which knows the drawn values")
     limit = _range(shortest[_CEILING_GAIN].dropna())
-    parts.append(f"the ceiling, which is expected of the best estimator, is {limit} %")
+    parts.append(f"and {limit} %, the ceiling, is expected of the best estimator")
     return f"{'; '.join(parts)}."
 
 
