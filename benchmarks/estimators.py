@@ -33,12 +33,12 @@ from gyro_pipeline.conventions import (
 )
 from gyro_pipeline.estimators import ESTIMATORS, estimator_class, make_estimator
 from gyro_pipeline.estimators.base import Estimator
-from gyro_pipeline.estimators.training import TrainingSet
+from gyro_pipeline.estimators.training_set import TrainingSet
 from gyro_pipeline.physics.allan import NoiseFigures
+from gyro_pipeline.physics.bias import windows_at
 from gyro_pipeline.physics.noise import simulate_noise, warm_up
 from gyro_pipeline.physics.recording_model import RecordingModel, best_linear
 from gyro_pipeline.pipeline_registry import base_parameters
-from gyro_pipeline.windows import cut_windows
 
 SAMPLES, RECORDING_S = 13_000, 87.0
 RATE_HZ = SAMPLES / RECORDING_S
@@ -121,9 +121,9 @@ def windows_of(recordings: xr.Dataset, window_s: float) -> Iterator[tuple]:
     size = round(window_s * rate_hz)
     for number in recordings.recording.to_numpy():
         samples = recordings.angular_rate.sel(imu=1, recording=number).to_numpy()
-        windows = cut_windows(samples, size).transpose(1, 0, 2)
-        starts = np.arange(len(windows)) * size / rate_hz
-        yield int(number), windows, starts, samples.mean(axis=-1, dtype=np.float64)
+        starts = np.arange(0, samples.shape[-1] - size + 1, size)
+        windows = windows_at(samples, size, starts).transpose(1, 0, 2)
+        yield int(number), windows, starts / rate_hz, samples.mean(axis=-1, dtype=np.float64)
 
 
 def fitted(name: str, recordings: xr.Dataset, window_s: float, validate: int = 0) -> Estimator:

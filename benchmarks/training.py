@@ -46,7 +46,7 @@ from torch.utils.data import DataLoader, Sampler, TensorDataset
 from gyro_pipeline.conventions import AXES, DIMENSIONS, HOLD_OUT, TEST, TRAIN
 from gyro_pipeline.datasets.recordings import Recordings
 from gyro_pipeline.estimators import entry, make_estimator
-from gyro_pipeline.estimators.training import TrainingSet
+from gyro_pipeline.estimators.training_set import TrainingSet
 from gyro_pipeline.executors import run_jobs
 from gyro_pipeline.learning import fused
 from gyro_pipeline.learning.design import Design, options_of

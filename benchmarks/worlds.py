@@ -41,7 +41,7 @@ from gyro_pipeline.conventions import (
     VALIDATION,
 )
 from gyro_pipeline.estimators import ESTIMATORS, make_estimator
-from gyro_pipeline.estimators.training import TrainingSet
+from gyro_pipeline.estimators.training_set import TrainingSet
 from gyro_pipeline.pipeline_registry import base_parameters
 from gyro_pipeline.scoring.scores import prior_conflict
 

@@ -4,6 +4,7 @@ import pytest
 
 from gyro_pipeline import windows
 from gyro_pipeline.conventions import InputError
+from gyro_pipeline.physics.bias import windows_at
 
 
 def test_masked_samples_are_the_mean_of_their_window_which_is_dropped_if_it_lost_too_many():
@@ -11,29 +12,22 @@ def test_masked_samples_are_the_mean_of_their_window_which_is_dropped_if_it_lost
     samples[:, [5, 20, 21]] = np.nan
     masked = np.isnan(samples[0])
     assert windows.usable_starts(masked, 10).tolist() == [0, 10, 30]
-    assert windows.usable_starts(masked, 10, largest_masked_share=0.2).tolist() == [0, 10, 20, 30]
-    cut = windows.cut_windows(samples, 10)
+    named = windows.usable_starts(masked, 10, np.array([12, 6, 25]))  # the first lost two
+    assert named.tolist() == [6, 25]
+    cut = windows_at(samples, 10, np.array([0, 10, 30]))
     assert cut.shape == (2, 3, 10)
     whole = [samples[:, 10:20], samples[:, 30:40]]
     np.testing.assert_array_equal(cut[:, 1:], np.stack(whole, axis=1))
     means = np.nanmean(samples[:, :10], axis=1)
     np.testing.assert_allclose(cut[:, 0, 5], means, rtol=1e-6)
-    named = windows.cut_windows(samples, 10, np.array([12, 6, 25]))  # the first lost two
-    np.testing.assert_array_equal(named, np.stack([samples[:, 6:16], samples[:, 25:35]], axis=1))
 
 
 def test_the_papers_windows_are_non_overlapping_slices_from_the_start(parameters):
     for sensor, size, count in (("sparkfun", 1494, 8), ("dot", 1083, 12), ("memsense", 2500, 5)):
         entry = parameters("base").sensors[sensor]
         assert windows.window_size(10, entry.rate_hz, entry.samples, sensor) == size
-        whole = windows.cut_windows(np.zeros((3, entry.samples), np.float32), size)
-        assert whole.shape == (3, count, size)
-    samples = np.arange(2 * 3 * 23).reshape(2, 3, 23)
-    cut = windows.cut_windows(samples, 5)
-    assert cut.shape == (2, 3, 4, 5)
-    for k in range(4):
-        np.testing.assert_array_equal(cut[:, :, k], samples[:, :, 5 * k : 5 * k + 5])
-    assert np.shares_memory(cut, samples)
+        starts = windows.usable_starts(np.zeros(entry.samples, bool), size)
+        assert starts.tolist() == [size * number for number in range(count)]
     message = r"memsense: a window of 52.01 s is 13002 samples at 250 Hz, .* 13000 \(52 s\)"
     with pytest.raises(InputError, match=message):
         windows.window_size(52.01, 250.0, 13000, "memsense")

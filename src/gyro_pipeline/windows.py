@@ -1,7 +1,7 @@
 """Windows, the stretches of a recording that an estimator sees.
 
-Masked samples, which hold no measurement, end here: a window with too many of them is dropped; in
-other windows they are replaced by the mean of the window. So no user of windows meets NaN.
+A window with too many masked samples, which hold no measurement, is dropped. In the others they are
+replaced by the mean of the window (:func:`gyro_pipeline.physics.bias.windows_at`).
 """
 
 from collections.abc import Sequence
@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 
 from gyro_pipeline.conventions import InputError
-from gyro_pipeline.physics.bias import windows_at
 
 LARGEST_MASKED_SHARE = 0.1
 """Largest share of masked samples in a window; windows with more are left out."""
@@ -38,48 +37,20 @@ def window_size(window_s: float, rate_hz: float, recording_samples: int, where: 
     return size
 
 
-def usable_starts(
-    masked: np.ndarray,
-    size: int,
-    starts: np.ndarray | None = None,
-    largest_masked_share: float = LARGEST_MASKED_SHARE,
-) -> np.ndarray:
+def usable_starts(masked: np.ndarray, size: int, starts: np.ndarray | None = None) -> np.ndarray:
     """First samples of the windows that have enough measurements.
 
     Args:
         masked: Whether each sample of the recording is masked, shape (n,).
         size: Samples per window.
         starts: First samples of all windows; None for all non-overlapping ones from the start on.
-        largest_masked_share: Largest share of masked samples in a usable window.
     """
     if starts is None:
         starts = np.arange(0, len(masked) - size + 1, size)
     if not masked.any():
         return starts
     before = np.concatenate([[0], np.cumsum(masked)])
-    return starts[before[starts + size] - before[starts] <= largest_masked_share * size]
-
-
-def cut_windows(samples: np.ndarray, size: int, starts: np.ndarray | None = None) -> np.ndarray:
-    """Cut the windows out of a recording.
-
-    Args:
-        samples: Shape (..., n); NaN where masked.
-        size: Samples per window.
-        starts: First samples of the windows, which may overlap; None for all non-overlapping
-            windows from the start on.
-
-    Returns:
-        Shape (..., windows, size), without the windows that :func:`usable_starts` drops, and
-        without NaN. This is a view if no sample is masked and ``starts`` is None, else a copy.
-    """
-    masked = np.isnan(samples).reshape(-1, samples.shape[-1]).any(axis=0)
-    if masked.any():
-        starts = usable_starts(masked, size, starts)
-    if starts is not None:
-        return windows_at(samples, size, starts)
-    count = samples.shape[-1] // size
-    return samples[..., : count * size].reshape(*samples.shape[:-1], count, size)
+    return starts[before[starts + size] - before[starts] <= LARGEST_MASKED_SHARE * size]
 
 
 def usable_windows(contents: pd.DataFrame, samples: int, size: int, stride: int) -> pd.DataFrame:

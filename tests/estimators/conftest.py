@@ -8,7 +8,7 @@ import xarray as xr
 from threadpoolctl import threadpool_limits
 
 from gyro_pipeline.conventions import AXES, DIMENSIONS, ORIGIN_REAL, RECORDING_MEAN, TRAIN
-from gyro_pipeline.estimators.training import TrainingSet
+from gyro_pipeline.estimators.training_set import TrainingSet
 from gyro_pipeline.physics.bias import windows_at
 from gyro_pipeline.physics.noise import simulate_noise, warm_up
 

@@ -8,7 +8,7 @@ from gyro_pipeline.conventions import VALIDATION as VALIDATE
 from gyro_pipeline.estimators import make_estimator, settings_of
 from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.estimators.nn_module import ModuleEstimator
-from gyro_pipeline.estimators.training import TrainingSet
+from gyro_pipeline.estimators.training_set import TrainingSet
 from gyro_pipeline.parameters import Training
 from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.recording_model import constant_bias

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gyro_pipeline.conventions import NOTHING, RECORDING_MEAN
 from gyro_pipeline.estimators.base import Estimator, Windows
-from gyro_pipeline.estimators.training import TrainingSet
+from gyro_pipeline.estimators.training_set import TrainingSet
 
 
 class RunningMean(Estimator):

@@ -13,7 +13,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from gyro_pipeline.conventions import BIAS, LAST, OWN, RECORDING_MEAN, InputError
-from gyro_pipeline.estimators.training import TrainingSet
+from gyro_pipeline.estimators.training_set import TrainingSet
 
 Estimates = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Biases (n, gyroscopes) and their standard deviations, deg/s; NaN where a method has none."""

@@ -11,7 +11,7 @@ from typing import Any
 from gyro_pipeline.conventions import InputError
 from gyro_pipeline.estimators import estimator_class, make_estimator
 from gyro_pipeline.estimators.base import Estimator
-from gyro_pipeline.estimators.training import TrainingSet
+from gyro_pipeline.estimators.training_set import TrainingSet
 from gyro_pipeline.executors import run_jobs
 from gyro_pipeline.parameters import Execution, Training
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gyro_pipeline.conventions import BIAS, PAPER, RECORDING_MEAN, TRUE, InputError
 from gyro_pipeline.estimators.base import Estimator, Windows
-from gyro_pipeline.estimators.training import TrainingSet
+from gyro_pipeline.estimators.training_set import TrainingSet
 from gyro_pipeline.physics.bias import windows_at
 from gyro_pipeline.physics.history import BiasHistory
 from gyro_pipeline.physics.mixture import mixture_posterior

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from gyro_pipeline.conventions import BIAS, REAL, RECORDING_MEAN
 from gyro_pipeline.estimators.base import Estimator, Windows
 from gyro_pipeline.estimators.linear import BestLinear
-from gyro_pipeline.estimators.training import ImuRecordings, TrainingSet
+from gyro_pipeline.estimators.training_set import ImuRecordings, TrainingSet
 from gyro_pipeline.learning.perceptrons import Perceptrons, train_perceptrons
 from gyro_pipeline.physics.bias import windows_at
 from gyro_pipeline.physics.recording_model import innovations

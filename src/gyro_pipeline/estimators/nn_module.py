@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from gyro_pipeline.conventions import ALL, BEST, LAST, ORIGIN_REAL, TRAIN, VALIDATION, InputError
 from gyro_pipeline.estimators.base import Estimator, Windows
-from gyro_pipeline.estimators.training import TrainingSet
+from gyro_pipeline.estimators.training_set import TrainingSet
 from gyro_pipeline.learning.design import Design, network_class, options_of
 from gyro_pipeline.learning.examples import NetworkInput, with_shuffled_labels
 from gyro_pipeline.learning.jobs import StoredNetwork, TrainedNetwork, TrainingJob, run_training

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gyro_pipeline.conventions import BIAS, REAL, RECORDING_MEAN
 from gyro_pipeline.estimators.base import Estimator, Windows
-from gyro_pipeline.estimators.training import TrainingSet, fitted_noise
+from gyro_pipeline.estimators.training_set import TrainingSet, fitted_noise
 from gyro_pipeline.physics.history import merged_calibrations
 from gyro_pipeline.physics.reml import FEWEST_RECORDINGS
 from gyro_pipeline.physics.turn_on import guarded_spread

@@ -103,6 +103,30 @@ def allan_variance(
         return squares / counts, counts
 
 
+def fit_axes(
+    times_s: NDArray[np.floating],
+    variances: NDArray[np.floating],
+    counts: NDArray[np.integer],
+    duration_s: float | NDArray[np.floating],
+    rate_hz: float,
+) -> list[NoiseFigures]:
+    """N, B and K of each axis from the Allan variances of several recordings.
+
+    Args:
+        times_s: Averaging times, (m,), seconds.
+        variances: (recordings, axes, m), (deg/s)^2.
+        counts: Numbers of differences, of a shape that broadcasts to that of the variances.
+        duration_s: See :func:`fit_noise`.
+        rate_hz: Samples per second.
+
+    Raises:
+        InputError: See :func:`fit_noise`.
+    """
+    shortest_s = SHORTEST_FIT_SAMPLES / rate_hz
+    means = mean_variance(variances, counts)
+    return [fit_noise(times_s, variance, duration_s, shortest_s) for variance in means]
+
+
 def mean_variance(
     variances: NDArray[np.floating], counts: NDArray[np.integer]
 ) -> NDArray[np.float64]:

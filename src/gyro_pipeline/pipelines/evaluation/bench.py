@@ -44,7 +44,7 @@ from gyro_pipeline.scoring.truths import (
     running_mean_curve,
     stack_columns,
 )
-from gyro_pipeline.windows import cut_windows, window_size
+from gyro_pipeline.windows import window_size
 
 SCORE_COLUMNS = ["weights", "truth", "windows", "score", "value", "lo", "hi"]
 """Columns of a table of scores."""
@@ -248,7 +248,7 @@ class Bench:
         return tests[(tests.imu == recording.imu) & (tests.recording == recording.number)]
 
     def _oracle_estimates(self, recording: TestRecording, truth: str) -> np.ndarray:
-        """EstimatesByTruth of the oracle, which knows the drawn values, (windows, 3), deg/s."""
+        """Estimates of the oracle, which knows the drawn values, (windows, 3), deg/s."""
         device, size = self.device, self.size
         if device.models is None:
             assert device.unit_bias is not None
@@ -257,7 +257,7 @@ class Bench:
             prior = device.unit_bias[axes], device.spread[0, axes], device.noise[axes]
             return oracle(means, *prior, self.window_s, self.recording_s, truth)
         starts = recording.starts
-        windows = cut_windows(recording.samples, size, starts)
+        windows = windows_at(recording.samples, size, starts)
         estimates = [
             [
                 self._line(model, axis, start, truth)(window[None])[0]

@@ -8,7 +8,7 @@ import pandas as pd
 import xarray as xr
 
 from gyro_pipeline.conventions import AXES, ORIGIN_REAL, TEST
-from gyro_pipeline.physics.allan import SHORTEST_FIT_SAMPLES, NoiseFigures, fit_noise, mean_variance
+from gyro_pipeline.physics.allan import NoiseFigures, fit_axes
 from gyro_pipeline.physics.bias import fill_masked
 from gyro_pipeline.physics.history import BiasHistory
 from gyro_pipeline.physics.recording_model import RecordingModel
@@ -212,9 +212,7 @@ def _allan_fits(
     )
     rate_hz, times_s = recordings.attrs["rate_hz"], allan.time_s.to_numpy()
     durations_s = recordings.sizes["sample"] / rate_hz * (counts > 0).mean(axis=0)
-    shortest_s = SHORTEST_FIT_SAMPLES / rate_hz
-    mean = mean_variance(variances, counts[:, None])
-    return [fit_noise(times_s, variance, durations_s, shortest_s) for variance in mean]
+    return fit_axes(times_s, variances, counts[:, None], durations_s, rate_hz)
 
 
 def _drawn_models(recordings: xr.Dataset) -> tuple[RecordingModel, ...] | None:

@@ -10,18 +10,16 @@ from numpy.typing import NDArray
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 from gyro_pipeline.parameters import GroundTruth
 from gyro_pipeline.physics.allan import (
-    SHORTEST_FIT_SAMPLES,
     allan_variance,
     averaging_times_s,
-    fit_noise,
-    mean_variance,
+    fit_axes,
 )
 from gyro_pipeline.physics.bias import settling_time_s
 from gyro_pipeline.recordings import bias_rows, iterate_recordings
 
 logger = logging.getLogger(__name__)
 
-_FIGURES = ["white_dps_rts", "instability_dps", "random_walk_dps_per_rts"]
+NOISE_COLUMNS = ["white_dps_rts", "instability_dps", "random_walk_dps_per_rts"]
 
 
 def measure_allan_variance(recordings: xr.Dataset) -> xr.Dataset:
@@ -101,7 +99,7 @@ def measure_noise(recordings: xr.Dataset, allan: xr.Dataset, bias: pd.DataFrame)
         )
     index = pd.MultiIndex.from_product([[*fitted], AXES], names=["imu", "axis"])
     rows = np.concatenate([figures for figures, _ in fitted.values()])
-    table = pd.DataFrame(rows, index, _FIGURES)
+    table = pd.DataFrame(rows, index, NOISE_COLUMNS)
     squares = bias.assign(square=bias.sample_sigma_dps**2).groupby(["imu", "axis"])["square"]
     table.insert(0, "sample_sigma_dps", np.sqrt(squares.mean()))
     table = table.reset_index()
@@ -114,16 +112,16 @@ def _noise_figures(
 ) -> dict[int, tuple[NDArray[np.float64], str]]:
     """N, B and K of each IMU, (axes, 3), from all its recordings; or NaN and the reason."""
     rate_hz, times_s = recordings.attrs["rate_hz"], allan.time_s.to_numpy()
-    shortest_s, figures = SHORTEST_FIT_SAMPLES / rate_hz, {}
+    figures = {}
     for imu in recordings.imu.to_numpy().tolist():
         measured = allan.sel(imu=imu).transpose("recording", "axis", "time_s")
         counts = measured.differences.to_numpy()
         total_s = recordings["samples"].sel(imu=imu).to_numpy() / rate_hz @ (counts > 0)
-        variances = mean_variance(measured.allan_variance.to_numpy(), counts[:, None])
+        variances = measured.allan_variance.to_numpy()
         try:
-            fits = [fit_noise(times_s, axis, total_s, shortest_s) for axis in variances]
+            fits = fit_axes(times_s, variances, counts[:, None], total_s, rate_hz)
         except InputError as error:
-            figures[imu] = np.full((len(AXES), len(_FIGURES)), np.nan), str(error)
+            figures[imu] = np.full((len(AXES), len(NOISE_COLUMNS)), np.nan), str(error)
         else:
             rows = [(fit.white, fit.instability, fit.random_walk) for fit in fits]
             figures[imu] = np.array(rows), ""

@@ -64,8 +64,8 @@ def _networks(rows: pd.DataFrame) -> str:
     window_s = networks.window_s.min()
     shortest = where(rows, window_s=window_s)
     words = {
-        CNN: f"Over all windows of {window_s:g} s, the gain in accuracy over the mean of the window "
-        "is {} % for the paper's network",
+        CNN: f"Over all windows of {window_s:g} s, the gain in accuracy over the mean of the "
+        "window is {} % for the paper's network",
         CONSTANT: "{} % for a constant, the mean of the device's training recordings",
         DEFAULT: f"{{}} % for the {label(DEFAULT)} predictor",
     }
@@ -202,7 +202,8 @@ def _beyond_ceiling(rows: pd.DataFrame) -> str:
         return ""
     rows = rows[flagged].drop_duplicates(["estimator", "sensor", "window_s"])
     names = ", ".join(
-        f"{label(row.estimator)} on {row.sensor} at {row.window_s:g} s" for _, row in rows.iterrows()
+        f"{label(row.estimator)} on {row.sensor} at {row.window_s:g} s"
+        for _, row in rows.iterrows()
     )
     reason = (
         "The ceiling is the linear optimum, axis by axis, for exchangeable power-ons; correlated "

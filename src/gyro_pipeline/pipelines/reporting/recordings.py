@@ -16,12 +16,12 @@ from gyro_pipeline.physics.bias import fill_masked, settling_time_s
 from gyro_pipeline.physics.recording_model import block_edges, block_means
 from gyro_pipeline.physics.turn_on import turn_on_spread
 from gyro_pipeline.physics.warm_up import LAST, fit_common_warm_up, settling
+from gyro_pipeline.pipelines.ground_truth.nodes import NOISE_COLUMNS
 from gyro_pipeline.recordings import iterate_recordings, tested_imu
 
 SIGMAS_MDPS = (1.0, 0.5)
 """Standard deviations of the bias for which the time of a start-up is computed."""
 
-FIGURES = ["white_dps_rts", "instability_dps", "random_walk_dps_per_rts"]
 GYROSCOPES = (1, 4, 10)
 """Numbers of gyroscopes that the paper averages in its figure of convergence."""
 
@@ -122,7 +122,7 @@ def start_up(recordings: xr.Dataset, bias: pd.DataFrame, noise: pd.DataFrame) ->
         longer than a recording, NaN if the noise is unknown.
     """
     rate_hz, own = recordings.attrs["rate_hz"], noise[noise.imu == tested_imu(recordings)]
-    white, flicker, walk = own.set_index("axis").loc[list(AXES), FIGURES].T.to_numpy()
+    white, flicker, walk = own.set_index("axis").loc[list(AXES), NOISE_COLUMNS].T.to_numpy()
     recording_s = float(recordings["samples"].max()) / rate_hz
     averaging = white**2 / recording_s
     spread, count = _turn_on_spread(recordings, bias, averaging)
@@ -216,7 +216,7 @@ def _quality_row(row: pd.Series) -> dict[str, Any]:
 def _noise(noise: pd.DataFrame) -> dict[str, float]:
     """Root mean square over gyroscopes, with the smallest and the largest."""
     row: dict[str, float] = {}
-    for name, values in noise[["sample_sigma_dps", *FIGURES]].items():
+    for name, values in noise[["sample_sigma_dps", *NOISE_COLUMNS]].items():
         row[f"{name}"] = float(np.sqrt((values**2).mean()))
         row |= {f"{name}_min": float(values.min()), f"{name}_max": float(values.max())}
     return row
@@ -257,7 +257,7 @@ def _allan_lines(allan: xr.Dataset, noise: pd.DataFrame) -> Iterator[pd.DataFram
         for axis in AXES:
             deviation = np.sqrt(variance.sel(imu=imu, axis=axis).to_numpy())
             yield _line("allan", f"IMU {imu}, axis {axis}", times_s, deviation)
-    white, flicker, walk = (noise[FIGURES] ** 2).mean().to_numpy()
+    white, flicker, walk = (noise[NOISE_COLUMNS] ** 2).mean().to_numpy()
     fitted_s = times_s[SHORTEST_FIT_SAMPLES * times_s[0] <= times_s]
     model = white / fitted_s + FLICKER_FLOOR * flicker + walk * fitted_s / 3
     yield _line("allan", "fit of N, B, K", fitted_s, np.sqrt(model))

@@ -29,7 +29,7 @@ from gyro_pipeline.estimators import (
 )
 from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.estimators.fitting import FitJob, run_fits
-from gyro_pipeline.estimators.training import TrainingSet
+from gyro_pipeline.estimators.training_set import TrainingSet
 from gyro_pipeline.fingerprints import code_hash, data_hash, fingerprint
 from gyro_pipeline.parameters import Execution, Only, Splits, Study, Training, VirtualGyros
 from gyro_pipeline.physics.bias import fill_masked

@@ -25,8 +25,7 @@ from gyro_pipeline.physics.allan import (
     NoiseFigures,
     allan_variance,
     averaging_times_s,
-    fit_noise,
-    mean_variance,
+    fit_axes,
 )
 from gyro_pipeline.physics.bias import fill_masked
 
@@ -270,9 +269,7 @@ def fitted_noise(imus: Sequence[ImuRecordings]) -> list[NoiseFigures]:
     variances, counts = (np.concatenate(part) for part in parts)
     first = imus[0]
     recording_s = first.sample_count / first.rate_hz
-    shortest_s = SHORTEST_FIT_SAMPLES / first.rate_hz
-    means = mean_variance(variances, counts)
-    return [fit_noise(first.times_s, variance, recording_s, shortest_s) for variance in means]
+    return fit_axes(first.times_s, variances, counts, recording_s, first.rate_hz)
 
 
 def _sorted(windows: pd.DataFrame, device: int) -> pd.DataFrame:

@@ -8,8 +8,8 @@ import pytest
 import xarray as xr
 
 from gyro_pipeline.conventions import AXES, DIMENSIONS
-from gyro_pipeline.estimators import training as module
-from gyro_pipeline.estimators.training import TrainingSet
+from gyro_pipeline.estimators import training_set as module
+from gyro_pipeline.estimators.training_set import TrainingSet
 
 SIZE, SAMPLES, RATE = 20, 100, 10.0
 
