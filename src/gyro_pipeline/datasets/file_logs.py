@@ -50,7 +50,6 @@ class FileLogs(LogSource):
             IMU all files belong to IMU 1; without a recording the files of an IMU are numbered in
             their order.
         reader: How the files are read (:class:`gyro_pipeline.parameters.ReaderOptions`).
-        cache: Obsolete; a message says so, and the value is ignored.
 
     Raises:
         InputError: The sensor is unknown, or the pattern or the reader options are invalid.
@@ -64,7 +63,6 @@ class FileLogs(LogSource):
         sensors: Mapping[str, Mapping[str, Any]] | None = None,
         pattern: str = "*",
         reader: Mapping[str, Any] | None = None,
-        cache: Any = None,
         metadata: dict[str, Any] | None = None,
     ) -> None:
         super().__init__(sensor, sensors, source, path, metadata)
@@ -83,8 +81,6 @@ class FileLogs(LogSource):
                 f"{pattern} says that a file has a single IMU; remove one of the two"
             )
         self._messages: set[str] = set()
-        if cache is not None:
-            self._log_once("cache in the catalog entry is no longer needed; remove it")
 
     def load(self) -> Logs:
         """List the recordings; their files are read later, one at a time.

@@ -623,10 +623,8 @@ def _thinned(losses: pd.DataFrame, ended_ms: int) -> list[Metric]:
 _WRITERS: dict[str, Callable[[Any, Path], Any]] = {
     ".parquet": lambda content, path: content.to_parquet(path),
     ".csv": lambda content, path: content.to_csv(path, index=False),
-    ".json": lambda content, path: path.write_text(json.dumps(content, indent=1)),
 }
 _READERS: dict[str, Callable[[Path], Any]] = {
     ".parquet": pd.read_parquet,
     ".csv": pd.read_csv,
-    ".json": lambda path: json.loads(path.read_text()),
 }
