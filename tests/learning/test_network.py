@@ -57,8 +57,7 @@ def test_outputs_and_gradients_are_those_of_the_papers_network(sizes):
     a = architecture(*sizes)
     ours, paper = networks(a)
     windows = np.random.default_rng(1).normal(size=(9, a.gyroscopes, a.window))
-    packed = np.zeros((9, *packed_shape(a)))
-    pack(windows.transpose(1, 0, 2), a, packed)
+    packed = pack(windows.transpose(1, 0, 2), a, out=np.zeros((9, *packed_shape(a))))
     wanted = torch.from_numpy(np.random.default_rng(2).normal(size=(9, a.gyroscopes)))
     expected = paper(torch.from_numpy(windows))
     assert expected.std(dim=0).min() > 1e-3  # the outputs tell the windows apart

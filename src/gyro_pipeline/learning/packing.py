@@ -23,17 +23,24 @@ def packed_shape(architecture: Architecture) -> tuple[int, int]:
     return blocks, -(-a.gyroscopes * a.stride // CACHE_LINE) * CACHE_LINE
 
 
-def pack(windows: np.ndarray, architecture: Architecture, out: np.ndarray) -> None:
+def pack(
+    windows: np.ndarray, architecture: Architecture, out: np.ndarray | None = None
+) -> np.ndarray:
     """Pack windows; samples that no convolution output sees are left out.
 
     Args:
         windows: Shape (gyroscopes, n, window), as cut from a recording.
         architecture: The network's sizes.
         out: Zeros of shape (n, blocks, width), float32, to write into.
+
+    Returns:
+        ``out``.
     """
     a = architecture
     gyroscopes, n, _ = windows.shape
-    blocks, _ = packed_shape(a)
+    blocks, width = packed_shape(a)
+    if out is None:
+        out = aligned_zeros((n, blocks, width))
     # (n, blocks, gyroscopes, stride) view of the used part of each row
     cells = out[:, :, : gyroscopes * a.stride].reshape(n, blocks, gyroscopes, a.stride)
     full = min(a.window // a.stride, blocks)
@@ -42,6 +49,7 @@ def pack(windows: np.ndarray, architecture: Architecture, out: np.ndarray) -> No
     if full < blocks:  # the last block is cut short by the window's end
         rest = windows[:, :, full * a.stride :]
         cells[:, full, :, : rest.shape[2]] = rest.transpose(1, 0, 2)
+    return out
 
 
 @dataclass(frozen=True)
