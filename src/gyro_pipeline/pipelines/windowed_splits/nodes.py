@@ -21,7 +21,6 @@ from gyro_pipeline.pipelines.windowed_splits.copies import SAMPLES as COMPARED
 from gyro_pipeline.pipelines.windowed_splits.copies import near_copies
 from gyro_pipeline.pipelines.windowed_splits.protocols import (
     PROTOCOLS,
-    SINGLE_ROLE_COLUMNS,
     Candidates,
     check_table,
 )
@@ -153,7 +152,7 @@ def split_windows(  # noqa: PLR0917 - a node's arguments are its datasets
             folds = table[["fold"]].drop_duplicates()
             virtual_table = _virtual_windows(virtual, size, splits).merge(folds, how="cross")
             table = pd.concat([table, virtual_table])
-        if column := SINGLE_ROLE_COLUMNS[protocol]:
+        if column := PROTOCOLS[protocol].single_role:
             check_table(table, column, contents, drawn_from)
         tables.append(table.assign(protocol=protocol, window_s=window_s, window_stride_s=stride_s))
     return pd.concat(tables, ignore_index=True)[WINDOWS_TABLE].astype(_COMPACT)
@@ -200,7 +199,7 @@ def _real_windows(  # noqa: PLR0917 - everything that a table depends on
         candidates = Candidates(windows, split, imu, numbers, splits)
         folds = [
             windows[roles != UNUSED].assign(fold=fold, role=roles[roles != UNUSED])
-            for fold, roles in PROTOCOLS[protocol](candidates)
+            for fold, roles in PROTOCOLS[protocol].folds(candidates)
         ]
         return pd.concat(folds, ignore_index=True).assign(origin=ORIGIN_REAL)
 

@@ -11,6 +11,7 @@ model; leaks have no model for use, so the first fold stands for it.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -141,25 +142,22 @@ def best_epoch_on_test(candidates: Candidates) -> Folds:
             yield fold, np.where(roles == TEST, VALIDATION, UNUSED)
 
 
-PROTOCOLS: Mapping[str, Callable[[Candidates], Folds]] = {
-    BY_RECORDING: by_recording,
-    LEAVE_ONE_DEVICE_OUT: leave_one_device_out,
-    K_FOLD: k_fold,
-    WINDOW_SPLIT: window_split,
-    TEST_IN_TRAINING: test_in_training,
-    BEST_EPOCH_ON_TEST: best_epoch_on_test,
+class Protocol(NamedTuple):
+    """A protocol, and the column whose values have only one role in a fold; None for a leak."""
+
+    folds: Callable[[Candidates], Folds]
+    single_role: str | None
+
+
+PROTOCOLS: Mapping[str, Protocol] = {
+    BY_RECORDING: Protocol(by_recording, "recording"),
+    LEAVE_ONE_DEVICE_OUT: Protocol(leave_one_device_out, "imu"),
+    K_FOLD: Protocol(k_fold, "recording"),
+    WINDOW_SPLIT: Protocol(window_split, None),
+    TEST_IN_TRAINING: Protocol(test_in_training, None),
+    BEST_EPOCH_ON_TEST: Protocol(best_epoch_on_test, None),
 }
 """Protocols by their name in the setting ``protocol`` of a study."""
-
-SINGLE_ROLE_COLUMNS: Mapping[str, str | None] = {
-    BY_RECORDING: "recording",
-    LEAVE_ONE_DEVICE_OUT: "imu",
-    K_FOLD: "recording",
-    WINDOW_SPLIT: None,
-    TEST_IN_TRAINING: None,
-    BEST_EPOCH_ON_TEST: None,
-}
-"""Column whose values have only one role in a fold, by protocol; None for leaks."""
 
 
 def check_table(
