@@ -335,14 +335,14 @@ def _best_saving_pct(row: pd.Series, spreads_dps: NDArray[np.float64]) -> NDArra
 def _draw_savings(ax: Axes, rows: pd.DataFrame, claim: PublishedResult) -> None:
     curve = _best_saving_pct(rows.iloc[0], _SPREADS_MDPS * MDPS)
     ax.plot(_SPREADS_MDPS, curve, color=CEILING, lw=1.5, label="ceiling")
-    ax.axhline(claim.time_saving_pct, color="black", ls=":", label="the paper's saving")
+    ax.axhline(claim.time_saving_pct, color="black", ls=":", label="published saving")
     common = f"common for consumer parts: {_COMMON_SPREAD_MDPS} mdps"
     ax.axvline(_COMMON_SPREAD_MDPS, color="grey", ls="--", lw=1, label=common)
     for i, (_, row) in enumerate(rows.iterrows()):
         shift = 1 + 0.14 * (i - (len(rows) - 1) / 2)
         _draw_saving(ax, row, shift, COLOURS[i], MARKERS[i])
     ax.set(xscale="log", xlim=(_SPREADS_MDPS[0], _SPREADS_MDPS[-1]), ylim=_SAVINGS_PCT)
-    ax.set_title(f"{claim.sensor}; the paper's with {claim.real_gyros} gyroscopes")
+    ax.set_title(f"{claim.sensor}; published with {claim.real_gyros} gyroscopes")
     ax.xaxis.set_major_formatter("{x:g}")
 
 
