@@ -303,7 +303,7 @@ def test_the_oracle_stands_beside_and_chance_is_called_chance(make_run, mean, po
     tables, figures, page = write(stored_as("augmentation", made))
     table = tables["augmentation_three_gyroscopes"].iloc[0]
     assert table["Oracle A %"] == "62"
-    assert "by chance above its ceiling in all windows" in table["Note"]
+    assert "above its ceiling in all windows, which its interval contains" in table["Note"]
     assert table["Note"].endswith(conflict)
     assert f"network on sparkfun at 10 s: {conflict}" in page
     for ax in figures["forest"].axes:

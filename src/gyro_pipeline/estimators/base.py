@@ -57,6 +57,8 @@ class Estimator:
             IMUs together if the device is unseen.
         recommended: Whether it is recommended for use; others serve for comparison.
         uses_prior: Whether its estimates depend on biases that it has learned.
+        own_ceiling: The ceiling of what it uses: ``joint`` (the windows of all axes), ``history``
+            (earlier calibrations), or empty (the window of one axis).
         engine: Where it was fitted: ``cpu``, ``fused`` or ``batched``.
         losses: Losses of a network by epoch.
         settings: Arguments of a seeded estimator except the seed; stored with runs.
@@ -68,6 +70,7 @@ class Estimator:
     fewest_recordings: ClassVar[int] = 1
     recommended: bool = False
     uses_prior: bool = False
+    own_ceiling: str = ""
     engine: str = "cpu"
     losses: pd.DataFrame | None = None
     settings: Mapping[str, Any] = MappingProxyType({})

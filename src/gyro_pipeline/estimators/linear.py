@@ -22,6 +22,7 @@ from gyro_pipeline.physics.recording_model import (
     WindowModel,
     block_edges,
     block_means,
+    fitted_biases,
     joint_prior,
 )
 from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, fit_recording_model
@@ -101,7 +102,7 @@ class BestLinear(_Linear):
     For an unseen device the model is fitted to the recordings of all known devices, whose spread is
     that from unit to unit. With fewer than three known devices the prior is flat.
 
-    If the means of the recordings are correlated between axes
+    If the biases of the recordings are correlated between axes
     (:func:`gyro_pipeline.physics.turn_on.axes_are_correlated`), the estimate of an axis uses the
     windows of all axes. For an unseen device, with a history and with a fallback it does not.
 
@@ -157,8 +158,10 @@ class BestLinear(_Linear):
                 BiasHistory.fit(numbers, means, model)
                 for means, model in zip(labels.T, self.models, strict=True)
             ]
-        elif not self._fallback and axes_are_correlated(training.labels[1]):
-            self._biases = _joint_covariance(training.labels[1], self.models)
+        elif not self._fallback:
+            self._biases = _joint_covariance(self.models, axes)
+        joint, history = self._biases is not None, bool(self._histories)
+        self.own_ceiling = "joint" if joint else "history" if history else ""
         self._windows: dict[tuple[int, int, int, str], WindowModel] = {}
         self._forget()
 
@@ -245,10 +248,16 @@ def _of_unseen(model: RecordingModel, devices: int) -> RecordingModel:
 
 
 def _joint_covariance(
-    means: NDArray[np.float64], models: Sequence[RecordingModel]
-) -> NDArray[np.float64]:
-    """Covariance of the biases of all axes; its variances are at least those of the models."""
-    covariance = joint_draws(means, [model.averaging_variance() for model in models], draws=0)[0]
+    models: Sequence[RecordingModel], recordings: NDArray[np.floating]
+) -> NDArray[np.float64] | None:
+    """Covariance of the biases of all axes; None if they are not correlated.
+
+    Its variances are at least those of the models.
+    """
+    biases, errors = fitted_biases(models, recordings)
+    if not axes_are_correlated(biases):
+        return None
+    covariance = joint_draws(biases, errors, draws=0)[0]
     variances = np.array([model.covariance[0, 0] for model in models])
     missing = np.maximum(variances - np.diag(covariance), 0.0)
     return np.asarray(covariance + np.diag(missing))

@@ -74,6 +74,7 @@ class ResidualNetwork(Estimator):
 
     def _fit(self, training: TrainingSet) -> None:
         self._linear.fit(training)
+        self.own_ceiling = self._linear.own_ceiling
         self._size = training.size
         self._correction: _Correction | None = None
         partial = self._size < self._linear.models[0].samples

@@ -216,6 +216,27 @@ def joint_squares(
     return np.asarray(np.mean(of_axes, axis=0))
 
 
+def fitted_biases(
+    models: Sequence[RecordingModel], recordings: NDArray[np.floating]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The bias of each whole recording by generalised least squares, apart from a warm-up.
+
+    Args:
+        models: Models of the axes.
+        recordings: (axes, n, samples), deg/s; no NaN.
+
+    Returns:
+        Biases (n, axes), deg/s, and the variances of their errors, (axes,), (deg/s)^2.
+    """
+    windows = [WindowModel.of(model, 0, model.samples, TRUE) for model in models]
+    fits = [
+        window.constants(block_means(rates, window.edges))
+        for window, rates in zip(windows, recordings, strict=True)
+    ]
+    biases = np.stack([constants[:, 0] for constants, _ in fits], axis=1)
+    return biases, np.array([covariance[0, 0] for _, covariance in fits])
+
+
 def joint_prior(
     models: Sequence[RecordingModel], covariance: NDArray[np.float64]
 ) -> NDArray[np.float64]:
@@ -323,6 +344,20 @@ class WindowModel:
             np.concatenate([(i == axis) * w.shared for i, w in enumerate(windows)]),
             chosen.truth_noise,
         )
+
+    def constants(
+        self, means: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Generalised least squares estimates of c from block means y, without a prior.
+
+        Args:
+            means: (n, m), deg/s.
+
+        Returns:
+            Estimates (n, 1) or (n, 2), deg/s, and the covariance of their errors.
+        """
+        covariance = np.linalg.inv(self._information)
+        return means @ self._solved[1] @ covariance, np.asarray(covariance)
 
     @cached_property
     def _solved(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

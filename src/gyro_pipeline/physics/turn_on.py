@@ -72,8 +72,8 @@ def joint_draws(
     """Covariance of the turn-on bias of all axes: the estimate, then draws.
 
     Args:
-        recording_means: (n, axes), deg/s, of more recordings than axes.
-        averaging: Variance of their averaging noise, (axes,), (deg/s)^2.
+        recording_means: (n, axes), deg/s, of more recordings than axes; or fitted biases.
+        averaging: Variance of their averaging noise or error, (axes,), (deg/s)^2.
         draws: Number of draws, as by :func:`spread_draws`, but from a Wishart distribution.
 
     Returns:
@@ -118,23 +118,24 @@ def guarded_spread(scatter: ArrayLike, freedom: ArrayLike, averaging: ArrayLike)
     return float(np.exp(scipy.optimize.brentq(slope, *limits) / 2))
 
 
-def axes_are_correlated(recording_means: NDArray[np.floating]) -> bool:
+def axes_are_correlated(biases: NDArray[np.floating]) -> bool:
     """Whether the bias is correlated between axes: Bartlett's test at the 1 % level.
 
     The logarithm of the determinant of the correlations, multiplied by -(n - 1 - (2 k + 5) / 6),
     follows a chi-squared distribution of k (k - 1) / 2 degrees of freedom if k axes are independent
-    (Bartlett 1951, Biometrika 38, 337).
+    (Bartlett 1951, Biometrika 38, 337). Recordings must be exchangeable: independent biases that
+    drift from one recording to the next look correlated.
 
     Args:
-        recording_means: (n, axes), deg/s.
+        biases: Of each recording, (n, axes), deg/s.
 
     Returns:
         False if there are too few recordings for the test.
     """
-    n, axes = recording_means.shape
+    n, axes = biases.shape
     factor = n - 1 - (2 * axes + 5) / 6
     if n <= axes or axes == 1 or factor <= 0:
         return False
-    _, log_determinant = np.linalg.slogdet(np.corrcoef(recording_means.T))
+    _, log_determinant = np.linalg.slogdet(np.corrcoef(biases.T))
     p = scipy.stats.chi2.sf(-factor * log_determinant, axes * (axes - 1) / 2)
     return bool(p < _CHANCE)

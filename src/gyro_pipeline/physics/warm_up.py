@@ -63,10 +63,12 @@ class CommonWarmUp:
     Attributes:
         amplitude: (axes,), deg/s.
         half: Half of its 95 % interval over recordings, (axes,), deg/s.
+        p: Chance of an amplitude at least as large where there is no warm-up, (axes,).
     """
 
     amplitude: Array
     half: Array
+    p: Array
 
     @property
     def bound(self) -> Array:
@@ -88,7 +90,9 @@ def fit_common_warm_up(
     decay = profiles(edges, rate_hz, time_constant_s)[:, 1]
     shape = decay - decay.mean()
     amplitudes = block_means(recordings, edges) @ shape / (shape @ shape)
-    return CommonWarmUp(amplitudes.mean(axis=0), _half(amplitudes))
+    with np.errstate(invalid="ignore"):
+        p = scipy.stats.ttest_1samp(amplitudes, 0.0).pvalue  # NaN for a single recording
+    return CommonWarmUp(amplitudes.mean(axis=0), _half(amplitudes), np.asarray(p))
 
 
 def amplitude_needed(

@@ -27,7 +27,7 @@ from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.physics.bias import windows_at
 from gyro_pipeline.physics.ceiling import oracle
 from gyro_pipeline.physics.recording_model import LinearEstimate, RecordingModel, best_linear
-from gyro_pipeline.pipelines.evaluation.ceilings import Ceilings
+from gyro_pipeline.pipelines.evaluation.ceilings import Ceilings, with_draws
 from gyro_pipeline.pipelines.evaluation.device import TestDevice
 from gyro_pipeline.scoring.scorer import Scorer, View, squares_by_view
 from gyro_pipeline.scoring.scores import (
@@ -56,8 +56,6 @@ TARGETS = (RECORDING_MEAN, BIAS)
 
 EstimatesByTruth = Callable[[str], tuple[np.ndarray, ArrayLike]]
 """Biases and sigma of the windows of a recording, (windows, 3), deg/s, for each truth."""
-
-_MIN_CORRELATED = 5
 
 
 @dataclass(frozen=True)
@@ -362,15 +360,15 @@ class Bench:
         }
 
     def _turn_on_correlations(self) -> dict[str, Estimate]:
-        """Correlations of the training labels between axes, with intervals (Fisher 1915)."""
-        labels = max(self.device.labels.values(), key=len, default=np.empty(0))
-        if len(labels) < _MIN_CORRELATED:
+        """Correlations of the turn-on bias between axes; none where an axis has no spread."""
+        covariances = self.device.joint
+        if covariances is None or not np.diag(covariances[0]).all():
             return {}
-        scores, half = {}, 1.96 / np.sqrt(len(labels) - 3)
+        scores, spreads = {}, np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
         for (i, first), (j, second) in combinations(enumerate(AXES), 2):
-            value = float(np.corrcoef(labels[:, i], labels[:, j])[0, 1])
-            lo, hi = np.tanh(np.arctanh(value) + half * np.array([-1, 1]))
-            scores[f"turn_on_correlation_{first}{second}"] = Estimate(value, float(lo), float(hi))
+            with np.errstate(invalid="ignore"):
+                drawn = covariances[:, i, j] / (spreads[:, i] * spreads[:, j])
+            scores[f"turn_on_correlation_{first}{second}"] = with_draws(drawn[np.isfinite(drawn)])
         return scores
 
 

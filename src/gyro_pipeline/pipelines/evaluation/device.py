@@ -11,7 +11,7 @@ from gyro_pipeline.conventions import AXES, ORIGIN_REAL, TEST
 from gyro_pipeline.physics.allan import NoiseFigures, fit_axes
 from gyro_pipeline.physics.bias import fill_masked
 from gyro_pipeline.physics.history import BiasHistory
-from gyro_pipeline.physics.recording_model import RecordingModel
+from gyro_pipeline.physics.recording_model import RecordingModel, fitted_biases
 from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, fit_recording_model
 from gyro_pipeline.physics.turn_on import joint_draws, spread_draws, turn_on_spread
 
@@ -122,7 +122,7 @@ def _describe_unseen(
     else:
         fits = _allan_fits(recordings, allan, [allan.sel(imu=i, recording=n) for i, n in keys])
         noise = np.array([figures.white for figures in fits])
-        fitted = _fitted_models(recordings, keys) or ()
+        fitted = _fitted_models(_samples(recordings, keys), float(recordings.attrs["rate_hz"]))
         models = len(imus) * tuple(
             _with_prior(model, float(model.mean[0]), UNIT_SPREAD) for model in fitted
         )
@@ -163,18 +163,20 @@ def _describe_known(
         imu: Number of the IMU.
     """
     labels = means.to_numpy()
-    duration_s = recordings.sizes["sample"] / recordings.attrs["rate_hz"]
-    numbers = means.index.tolist()
+    rate_hz = float(recordings.attrs["rate_hz"])
+    duration_s, numbers = recordings.sizes["sample"] / rate_hz, means.index.tolist()
     variances = allan.sel(imu=imu, recording=numbers).load()
     fits = _allan_fits(recordings, allan, [variances.sel(recording=n) for n in numbers])
     noise = np.array([fit.white for fit in fits])
-    models = _fitted_models(recordings, [(imu, number) for number in numbers])
+    samples = _samples(recordings, [(imu, number) for number in numbers])
+    models = _fitted_models(samples, rate_hz) or None
     averaging = np.square(noise) / duration_s + _beyond_white(models, duration_s)
     spread = np.vstack([turn_on_spread(labels, averaging), spread_draws(labels, averaging, _DRAWS)])
     joint = given_earlier = None
     if models is not None:
         given_earlier = _given_earlier(models, means, tests)
-        joint = joint_draws(labels, averaging, _DRAWS) if len(labels) > len(AXES) else None
+        if len(labels) > len(AXES):
+            joint = joint_draws(*fitted_biases(models, samples), _DRAWS)
     return TestDevice((imu,), noise, spread, None, models, joint=joint, given_earlier=given_earlier)
 
 
@@ -237,21 +239,18 @@ def _drawn_models(recordings: xr.Dataset) -> tuple[RecordingModel, ...] | None:
     return tuple(models)
 
 
-def _fitted_models(
-    recordings: xr.Dataset, keys: Sequence[tuple[int, int]]
-) -> tuple[RecordingModel, ...] | None:
-    """Models of the axes, fitted to recordings by IMU and number; None with too few of them."""
-    if len(keys) < FEWEST_RECORDINGS:
-        return None
+def _samples(recordings: xr.Dataset, keys: Sequence[tuple[int, int]]) -> np.ndarray:
+    """Samples of recordings by IMU and number, (axes, n, samples), deg/s; no NaN."""
     rates = [recordings.angular_rate.sel(imu=imu, recording=number) for imu, number in keys]
-    samples = np.stack(
-        [fill_masked(part.transpose("axis", "sample").to_numpy()) for part in rates], 1
-    )
-    models = []
-    for axis in samples:
-        model = fit_recording_model(axis, float(recordings.attrs["rate_hz"]), warm_up=None)
-        models.append(replace(model, covariance=np.diag(np.diag(model.covariance))))
-    return tuple(models)
+    return np.stack([fill_masked(r.transpose("axis", "sample").to_numpy()) for r in rates], axis=1)
+
+
+def _fitted_models(samples: np.ndarray, rate_hz: float) -> tuple[RecordingModel, ...]:
+    """Models of the axes, fitted to recordings (axes, n, samples); none with too few of them."""
+    if samples.shape[1] < FEWEST_RECORDINGS:
+        return ()
+    models = [fit_recording_model(axis, rate_hz, warm_up=None) for axis in samples]
+    return tuple(replace(m, covariance=np.diag(np.diag(m.covariance))) for m in models)
 
 
 def _beyond_white(models: tuple[RecordingModel, ...] | None, duration_s: float) -> np.ndarray:

@@ -134,7 +134,8 @@ def _evaluate_run(run: StoredRun, spec: RunSpec, bench: Bench, evaluated_with: s
         artifacts[CURVE] = bench.curve
     tags = {EVALUATED_WITH: evaluated_with, "ceiling": bench.ceilings.basis}
     tags |= {"recommended": str(first.recommended)} | _off_the_curve(metrics)
-    tags |= ceiling_warning(table)
+    own_ceiling = max(fit.own_ceiling for fit in fits.values())
+    tags |= {"own_ceiling": own_ceiling} | ceiling_warning(table, own_ceiling)
     if first.uses_prior:
         tags |= {"uses_prior": ORIENTATION_NOTE} | _conflict(scores, metrics, run)
     logger.info(
@@ -158,11 +159,13 @@ def _metrics(scores: Scores) -> dict[str, float]:
     }
 
 
-def ceiling_warning(table: pd.DataFrame) -> dict[str, str]:
+def ceiling_warning(table: pd.DataFrame, own_ceiling: str = "") -> dict[str, str]:
     """A warning where the interval of a result lies entirely beyond that of the ceiling.
 
     Args:
         table: Scores from :meth:`gyro_pipeline.pipelines.evaluation.bench.Bench.scores`.
+        own_ceiling: The ceiling of what the estimator uses, as of ``Estimator``; that of one axis
+            where it was not computed.
 
     Returns:
         The tag ``beyond_ceiling``; empty without such a result.
@@ -170,9 +173,10 @@ def ceiling_warning(table: pd.DataFrame) -> dict[str, str]:
     beyond = []
     for truth, windows in product((PAPER, TRUE), (FIRST, ALL)):
         scores = read_scores(table, truth)
-        gain, ceiling = (
-            scores.get((f"{kind}accuracy_gain_pct", windows), MISSING) for kind in ("", "ceiling_")
-        )
+        axis_wise = "ceiling_accuracy_gain_pct", windows
+        own = f"ceiling_{own_ceiling}_accuracy_gain_pct", windows
+        gain = scores.get(("accuracy_gain_pct", windows), MISSING)
+        ceiling = scores.get(own, scores.get(axis_wise, MISSING))
         if gain.lies_above(ceiling):
             beyond.append(f"{windows} windows, truth {truth}")
     if not beyond:

@@ -242,7 +242,7 @@ def remark(row: pd.Series) -> str | None:
         if beyond_ceiling(row, windows):
             notes.append(f"beyond its ceiling in {windows} windows")
         elif gain > limit:
-            notes.append(f"by chance above its ceiling in {windows} windows")
+            notes.append(f"above its ceiling in {windows} windows, which its interval contains")
     if pd.notna(row.get("prior_conflict")):
         notes.append(row["prior_conflict"])
     return "; ".join(notes) or None

@@ -26,7 +26,7 @@ PAPER_STUDIES = ("augmentation", "real2real", "input_channels", tables.FIRST_WIN
 
 _BASE = ("base", "local")
 _COLUMNS = [*ROW, "study", "status", "run_ids", "fingerprints", "env", "simulated"]
-_COLUMNS += ["recommended", "beats_oracle_p", *WARNINGS]
+_COLUMNS += ["recommended", "own_ceiling", "beats_oracle_p", *WARNINGS]
 """Columns that the table of results has even without a row."""
 
 

@@ -31,6 +31,7 @@ WARM_UPS_S = (5.0, 20.0, 60.0)
 _FITTED_S = (*WARM_UPS_S, 7.0, 10.0, 14.0, 30.0, 40.0)
 """Time constants of which the most significant one is drawn."""
 
+_CHANCE = 0.05  # of a warm-up that is drawn where there is none
 _WORST_FIRST = (REJECTED, REPAIRED, KEPT)
 _MAX_ROWS = 20  # recordings of a sensor with a row in the quality table
 _POINTS = 1300  # of a running mean; more would not be visible
@@ -68,7 +69,7 @@ def describe(  # noqa: PLR0913, PLR0917 - a node's arguments are its datasets
 
 
 def drift(recordings: xr.Dataset) -> tuple[pd.DataFrame, dict[str, float]]:
-    """Mean rate against time after power-on, over all recordings and IMUs, and its warm-up.
+    """Mean rate against time after power-on, over all recordings of the tested IMU.
 
     Each recording is centred by the mean of its last quarter, so that only changes within a
     recording are left: a warm-up that all power-ons share stands out, noise averages out.
@@ -78,9 +79,11 @@ def drift(recordings: xr.Dataset) -> tuple[pd.DataFrame, dict[str, float]]:
     Returns:
         Lines for each axis: times ``x``, seconds, the mean ``y``, deg/s, with its 95 % interval
         over recordings, ``lo`` and ``hi``, NaN for a single recording; and the warm-up fitted with
-        the most significant time constant. Then, as ``warm_up_bound_dps_<time constant>``, the
-        largest amplitude of any axis that the 95 % interval allows.
+        the most significant time constant, if it is significant at the 5 % level. Then, as
+        ``warm_up_bound_dps_<time constant>``, the largest amplitude of any axis that the 95 %
+        interval allows.
     """
+    recordings = recordings.sel(imu=[tested_imu(recordings)])
     lengths = recordings["samples"].to_numpy()
     length = int(np.quantile(lengths[lengths > 0], 0.1, method="lower"))
     rate_hz = recordings.attrs["rate_hz"]
@@ -95,17 +98,17 @@ def drift(recordings: xr.Dataset) -> tuple[pd.DataFrame, dict[str, float]]:
     drifts = settling(coarse, coarse.shape[-1] * rate_hz / length)
     fits = {time_s: fit_common_warm_up(means, blocks_hz, time_s) for time_s in _FITTED_S}
     bounds = {f"warm_up_bound_dps_{t:g}": float(fits[t].bound.max()) for t in WARM_UPS_S}
-    time_s = max(fits, key=lambda t: np.nansum((fits[t].amplitude / fits[t].half) ** 2))
-    decay = np.exp(-drifts.time_s / time_s)
-    decay -= decay[drifts.time_s >= drifts.time_s[-1] * (1 - LAST)].mean()
-    lines = []
-    for axis, rate, half, amplitude in zip(
-        AXES, drifts.rate, drifts.half, fits[time_s].amplitude, strict=True
-    ):
-        lines += [
-            _line("drift", axis, drifts.time_s, rate, half),
-            _line("drift", f"{axis}, warm-up of {time_s:g} s", drifts.time_s, amplitude * decay),
-        ]
+    lines = [
+        _line("drift", axis, drifts.time_s, rate, half)
+        for axis, rate, half in zip(AXES, drifts.rate, drifts.half, strict=True)
+    ]
+    time_s = min(fits, key=lambda t: fits[t].p.prod())
+    if fits[time_s].p.min() * len(AXES) * len(fits) < _CHANCE:
+        decay = np.exp(-drifts.time_s / time_s)
+        decay -= decay[drifts.time_s >= drifts.time_s[-1] * (1 - LAST)].mean()
+        for axis, amplitude in zip(AXES, fits[time_s].amplitude, strict=True):
+            name = f"{axis}, warm-up of {time_s:g} s"
+            lines.append(_line("drift", name, drifts.time_s, amplitude * decay))
     return pd.concat(lines, ignore_index=True), bounds
 
 

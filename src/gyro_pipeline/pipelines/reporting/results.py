@@ -48,6 +48,7 @@ CNN_BEST = "cnn_best"
 """The paper's network at its best validation epoch, if that was stored."""
 
 CEILINGS = ["ceiling_rmse_dps", "ceiling_time_saving_pct", "ceiling_accuracy_gain_pct"]
+CEILINGS += [f"ceiling_{name}_rmse_dps" for name in ("joint", "history")]
 CEILINGS += [f"ceiling_{name}_accuracy_gain_pct" for name in ("joint", "history")]
 BOUND_GAINS = ["oracle_accuracy_gain_pct", "constant_accuracy_gain_pct"]
 """A of the constant and, on simulated data, of the oracle on the same windows."""
@@ -196,6 +197,7 @@ class Cell:
         assert self.mean is not None
         tags, scores = runs[0].tags, read_scores(runs[0].load(SCORES))
         row = mean_row(self.mean)
+        row |= own_ceiling(row, tags.get("own_ceiling", ""))
         if spec.estimator != MEAN:
             row |= self._pooled(runs)
         elif DEFAULT in self._errors_compared:
@@ -209,6 +211,7 @@ class Cell:
             "simulated": tags["simulated"] == "1",
             "recommended": tags.get("recommended") == "True",
             "uses_prior": "uses_prior" in tags,
+            "own_ceiling": tags.get("own_ceiling", ""),
             "folds": int(runs[0].params["folds"]),
             "status": None,
             "run_ids": " ".join(run.run_id for run in runs),
@@ -302,6 +305,22 @@ def mean_row(mean: StoredRun) -> dict[str, Any]:
     for windows, name in product((ALL, FIRST), _OF_THE_MEAN):
         row |= with_ends(column(name, windows), scores.get((name, windows), MISSING))
     return row
+
+
+def own_ceiling(row: Mapping[str, Any], kind: str) -> dict[str, Any]:
+    """The RMSE and A of the ceiling of what an estimator uses, if it was computed.
+
+    Args:
+        row: A row with all ceilings.
+        kind: ``joint`` or ``history``; empty for the windows of one axis, as the row has it.
+    """
+    return {
+        column(f"ceiling_{score}", windows) + end: value
+        for windows, score, end in product(
+            (ALL, FIRST), ("rmse_dps", "accuracy_gain_pct"), ("", "_lo", "_hi")
+        )
+        if (value := row.get(column(f"ceiling_{kind}_{score}", windows) + end)) is not None
+    }
 
 
 def errors_of(runs: Iterable[StoredRun], epoch: str = LAST) -> pd.DataFrame:

@@ -28,7 +28,7 @@ _TOLERANCE = "The band is the tolerance around the mean of the recording, which 
 
 
 def drift(material: Material) -> Exhibit | None:
-    """Mean rate against time after power-on, over all recordings of each sensor."""
+    """Mean rate against time after power-on, over all recordings of each tested IMU."""
     lines = where(material.signals, figure="drift")
     if lines.empty:
         return None
@@ -43,16 +43,20 @@ def drift(material: Material) -> Exhibit | None:
                 ax.fill_between(line.x, *band, color=colour, alpha=0.18, lw=0)
             for axis, colour in zip(AXES, COLOURS, strict=False):
                 fit = rows[rows.line.str.startswith(f"{axis},")]
-                ax.plot(fit.x, fit.y / MDPS, color=colour, ls="--", lw=1, label="fitted warm-up")
+                if len(fit):
+                    ax.plot(
+                        fit.x, fit.y / MDPS, color=colour, ls="--", lw=1, label="fitted warm-up"
+                    )
             ax.axhline(0, color="black", lw=0.8)
             ax.set(title=material.sensor_name(sensor), xlabel="time after power-on [s]")
             ax.set_ylabel("mean rate less its end [mdps]")
     caption = (
-        "The mean over all recordings, each centred by its last quarter, with its 95 % interval. A "
-        "line at 0 is a bias that does not move; a line that starts off 0 is a warm-up, which any "
-        "estimator that knows the device, even a constant, can correct. White noise without drift, "
-        "the premise of the ceiling, means a line at 0. Dashed is the warm-up fitted to all "
-        f"recordings. The 95 % intervals allow an amplitude of at most {_bounds(material)}."
+        "The mean over all recordings of the tested IMU, each centred by its last quarter, with "
+        "its 95 % interval. A line at 0 is a bias that does not move; a line that starts off 0 is "
+        "a warm-up, which any estimator that knows the device, even a constant, can correct. White "
+        "noise without drift, the premise of the ceiling, means a line at 0. Dashed is a fitted "
+        "warm-up, if it is significant. The 95 % intervals allow an amplitude of at most "
+        f"{_bounds(material)}."
     )
     return Exhibit("drift", "Does the rate drift after power-on?", caption, figure)
 
