@@ -115,6 +115,20 @@ def test_how_a_recording_is_cut_changes_no_bit(seed=1):
     assert {"cut", "attitude", "gap", "not_finite", "conflict"} <= codes(one)
 
 
+def test_a_first_sample_alone_changes_neither_a_bit_nor_the_order_of_what_is_said():
+    """An index leaves lost samples out in another memory layout; an axis dies after a turn."""
+    samples = still(20)
+    samples[1500], samples[800:900, 2] = np.nan, samples[800:900, 2] + 30
+    samples[1600:, 0] = 0.5
+    whole, parts = fed(samples, UNKNOWN), Calibrator(UNKNOWN, RATE)
+    for part in (samples[:1], samples[1:1400], samples[1400:]):
+        parts.update(None, part)
+    one, other = whole.finish(), parts.finish()
+    np.testing.assert_array_equal(one.sigma_dps, other.sigma_dps)
+    assert one.reasons == other.reasons
+    assert [reason.code for reason in one.reasons][:2] == ["dead", "attitude"]
+
+
 def test_seconds_left_are_the_ones_it_takes():
     samples = still(60)
     calibrator = Calibrator(KIND, RATE, target_dps=1.0001e-3)

@@ -215,6 +215,8 @@ def test_a_sensor_that_stops_sends_no_times_or_begins_within_a_line_is_said():
     header = "gyro_x (deg/s),gyro_y (deg/s),gyro_z (deg/s)"
     rows = "\n".join([header, *(["0.1,0.2,0.3"] * 30)])
     assert "give --rate" in streamed(send=rows).stderr
+    done = streamed("--increments", "true", send=text(rates(5)))  # not what a stream divides
+    assert (done.exit_code, "--increments: expected a log file" in done.stderr) == (2, True)
     done = streamed(send='{"t (s)": 0.0, "gyro_x (d\n' + '{"t (s)": 0.01}\n' * 30)
     assert (done.exit_code, """got '{"t (s)": 0.0, "gyro_x (d'""" in done.stderr) == (2, True)
 

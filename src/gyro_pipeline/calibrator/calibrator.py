@@ -21,7 +21,7 @@ from gyro_pipeline.calibrator.history import MOVING, STILL, UNSURE, Calibration,
 from gyro_pipeline.calibrator.reasons import Reason, reason, reasons_of, unit_reason
 from gyro_pipeline.calibrator.rest import ATTITUDE, MOTION, NOISE, Alarm, Blocks
 from gyro_pipeline.calibrator.stretch import BLOCK_S, LEAST_S, Setup, Stretch
-from gyro_pipeline.conventions import AXES, MDPS, InputError
+from gyro_pipeline.conventions import MDPS, InputError
 from gyro_pipeline.quality.rest import Mask
 
 _JUMP_S = 3600.0  # a clock that moves by more has jumped
@@ -38,7 +38,8 @@ class State:
 
     stretch: Stretch  # that the result is from
     counts: Counter[str]  # samples, gaps, jumps of the clock, samples left out
-    ended: dict[str, Reason]  # why stretches ended, the last reason of each code; dead axes
+    ended: dict[str, Reason]  # why stretches ended, the last reason of each code
+    dead: Mask  # whether an axis has not changed for a while, (3,)
     rest: str  # STILL, MOVING or UNSURE
     time_s: float  # since the first sample
 
@@ -110,7 +111,7 @@ class Calibrator:
         target_dps, now = np.inf if target_dps is None else target_dps, now or Circumstances()
         self.setup = Setup(device_type, float(rate_hz), tuple(history), now, target_dps)
         self.counts, self.ended = Counter[str](), dict[str, Reason]()
-        self._constant = np.zeros(3)  # blocks in a row without any change
+        self._constant, self._dead = np.zeros(3), np.zeros(3, bool)  # blocks without any change
         self._pending = np.empty((_COLUMNS, 0))  # samples of an incomplete block
         self._last_time: float | None = None
         self._end: float | None = None  # end of the last block, on the clock of the samples
@@ -210,7 +211,7 @@ class Calibrator:
         rest = self._rest(stretch, finished)
         if finished and rest == MOVING:
             stretch = Stretch.start(self.setup, self.time_s)
-        return State(stretch, self.counts.copy(), self.ended, rest, self.time_s)
+        return State(stretch, self.counts.copy(), self.ended, self._dead, rest, self.time_s)
 
     @property
     def best(self) -> Stretch:
@@ -270,8 +271,8 @@ class Calibrator:
         self.counts.update(samples=len(rates), **invalid)
         if len(rates) and np.isfinite(rows[0, -1]):
             self._last_time = float(rows[0, -1])
-        good = finite & ~zero
-        return rows if good.all() else rows[:, good]
+        # an index would return another memory layout, and sums would then differ in the last bit
+        return np.compress(finite & ~zero, rows, axis=1)
 
     def _process_blocks(self, rows: Array) -> Array:
         """Process whole blocks of rows without a gap; returns the remaining rows."""
@@ -289,8 +290,7 @@ class Calibrator:
     def _find_dead_axes(self, constant: Mask) -> None:
         for axes in constant if constant.any() or self._constant.any() else ():
             self._constant = np.where(axes, self._constant + 1, 0)
-            for axis in np.flatnonzero(self._constant >= _DEAD_BLOCKS):
-                self.ended = {**self.ended, AXES[axis]: reason("dead", axis=axis)}
+            self._dead = self._dead | (self._constant >= _DEAD_BLOCKS)
 
     def _cross_gap(self, start: float) -> None:
         """Move on to the time at which rows start, if the last block ended at another one."""
@@ -368,7 +368,7 @@ class Calibrator:
         if self.setup.now.known_still:
             return STILL if stretch.blocks else UNSURE
         enough = stretch.seconds >= max(min(self.setup.least_s, 2 * LEAST_S), self._min_rest_s)
-        ended = bool(self.ended.keys() - {ATTITUDE, *AXES})
+        ended = bool(self.ended.keys() - {ATTITUDE})
         if finished:
             half = self._ended_rest_s + self.stretch.seconds >= self.time_s / 2
             cut = any(note.code == "cut" for note in stretch.notes)

@@ -110,6 +110,7 @@ def unit_reason(factor: float, name: str, inside: float | None = None) -> Reason
 def reasons_of(state: "State") -> Iterator[Reason]:
     """All remarks on a result, the most important first."""
     counts, stretch = state.counts, state.stretch
+    yield from (reason("dead", axis=axis) for axis in np.flatnonzero(state.dead))
     yield from state.ended.values()
     for code in ("zero", "not_finite"):
         if 0 < counts[code] < counts["samples"]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from gyro_pipeline.conventions import InputError
 
 _HEADER_LINES = 20  # that columns, units and the rate are inferred from
+_OF_FILES = {"increments", "repeats", "row", "rows", "signed_bits", "time_is"}  # options
 
 Samples = list[Any]
 """Times (n,), rates (n, 3) in deg/s, accelerations (n, 3) in g, temperatures (n,), or None each."""
@@ -64,9 +65,15 @@ class Parser:
 
     Attributes:
         bad: Number of lines that could not be parsed.
+
+    Raises:
+        InputError: An option would change the samples of a file, but not those of a stream.
     """
 
     def __init__(self, options: Any, rate_hz: float | None) -> None:
+        for name in sorted(_OF_FILES & options.model_fields_set):
+            text = f"--{name.replace('_', '-')}: expected a log file, got a stream"
+            raise InputError(f"{text}; leave it out, or store the stream and use log")
         self.options, self.rate_hz, self.bad = options, rate_hz, 0
         self._names: list[str] = []
         self._separator: str | None = ""  # empty for JSON, None for blanks
