@@ -165,6 +165,8 @@ def test_notes_and_withdrawals_are_appended(csv, tmp_path):
     told = ["knocked" in {reason["code"] for reason in r["reasons"]} for r in (before, knocked)]
     assert told == [False, True]
     assert "note of a knock: fell" in run("devices", "show", "B17").stdout
+    for start in ("", "no.csv"):
+        assert "forget: expected one of still.csv" in run("devices", "forget", "B17", start).stderr
     assert run("devices", "forget", "B17", "still.csv").exit_code == 0
     assert "does not count" in run("devices", "show", "B17").stdout
     assert run("devices", "save", "B17", tmp_path / "b17.json").exit_code == 0

@@ -46,12 +46,12 @@ class State:
     @property
     def bias_dps(self) -> Array:
         """The current bias, deg/s; the settled one where the device warms up."""
-        return self.stretch.bias
+        return self.stretch.result[0]
 
     @cached_property
     def sigma_dps(self) -> Array:
         """Standard deviation of the bias: 1.96 of it are the 95 % limits."""
-        return np.sqrt(self.stretch.variance)
+        return np.sqrt(self.stretch.result[1])
 
     @property
     def seconds_at_rest(self) -> float:
@@ -74,13 +74,10 @@ class State:
         """Whether the device is at rest and the target is reached."""
         return self.rest == STILL and self.reached
 
-    @cached_property
+    @property
     def seconds_left(self) -> Array:
         """Seconds at rest until the target; infinite where never, NaN without a target."""
-        setup = self.stretch.setup
-        if np.isinf(setup.target_dps):
-            return np.full(3, np.nan)
-        return np.maximum(self.stretch.seconds_left(), setup.least_s - self.seconds_at_rest)
+        return self.stretch.seconds_left
 
     @cached_property
     def reasons(self) -> tuple[Reason, ...]:
@@ -113,7 +110,7 @@ class Calibrator:
         self.counts, self.ended = Counter[str](), dict[str, Reason]()
         self._constant, self._dead = np.zeros(3), np.zeros(3, bool)  # blocks without any change
         self._pending = np.empty((_COLUMNS, 0))  # samples of an incomplete block
-        self._last_time: float | None = None
+        self._last_time = -1 / rate_hz
         self._end: float | None = None  # end of the last block, on the clock of the samples
         self._min_rest_s = 0.0  # longer than any stretch that turned out not to be at rest
         self._block_count, self._gaps_s = 0, 0.0
@@ -154,21 +151,21 @@ class Calibrator:
         Raises:
             InputError: A file in the registry is invalid.
         """
-        from gyro_pipeline.calibrator.registry import Device, registry_folder  # noqa: PLC0415
+        from gyro_pipeline.calibrator.registry import Device, Settings, registry_folder  # noqa: PLC0415
 
         folder = registry_folder(registry)
         stored = None if device is None else Device(folder, device)
-        settings = stored.settings() if stored else {}
+        settings = stored.settings() if stored else Settings()
         now = Circumstances(
             started_at,
             since_power_on_s,
-            bool(settings.get("mounted") if same_heading is None else same_heading),
-            settings.get("latitude") if latitude_deg is None else latitude_deg,
+            settings.mounted if same_heading is None else same_heading,
+            settings.latitude if latitude_deg is None else latitude_deg,
             known_still,
             stored.attempt(without) if stored else 1,
             stored.knocks() if stored else 0,
         )
-        resolved = read_type(device_type or settings.get("type"), folder)
+        resolved = read_type(device_type or settings.type, folder)
         history = stored.history(without) if stored else ()
         return cls(resolved, rate_hz, history, now, target_mdps and target_mdps * MDPS)
 
@@ -257,19 +254,18 @@ class Calibrator:
         rates = np.atleast_2d(np.asarray(gyro_dps, np.float64))
         if rates.ndim != 2 or rates.shape[1] != 3:  # noqa: PLR2004
             raise InputError(f"gyro_dps: expected (n, 3) or (3,) deg/s, got {np.shape(gyro_dps)}")
-        rows, rate_hz = np.full((_COLUMNS, len(rates)), np.nan), self.setup.rate_hz
+        count, rate_hz = len(rates), self.setup.rate_hz
         if time_s is None:
-            first = -1 if self._last_time is None else round(self._last_time * rate_hz)
-            time_s = (first + 1 + np.arange(len(rates))) / rate_hz
+            time_s = (round(self._last_time * rate_hz) + 1 + np.arange(count)) / rate_hz
+        rows = np.full((_COLUMNS, count), np.nan)
         rows[0], rows[1:4] = time_s, rates.T
         if accel_g is not None:
             rows[4:7] = np.atleast_2d(accel_g).T
         if temperature_c is not None:
             rows[7] = temperature_c
         finite, zero = np.isfinite(rows[:4]).all(axis=0), ~rows[1:4].any(axis=0)
-        invalid = {"not_finite": int(np.sum(~finite)), "zero": int(np.sum(zero))}
-        self.counts.update(samples=len(rates), **invalid)
-        if len(rates) and np.isfinite(rows[0, -1]):
+        self.counts.update(samples=count, not_finite=int(np.sum(~finite)), zero=int(np.sum(zero)))
+        if count and np.isfinite(rows[0, -1]):
             self._last_time = float(rows[0, -1])
         # an index would return another memory layout, and sums would then differ in the last bit
         return np.compress(finite & ~zero, rows, axis=1)

@@ -22,8 +22,7 @@ from gyro_pipeline.conventions import MDPS, InputError
 if TYPE_CHECKING:
     from gyro_pipeline.physics.recording_model import RecordingModel
 
-Axes = float | tuple[float, float, float]
-"""One number for all axes, or one each for x, y and z."""
+Axes = float | tuple[float, float, float]  # for all axes, or for x, y and z
 
 
 @dataclass(frozen=True)
@@ -125,11 +124,7 @@ def type_of(content: Mapping[str, Any], where: str) -> DeviceType:
 
 
 def validated(kind: Any, content: Mapping[str, Any], where: str) -> Any:
-    """A dataclass made from the content of a file.
-
-    Raises:
-        InputError: A key is unknown, or a value is invalid.
-    """
+    """A dataclass made from the content of a file; an ``InputError`` names the first bad key."""
     from pydantic import ValidationError  # noqa: PLC0415
 
     try:

@@ -15,9 +15,7 @@ from gyro_pipeline.calibrator.history import DROPPED, NONE, STILL, USED
 from gyro_pipeline.calibrator.registry import SET, Device
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 
-HEADING_DEG = 3.6
-"""Drift of the heading in degrees per hour for 1 mdps."""
-
+_HEADING_DEG = 3.6  # drift of the heading in an hour for 1 mdps
 _IN_TEXT = {"conflict", "cut", "floor", "rotation_bound"}  # reasons that the text contains
 
 
@@ -56,7 +54,7 @@ def as_text(state: State) -> Iterator[str]:
     if np.isfinite(target_mdps(state)):
         yield _time_left(state)
     if np.isfinite(sigmas).all():
-        drifts = zip(sigmas * HEADING_DEG, AXES, strict=True)
+        drifts = zip(sigmas * _HEADING_DEG, AXES, strict=True)
         listed = ", ".join(f"{drift:.2g}° about {name}" for drift, name in drifts)
         yield f"In one hour the heading drifts by {listed} (1 σ of the bias alone)."
     yield from (r.sentence for r in state.reasons if r.code == "rotation_bound")
@@ -119,7 +117,7 @@ def _time_left(state: State) -> str:
 def planned(state: State) -> Iterator[str]:
     """A line for each axis: the seconds that a target takes, or why it cannot be reached."""
     target = target_mdps(state)
-    text = f"{target:.3g} mdps ({target * HEADING_DEG:.3g}° of heading an hour)"
+    text = f"{target:.3g} mdps ({target * _HEADING_DEG:.3g}° of heading an hour)"
     floors = state.stretch.floor_dps / MDPS
     for name, needed, floor in zip(AXES, state.seconds_left, floors, strict=True):
         if np.isfinite(needed):

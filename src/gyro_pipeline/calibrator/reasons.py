@@ -12,12 +12,8 @@ if TYPE_CHECKING:
     from gyro_pipeline.calibrator.calibrator import State
     from gyro_pipeline.calibrator.stretch import Stretch
 
-UNUSABLE_CODES = {"dead", "unit"}
-"""Codes of data that cannot be used at all."""
-
-VERTICAL = 0.9
-"""An axis counts as vertical where the cosine of its angle to the vertical is larger."""
-
+UNUSABLE_CODES = {"dead", "unit"}  # of data that cannot be used at all
+VERTICAL = 0.9  # an axis with a larger cosine of its angle to the vertical counts as vertical
 _UNIT_FACTOR = 15.0  # on the noise; a larger one means a wrong unit, not another device
 _WHITE = 4.0  # the noise of samples and of block means differs by a smaller factor at rest
 _WARMING_C = 1.0  # a larger change of temperature over a log is reported
