@@ -9,6 +9,7 @@ import pytest
 
 from gyro_pipeline.calibrator import Calibration, Calibrator, Circumstances
 from gyro_pipeline.calibrator.device_types import read_type, type_of
+from gyro_pipeline.conventions import InputError
 
 RATE = 100.0
 BIAS = np.array([0.412, -0.104, 0.087])  # three different axes
@@ -228,6 +229,21 @@ def test_data_that_cannot_be_used_and_a_clock_that_jumps_are_told():
     state = finished(still(20), time_s=time_s)
     assert "clock" in codes(state)
     assert state.seconds_at_rest >= 18
+
+
+def test_arguments_that_do_not_fit_are_refused():
+    samples = still(1)
+    for bad in ({"time_s": 0.0}, {"accel_g": UP[:9]}, {"accel_g": samples.T}):
+        with pytest.raises(InputError, match="expected as many samples of each"):
+            Calibrator(KIND, RATE).update(**{"time_s": None, "gyro_dps": samples, **bad})
+    for now in (Circumstances(latitude_deg=np.nan), Circumstances(since_power_on_s=-5.0)):
+        with pytest.raises(InputError, match="(latitude|since_power_on): expected"):
+            Calibrator(KIND, RATE, now=now)
+
+
+def test_a_temperature_that_is_infinite_is_not_measured():
+    state = finished(still(2), warmth=np.r_[np.inf, np.full(199, 25.0)])
+    assert state.stretch.temperature[:4] == (3, 25.0, 25.0, 25.0)
 
 
 def test_a_temperature_that_moves_makes_the_bias_now_less_certain():

@@ -60,6 +60,12 @@ def test_a_log_needs_no_configuration(csv):
         assert float(row.split()[1]) == pytest.approx(bias, abs=5e-3)
 
 
+def test_a_log_that_is_too_short_is_not_taken_for_a_stored_value(csv):
+    result = run("log", csv(rates(1)[:60]), "--type", "memsense")
+    assert (result.exit_code, "Too short" in result.stdout) == (4, True)
+    assert "stored value" not in result.stdout
+
+
 @pytest.mark.slow
 def test_six_logs_make_a_history_that_the_next_one_uses_but_not_the_same_one(csv):
     about = ("--device", "B17", "--type", "memsense", "--same-heading")
@@ -130,6 +136,9 @@ def test_plan_says_how_long_or_that_it_is_not_possible():
 
 
 def test_a_bias_that_was_typed_in_stays_until_it_is_forgotten(csv):
+    for bad in (("nan", "-0.1", "0.09"), ("0.5", "-0.1", "0.09", "--sigma", "-1")):
+        result = run("devices", "set", "B17", *bad)
+        assert (result.exit_code, "expected three rates" in result.stderr) == (2, True)
     typed = ("0.5", "-0.1", "0.09", "--sigma", "0.4", "--type", "memsense")
     assert run("devices", "set", "B17", *typed).exit_code == 0
     for seed in range(2):
@@ -137,6 +146,9 @@ def test_a_bias_that_was_typed_in_stays_until_it_is_forgotten(csv):
     answer, _ = said("log", csv(rates(2)), "--device", "B17", "--same-heading", "--no-store")
     assert answer["history"][0] == "dropped"  # x was typed in wrong
     assert "set by hand" in run("log", csv(rates(2)), "--device", "B17", "--no-store").stdout
+    run("devices", "set", "B18", *typed[:3])  # one block of unknown noise has no bound, but JSON
+    answer, _ = said("log", csv(rates(1)[:60]), "--device", "B18")
+    assert [None] * 3 != answer["bias_dps"]
     run("devices", "forget", "B17", "set")
     answer, _ = said("log", csv(rates(2)), "--device", "B17", "--same-heading", "--no-store")
     assert answer["history"] == ["used"] * 3
@@ -251,6 +263,8 @@ def test_a_picture_is_drawn_and_a_failure_loses_no_calibration(csv, tmp_path, mo
         result = run(*about, tmp_path / name)
         assert (result.exit_code, result.stdout, words in result.stderr) == (2, "", True)
 
+    result = run(*about, tmp_path / "a.png", csv(rates(5), "b.csv"))
+    assert (result.exit_code, "expected one log, got 2" in result.stderr) == (2, True)
     assert run(*about, tmp_path / "a.png", "--no-store").exit_code == 0
     assert (tmp_path / "a.png").stat().st_size > 10_000
     full = Mock(side_effect=OSError(28, "No space left on device"))

@@ -106,6 +106,11 @@ class Calibrator:
             got = f"{target_dps / MDPS:g}"
             raise InputError(f"target: expected more than 0 mdps, such as 0.5, got {got}")
         target_dps, now = np.inf if target_dps is None else target_dps, now or Circumstances()
+        if now.latitude_deg is not None and not abs(now.latitude_deg) <= 90:  # noqa: PLR2004
+            raise InputError(f"latitude: expected -90 to 90 degrees, got {now.latitude_deg:g}")
+        if now.since_power_on_s is not None and not 0 <= now.since_power_on_s < np.inf:
+            got = f"{now.since_power_on_s:g}"
+            raise InputError(f"since_power_on: expected 0 s or more, got {got}")
         self.setup = Setup(device_type, float(rate_hz), tuple(history), now, target_dps)
         self.counts, self.ended = Counter[str](), dict[str, Reason]()
         self._constant, self._dead = np.zeros(3), np.zeros(3, bool)  # blocks without any change
@@ -182,7 +187,7 @@ class Calibrator:
             temperature_c: Temperatures, (n,) or a number, degrees Celsius.
 
         Raises:
-            InputError: The samples do not have three axes.
+            InputError: The samples do not have three axes, or there is not one time for each.
         """
         rows = self._rows(time_s, gyro_dps, accel_g, temperature_c)
         if rows.size:
@@ -257,12 +262,13 @@ class Calibrator:
         count, rate_hz = len(rates), self.setup.rate_hz
         if time_s is None:
             time_s = (round(self._last_time * rate_hz) + 1 + np.arange(count)) / rate_hz
-        rows = np.full((_COLUMNS, count), np.nan)
-        rows[0], rows[1:4] = time_s, rates.T
-        if accel_g is not None:
-            rows[4:7] = np.atleast_2d(accel_g).T
-        if temperature_c is not None:
-            rows[7] = temperature_c
+        accel = np.full((count, 3), np.nan) if accel_g is None else np.atleast_2d(accel_g)
+        if np.size(time_s) != count or accel.shape not in (rates.shape, (1, 3)):
+            text = "gyro_dps, time_s and accel_g: expected as many samples of each"
+            raise InputError(f"{text}, got {count}, {np.size(time_s)} and the shape {accel.shape}")
+        rows = np.empty((_COLUMNS, count))
+        rows[0], rows[1:4], rows[4:7] = np.ravel(time_s), rates.T, accel.T
+        rows[7] = np.nan if temperature_c is None else temperature_c
         finite, zero = np.isfinite(rows[:4]).all(axis=0), ~rows[1:4].any(axis=0)
         self.counts.update(samples=count, not_finite=int(np.sum(~finite)), zero=int(np.sum(zero)))
         if count and np.isfinite(rows[0, -1]):
@@ -380,4 +386,5 @@ def _blocks(samples: Array) -> Blocks:
     gravity_variances = np.full(samples.shape[1], np.nan)
     if np.isfinite(means[4:7]).any():
         gravity_variances = samples[4:7].var(axis=2, ddof=1).mean(axis=0)
-    return Blocks(means[1:4].T, variances.T, means[4:7].T, gravity_variances, means[7])
+    celsius = np.where(np.isfinite(means[7]), means[7], np.nan)
+    return Blocks(means[1:4].T, variances.T, means[4:7].T, gravity_variances, celsius)

@@ -185,6 +185,8 @@ def _job(store: bool, **values: Any) -> SimpleNamespace:
 def log(files: tuple[Path, ...], **values: Any) -> int:
     """Calibrate from log files, one after the other."""
     job = _job(**values)
+    if job.plot and len(files) > 1:
+        raise InputError(f"--plot: expected one log, got {len(files)}; plot them one by one")
     return max(_code_of(_calibrate, path, job) for path in files)
 
 
@@ -376,6 +378,9 @@ def set_bias(
     device_type: str | None,
 ) -> None:  # fmt: skip
     """Set a bias, deg/s about x, y and z, which replaces the history until it is forgotten."""
+    if not (np.isfinite(bias_dps).all() and 0 <= sigma < np.inf):
+        text = f"{' '.join(map(str, bias_dps))} --sigma {sigma:g}"
+        raise InputError(f"set: expected three rates in deg/s, and a sigma from 0, got {text}")
     device, variance = Device(registry, name), (sigma * MDPS) ** 2
     device.create(device_type)
     typed: Any = {"time": time.time(), "hash": SET, "source": SET, "event": SET}

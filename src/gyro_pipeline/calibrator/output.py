@@ -46,7 +46,8 @@ def as_text(state: State) -> Iterator[str]:
     if state.rest != STILL:
         if np.isinf(sigmas).all():
             return
-        yield "The stored value is still the one to use:"
+        stored = "The stored value is still the one to use:"
+        yield "Too short to tell rest from motion; so far:" if state.stretch.blocks else stored
     yield f"{'bias, deg/s':>17}{'σ, mdps':>11}   from"
     for axis, name in enumerate(AXES):
         row = f"{name}{state.bias_dps[axis]:+16.6f}{sigmas[axis]:11.2f}   {_sources(state, axis)}"
@@ -101,14 +102,12 @@ def _sources(state: State, axis: int) -> str:
 
 
 def _time_left(state: State) -> str:
-    floors = {r.axis: r.value for r in state.reasons if r.code == "floor"}
+    floors = [r for r in state.reasons if r.code == "floor"]
+    why = {floor.axis: f", below its floor of {floor.value:.2g}" for floor in floors}
     target, parts = f"{target_mdps(state):g} mdps", []
     for name, seconds in zip(AXES, state.seconds_left, strict=True):
         if np.isinf(seconds):
-            why = (
-                f", below its floor of {floors[name]:.2g}" if name in floors else " within an hour"
-            )
-            parts.append(f"{name} does not reach {target}{why}")
+            parts.append(f"{name} does not reach {target}{why.get(name, ' within an hour')}")
         elif seconds:
             parts.append(f"{name} needs {math.ceil(seconds)} s more at rest for {target}")
     return f"{'; '.join(parts)}." if parts else f"The target of {target} is reached."

@@ -160,9 +160,9 @@ def _rotation_reasons(stretch: "Stretch") -> Iterator[Reason]:
     up = stretch.up
     about = "any axis" if up is None else "the vertical"
     axes = stretch.usable & (True if up is None else np.abs(up) > VERTICAL)
-    if not axes.any():
+    spread = np.where(axes, stretch.prior.narrow + stretch.estimate.start_variance, 0.0)
+    bound = 1.96 * float(np.sqrt(spread.max())) / MDPS
+    if 0 < bound < np.inf:
+        yield reason("rotation_bound", bound, about=about)
+    else:
         yield reason("rotation_bound none", about=about)
-        return
-    spread = stretch.prior.narrow + stretch.estimate.start_variance
-    bound = 1.96 * float(np.sqrt(spread[axes].max())) / MDPS
-    yield reason("rotation_bound", bound, about=about)

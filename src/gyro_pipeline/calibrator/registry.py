@@ -9,7 +9,7 @@ import os
 import re
 import tomllib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -93,8 +93,11 @@ class Device:
 
     def lines(self) -> list[Line]:
         """All complete lines of the history, the oldest first."""
-        parsed = map(_parsed, _read(self.lines_path).split(b"\n"))
-        return [line for line in parsed if line is not None]
+        lines = []
+        for line in _read(self.lines_path).split(b"\n"):
+            with suppress(ValueError):
+                lines.append(json.loads(line))
+        return [line for line in lines if isinstance(line, dict) and "event" in line]
 
     def calibrations(self) -> dict[str, Calibration]:
         """Calibrations and failed attempts that were not withdrawn, by hash."""
@@ -226,11 +229,3 @@ def _append(path: Path, data: bytes) -> int:
             file.truncate(size)
             raise
         return size
-
-
-def _parsed(line: bytes) -> Line | None:
-    try:
-        content = json.loads(line)
-    except ValueError:
-        return None
-    return content if isinstance(content, dict) and "event" in content else None

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from statistics import NormalDist
-from typing import NamedTuple, SupportsIndex
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -240,8 +240,12 @@ class Stretch:
         estimate = self.estimate
         off = estimate.start - self._prior_mean
         axes = self.usable & (self._log_ratios(off, estimate.start_variance) > 0)
-        sigma = np.sqrt(self.prior.narrow + estimate.start_variance)
-        notes = [_conflict(axis, off[axis], sigma[axis]) for axis in np.flatnonzero(axes)]
+        sigmas = np.abs(off / np.sqrt(self.prior.narrow + estimate.start_variance))
+        notes = []
+        for axis in np.flatnonzero(axes):
+            away, chance = float(off[axis] / MDPS), max(2 * NormalDist().cdf(-sigmas[axis]), 1e-12)
+            words = {"away": abs(away), "chance": 1 / chance}
+            notes.append(reason("conflict", away, float(sigmas[axis]), axis, **words))
         after = replace(self, dropped=self.dropped | axes, notes=(*self.notes, *notes))
         horizontal = axes if self.up is None else axes & (np.abs(self.up) < VERTICAL)
         return after._with_prior(self.up, self.prior_c, False) if horizontal.any() else after
@@ -365,9 +369,3 @@ def _temperature_rise(start: float, end: float) -> float:
 def _temperature_moved(now: ArrayLike, before: float) -> Mask:
     """Whether the temperature has moved by a step, or has become known."""
     return np.isfinite(now) & ~(np.abs(np.subtract(now, before)) <= _TEMPERATURE_STEP_C)
-
-
-def _conflict(axis: SupportsIndex, away: float, sigma: float) -> Reason:
-    chance = max(2 * NormalDist().cdf(-abs(away / sigma)), 1e-12)
-    away, sigmas = float(away / MDPS), float(abs(away / sigma))
-    return reason("conflict", away, sigmas, axis, away=abs(away), chance=1 / chance)
