@@ -219,6 +219,11 @@ def test_warm_up_settles_and_is_said():
     assert "warm_up" in codes(state)
 
 
+def test_a_gap_before_the_first_block_of_a_stretch_makes_it_start_later():
+    stretch = Calibrator(KIND, RATE, now=Circumstances(since_power_on_s=3.0)).stretch.cut(5.0, None)
+    assert (stretch.start_s, stretch.filter.age_s, stretch.filter.time_s) == (5.0, 8.0, 0.0)
+
+
 def test_data_that_cannot_be_used_and_a_clock_that_jumps_are_told():
     for dead in (np.zeros((1000, 3)), np.full((1000, 3), np.nan)):
         assert "dead" in codes(finished(dead))

@@ -207,6 +207,15 @@ def test_a_stream_ends_when_the_target_is_reached():
     assert 8 <= last["seconds_at_rest"] <= 10  # 6.0^2 / 2^2 = 9 s
 
 
+def test_the_rate_of_a_stream_is_that_of_stamps_of_whole_milliseconds():
+    """400 Hz: the stamps alternate between steps of 2 and 3 ms; one of 60 samples is lost."""
+    rows = [f"{n * 5 // 2},{n % 7},{n % 5},{n % 3}" for n in range(2000) if n % 60 != 10]
+    header = "time (ms),gyro_x (mdps),gyro_y (mdps),gyro_z (mdps)"
+    done = streamed("--known-still", "--json", send="\n".join([header, *rows]))
+    last = json.loads(done.stdout.splitlines()[-1])
+    assert 4.4 < last["seconds_at_rest"] <= 5
+
+
 def test_a_stream_of_json_lines_with_rows_that_are_none():
     names = ("t (s)", "gyro_x (deg/s)", "gyro_y (deg/s)", "gyro_z (deg/s)")
     values = rates(5).round(3)

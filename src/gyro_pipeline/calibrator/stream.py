@@ -145,7 +145,9 @@ class Parser:
 
     def _infer_rate(self, times: NDArray[np.float64] | None) -> None:
         """Set the rate from the times of the first lines, where no option gives it."""
-        step = 0.0 if times is None else float(np.nanmedian(np.diff(times)))
+        steps = np.zeros(1) if times is None else np.diff(times[np.isfinite(times)])
+        usual = steps[(steps >= 0) & (steps <= 2 * np.median(steps))]  # a gap is longer
+        step = float(usual.mean()) if usual.size else 0.0  # stamps of whole ms alternate
         if self.rate_hz is None and not step > 0:
             text = "expected times that increase, in a column with a unit, or the rate, got neither"
             raise InputError(f"stream: {text}; give --rate, or --time-column and --time-units")

@@ -158,7 +158,9 @@ class Stretch:
             return self, 0, alarm
         conflict = before._first_conflict(filters[1 : count + 1], temperatures[1:])
         if conflict is None and alarm is None or conflict == len(innovations) - 1:
-            after = before._advance(blocks, filters[-1], monitor, temperatures[-1])
+            gravity = _gravity_sum(before.gravity, blocks.gravity)
+            after = replace(before, filter=filters[-1], monitor=monitor, gravity=gravity)
+            after = replace(after, temperature=temperatures[-1])
             return (after if conflict is None else after._drop_history()), len(innovations), None
         return self.update(blocks.part(0, count if conflict is None else conflict + 1))
 
@@ -176,23 +178,10 @@ class Stretch:
         moved = _temperature_moved(celsius, before.prior_c)
         return before, blocks.part(0, int(moved.argmax()) if moved.any() else None)
 
-    def _advance(
-        self, blocks: Blocks, after: Filter, monitor: RestMonitor, temperature: Temperature
-    ) -> "Stretch":
-        measured = blocks.gravity[np.isfinite(blocks.gravity).all(axis=1)]
-        added = np.hstack([measured, np.ones((len(measured), 1))])
-        return replace(
-            self,
-            filter=after,
-            monitor=monitor,
-            gravity=np.add.accumulate(np.vstack([self.gravity, added]))[-1],
-            temperature=temperature,
-        )
-
     def cut(self, seconds: float, motion: Reason | None) -> "Stretch":
         """The stretch after seconds without data, or after a motion."""
         if not self.blocks:
-            return self
+            return Stretch.start(self.setup, self.start_s + seconds)
         moved = replace(self, filter=self.filter.skip(seconds))
         if motion is None:
             return moved
@@ -359,6 +348,12 @@ class Stretch:
             count += _LOOKAHEAD_BLOCKS
         seconds = np.maximum(seconds, setup.least_s - self.seconds)
         return np.where(open_axes, seconds, np.inf)
+
+
+def _gravity_sum(before: Array, gravity: Array) -> Array:
+    """The sum of gravity over blocks, and their number, after more blocks."""
+    measured = gravity[np.isfinite(gravity).all(axis=1)]
+    return np.add.accumulate(np.vstack([before, np.c_[measured, np.ones(len(measured))]]))[-1]
 
 
 def _temperature_rise(start: float, end: float) -> float:
