@@ -214,6 +214,7 @@ def test_the_rate_of_a_stream_is_that_of_stamps_of_whole_milliseconds():
     done = streamed("--known-still", "--json", send="\n".join([header, *rows]))
     last = json.loads(done.stdout.splitlines()[-1])
     assert 4.4 < last["seconds_at_rest"] <= 5
+    assert "the first times show 100" in streamed("--rate", "50", send=text(rates(5))).stderr
 
 
 def test_a_stream_of_json_lines_with_rows_that_are_none():

@@ -296,6 +296,8 @@ def stream(port: str | None, baud: int, timeout: float, **values: Any) -> int:
     if calibrator is None:
         text = "expected lines of samples, got none; check the program that sends them"
         raise InputError(f"stream: {text}")
+    if parser.doubt:
+        _remark(parser.doubt)
     if parser.bad:
         _remark(f"{parser.bad} lines were of another shape and were left out")
     source = hashlib.sha256(f"{name} {job.opening['started_at']}".encode()).hexdigest()

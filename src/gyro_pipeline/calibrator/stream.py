@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from gyro_pipeline.conventions import InputError
 
 _HEADER_LINES = 20  # that columns, units and the rate are inferred from
+_MOST_OFF = 1.1  # factor between the given rate and that of the first times
 _OF_FILES = {"increments", "repeats", "row", "rows", "signed_bits", "time_is"}  # options
 
 Samples = list[Any]  # times (n,), rates (n, 3), accelerations (n, 3), temperatures (n,); or None
@@ -58,7 +59,8 @@ def lines_of(descriptor: int, timeout_s: float, say: Callable[[str], None]) -> I
 class Parser:
     """Finds the columns in the first lines, as the readers of files do, and parses all lines.
 
-    Without ``rate_hz``, the rate is inferred from the times. ``bad`` counts lines of another shape.
+    Without ``rate_hz``, the rate is inferred from the times. ``bad`` counts lines of another shape;
+    ``doubt`` says that the times contradict the rate.
 
     Raises:
         InputError: An option would change the samples of a file, but not those of a stream.
@@ -68,7 +70,7 @@ class Parser:
         for name in sorted(_OF_FILES & options.model_fields_set):
             text = f"--{name.replace('_', '-')}: expected a log file, got a stream"
             raise InputError(f"{text}; leave it out, or store the stream and use log")
-        self.options, self.rate_hz, self.bad = options, rate_hz, 0
+        self.options, self.rate_hz, self.bad, self.doubt = options, rate_hz, 0, ""
         self._names: list[str] = []
         self._split: Callable[[str], list[Any]] = str.split  # a line into the cells of the names
         self._parts: list[tuple[list[int], float, float]] = []  # columns, factor, offset
@@ -151,7 +153,10 @@ class Parser:
         if self.rate_hz is None and not step > 0:
             text = "expected times that increase, in a column with a unit, or the rate, got neither"
             raise InputError(f"stream: {text}; give --rate, or --time-column and --time-units")
-        self.rate_hz = self.rate_hz or float(f"{1 / step:.4g}")
+        measured = float(f"{1 / step:.4g}") if step > 0 else 0.0
+        self.rate_hz = given = self.rate_hz or measured
+        if measured and not 1 / _MOST_OFF < given / measured < _MOST_OFF:
+            self.doubt = f"--rate {given:g}: the first times show {measured:g} samples a second"
 
 
 def _times(file: Any) -> tuple[list[int], float, float]:
