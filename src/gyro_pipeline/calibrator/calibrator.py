@@ -262,7 +262,7 @@ class Calibrator:
         count, rate_hz = len(rates), self.setup.rate_hz
         if time_s is None:
             time_s = (round(self._last_time * rate_hz) + 1 + np.arange(count)) / rate_hz
-        accel = np.full((count, 3), np.nan) if accel_g is None else np.atleast_2d(accel_g)
+        accel = np.full((1, 3), np.nan) if accel_g is None else np.atleast_2d(accel_g)
         if np.size(time_s) != count or accel.shape not in (rates.shape, (1, 3)):
             text = "gyro_dps, time_s and accel_g: expected as many samples of each"
             raise InputError(f"{text}, got {count}, {np.size(time_s)} and the shape {accel.shape}")
@@ -273,8 +273,9 @@ class Calibrator:
         self.counts.update(samples=count, not_finite=int(np.sum(~finite)), zero=int(np.sum(zero)))
         if count and np.isfinite(rows[0, -1]):
             self._last_time = float(rows[0, -1])
+        good = finite & ~zero
         # an index would return another memory layout, and sums would then differ in the last bit
-        return np.compress(finite & ~zero, rows, axis=1)
+        return rows if good.all() else np.compress(good, rows, axis=1)
 
     def _process_blocks(self, rows: Array) -> Array:
         """Process whole blocks of rows without a gap; returns the remaining rows."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from gyro_pipeline.conventions import InputError
 
 _HEADER_LINES = 20  # that columns, units and the rate are inferred from
+_REGULAR = 0.8  # share of equal steps from which their median is the period of the samples
 _MOST_OFF = 1.1  # factor between the given rate and that of the first times
 _OF_FILES = {"increments", "repeats", "row", "rows", "signed_bits", "time_is"}  # options
 
@@ -148,8 +149,10 @@ class Parser:
     def _infer_rate(self, times: NDArray[np.float64] | None) -> None:
         """Set the rate from the times of the first lines, where no option gives it."""
         steps = np.zeros(1) if times is None else np.diff(times[np.isfinite(times)])
-        usual = steps[(steps >= 0) & (steps <= 2 * np.median(steps))]  # a gap is longer
-        step = float(usual.mean()) if usual.size else 0.0  # stamps of whole ms alternate
+        step = float(np.median(steps)) if steps.size else 0.0
+        if np.sum(np.abs(steps - step) < step / 10) < _REGULAR * steps.size:
+            near = steps[(steps >= 0) & (steps <= 2 * step)]  # stamps of whole ms alternate
+            step = near.sum() / max(near.size, 1)
         if self.rate_hz is None and not step > 0:
             text = "expected times that increase, in a column with a unit, or the rate, got neither"
             raise InputError(f"stream: {text}; give --rate, or --time-column and --time-units")

@@ -158,9 +158,13 @@ class Stretch:
             return self, 0, alarm
         conflict = before._first_conflict(filters[1 : count + 1], temperatures[1:])
         if conflict is None and alarm is None or conflict == len(innovations) - 1:
-            gravity = _gravity_sum(before.gravity, blocks.gravity)
-            after = replace(before, filter=filters[-1], monitor=monitor, gravity=gravity)
-            after = replace(after, temperature=temperatures[-1])
+            after = replace(
+                before,
+                filter=filters[-1],
+                monitor=monitor,
+                gravity=_gravity_sum(before.gravity, blocks.gravity),
+                temperature=temperatures[-1],
+            )
             return (after if conflict is None else after._drop_history()), len(innovations), None
         return self.update(blocks.part(0, count if conflict is None else conflict + 1))
 
