@@ -9,6 +9,7 @@ import pytest
 
 from gyro_pipeline.calibrator import Calibration, Calibrator, Circumstances
 from gyro_pipeline.calibrator.device_types import read_type, type_of
+from gyro_pipeline.conventions import InputError
 
 RATE = 100.0
 BIAS = np.array([0.412, -0.104, 0.087])  # three different axes
@@ -115,6 +116,20 @@ def test_how_a_recording_is_cut_changes_no_bit(seed=1):
     assert {"cut", "attitude", "gap", "not_finite", "conflict"} <= codes(one)
 
 
+def test_a_first_sample_alone_changes_neither_a_bit_nor_the_order_of_what_is_said():
+    """An index leaves lost samples out in another memory layout; an axis dies after a turn."""
+    samples = still(20)
+    samples[1500], samples[800:900, 2] = np.nan, samples[800:900, 2] + 30
+    samples[1600:, 0] = 0.5
+    whole, parts = fed(samples, UNKNOWN), Calibrator(UNKNOWN, RATE)
+    for part in (samples[:1], samples[1:1400], samples[1400:]):
+        parts.update(None, part)
+    one, other = whole.finish(), parts.finish()
+    np.testing.assert_array_equal(one.sigma_dps, other.sigma_dps)
+    assert one.reasons == other.reasons
+    assert [reason.code for reason in one.reasons][:2] == ["dead", "attitude"]
+
+
 def test_seconds_left_are_the_ones_it_takes():
     samples = still(60)
     calibrator = Calibrator(KIND, RATE, target_dps=1.0001e-3)
@@ -204,6 +219,11 @@ def test_warm_up_settles_and_is_said():
     assert "warm_up" in codes(state)
 
 
+def test_a_gap_before_the_first_block_of_a_stretch_makes_it_start_later():
+    stretch = Calibrator(KIND, RATE, now=Circumstances(since_power_on_s=3.0)).stretch.cut(5.0, None)
+    assert (stretch.start_s, stretch.filter.age_s, stretch.filter.time_s) == (5.0, 8.0, 0.0)
+
+
 def test_data_that_cannot_be_used_and_a_clock_that_jumps_are_told():
     for dead in (np.zeros((1000, 3)), np.full((1000, 3), np.nan)):
         assert "dead" in codes(finished(dead))
@@ -214,6 +234,21 @@ def test_data_that_cannot_be_used_and_a_clock_that_jumps_are_told():
     state = finished(still(20), time_s=time_s)
     assert "clock" in codes(state)
     assert state.seconds_at_rest >= 18
+
+
+def test_arguments_that_do_not_fit_are_refused():
+    samples = still(1)
+    for bad in ({"time_s": 0.0}, {"accel_g": UP[:9]}, {"accel_g": samples.T}):
+        with pytest.raises(InputError, match="expected as many samples of each"):
+            Calibrator(KIND, RATE).update(**{"time_s": None, "gyro_dps": samples, **bad})
+    for now in (Circumstances(latitude_deg=np.nan), Circumstances(since_power_on_s=-5.0)):
+        with pytest.raises(InputError, match="(latitude|since_power_on): expected"):
+            Calibrator(KIND, RATE, now=now)
+
+
+def test_a_temperature_that_is_infinite_is_not_measured():
+    state = finished(still(2), warmth=np.r_[np.inf, np.full(199, 25.0)])
+    assert state.stretch.temperature[:4] == (3, 25.0, 25.0, 25.0)
 
 
 def test_a_temperature_that_moves_makes_the_bias_now_less_certain():

@@ -60,6 +60,12 @@ def test_a_log_needs_no_configuration(csv):
         assert float(row.split()[1]) == pytest.approx(bias, abs=5e-3)
 
 
+def test_a_log_that_is_too_short_is_not_taken_for_a_stored_value(csv):
+    result = run("log", csv(rates(1)[:60]), "--type", "memsense")
+    assert (result.exit_code, "Too short" in result.stdout) == (4, True)
+    assert "stored value" not in result.stdout
+
+
 @pytest.mark.slow
 def test_six_logs_make_a_history_that_the_next_one_uses_but_not_the_same_one(csv):
     about = ("--device", "B17", "--type", "memsense", "--same-heading")
@@ -130,6 +136,9 @@ def test_plan_says_how_long_or_that_it_is_not_possible():
 
 
 def test_a_bias_that_was_typed_in_stays_until_it_is_forgotten(csv):
+    for bad in (("nan", "-0.1", "0.09"), ("0.5", "-0.1", "0.09", "--sigma", "-1")):
+        result = run("devices", "set", "B17", *bad)
+        assert (result.exit_code, "expected three rates" in result.stderr) == (2, True)
     typed = ("0.5", "-0.1", "0.09", "--sigma", "0.4", "--type", "memsense")
     assert run("devices", "set", "B17", *typed).exit_code == 0
     for seed in range(2):
@@ -137,6 +146,9 @@ def test_a_bias_that_was_typed_in_stays_until_it_is_forgotten(csv):
     answer, _ = said("log", csv(rates(2)), "--device", "B17", "--same-heading", "--no-store")
     assert answer["history"][0] == "dropped"  # x was typed in wrong
     assert "set by hand" in run("log", csv(rates(2)), "--device", "B17", "--no-store").stdout
+    run("devices", "set", "B18", *typed[:3])  # one block of unknown noise has no bound, but JSON
+    answer, _ = said("log", csv(rates(1)[:60]), "--device", "B18")
+    assert [None] * 3 != answer["bias_dps"]
     run("devices", "forget", "B17", "set")
     answer, _ = said("log", csv(rates(2)), "--device", "B17", "--same-heading", "--no-store")
     assert answer["history"] == ["used"] * 3
@@ -165,6 +177,8 @@ def test_notes_and_withdrawals_are_appended(csv, tmp_path):
     told = ["knocked" in {reason["code"] for reason in r["reasons"]} for r in (before, knocked)]
     assert told == [False, True]
     assert "note of a knock: fell" in run("devices", "show", "B17").stdout
+    for start in ("", "no.csv"):
+        assert "forget: expected one of still.csv" in run("devices", "forget", "B17", start).stderr
     assert run("devices", "forget", "B17", "still.csv").exit_code == 0
     assert "does not count" in run("devices", "show", "B17").stdout
     assert run("devices", "save", "B17", tmp_path / "b17.json").exit_code == 0
@@ -193,6 +207,16 @@ def test_a_stream_ends_when_the_target_is_reached():
     assert 8 <= last["seconds_at_rest"] <= 10  # 6.0^2 / 2^2 = 9 s
 
 
+def test_the_rate_of_a_stream_is_that_of_stamps_of_whole_milliseconds():
+    """400 Hz: the stamps alternate between steps of 2 and 3 ms; one of 60 samples is lost."""
+    rows = [f"{n * 5 // 2},{n % 7},{n % 5},{n % 3}" for n in range(2000) if n % 60 != 10]
+    header = "time (ms),gyro_x (mdps),gyro_y (mdps),gyro_z (mdps)"
+    done = streamed("--known-still", "--json", send="\n".join([header, *rows]))
+    last = json.loads(done.stdout.splitlines()[-1])
+    assert 4.4 < last["seconds_at_rest"] <= 5
+    assert "the first times show 100" in streamed("--rate", "50", send=text(rates(5))).stderr
+
+
 def test_a_stream_of_json_lines_with_rows_that_are_none():
     names = ("t (s)", "gyro_x (deg/s)", "gyro_y (deg/s)", "gyro_z (deg/s)")
     values = rates(5).round(3)
@@ -215,6 +239,8 @@ def test_a_sensor_that_stops_sends_no_times_or_begins_within_a_line_is_said():
     header = "gyro_x (deg/s),gyro_y (deg/s),gyro_z (deg/s)"
     rows = "\n".join([header, *(["0.1,0.2,0.3"] * 30)])
     assert "give --rate" in streamed(send=rows).stderr
+    done = streamed("--increments", "true", send=text(rates(5)))  # not what a stream divides
+    assert (done.exit_code, "--increments: expected a log file" in done.stderr) == (2, True)
     done = streamed(send='{"t (s)": 0.0, "gyro_x (d\n' + '{"t (s)": 0.01}\n' * 30)
     assert (done.exit_code, """got '{"t (s)": 0.0, "gyro_x (d'""" in done.stderr) == (2, True)
 
@@ -247,6 +273,8 @@ def test_a_picture_is_drawn_and_a_failure_loses_no_calibration(csv, tmp_path, mo
         result = run(*about, tmp_path / name)
         assert (result.exit_code, result.stdout, words in result.stderr) == (2, "", True)
 
+    result = run(*about, tmp_path / "a.png", csv(rates(5), "b.csv"))
+    assert (result.exit_code, "expected one log, got 2" in result.stderr) == (2, True)
     assert run(*about, tmp_path / "a.png", "--no-store").exit_code == 0
     assert (tmp_path / "a.png").stat().st_size > 10_000
     full = Mock(side_effect=OSError(28, "No space left on device"))

@@ -191,11 +191,19 @@ def test_flicker_that_short_recordings_show_as_turn_on_spread_is_counted_once():
     np.testing.assert_allclose(content["turn_on_mdps"], expected, rtol=1e-3)
 
 
-def test_every_shipped_type_is_read_and_each_number_has_a_source():
+def test_every_shipped_type_is_read_and_each_number_has_a_source(tmp_path):
     with pytest.raises(InputError, match="expected consumer, dot, memsense, got 'dott'"):
         read_type("dott")
     with pytest.raises(InputError, match=r"here: noise: unexpected keyword argument, got 3; corr"):
         type_of({"noise": 3}, "here")
+    for key in ("noise_mdps_rts", "turn_on_factor"):
+        with pytest.raises(InputError, match=f"here: {key}: expected more than 0, got 0"):
+            type_of({key: 0}, "here")
+    (tmp_path / "types").mkdir()
+    for text in (b"[1]", b"\xff"):
+        (tmp_path / "types/bad.json").write_bytes(text)
+        with pytest.raises(InputError, match=r"bad\.json: .*; correct it"):
+            read_type("bad", tmp_path)
     for path in (files("gyro_pipeline.calibrator") / "types").iterdir():
         content = json.loads(path.read_text())
         assert read_type(content["type"]).noise_freedom > 0

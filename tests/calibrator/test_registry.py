@@ -11,7 +11,7 @@ from dataclasses import asdict
 import pytest
 
 from gyro_pipeline.calibrator import Calibration, Calibrator, registry
-from gyro_pipeline.calibrator.registry import Device, RegistryError
+from gyro_pipeline.calibrator.registry import Device, RegistryError, Settings
 from gyro_pipeline.conventions import InputError
 
 
@@ -108,17 +108,21 @@ def test_a_device_moves_in_one_file_and_is_not_doubled(device, tmp_path):
     for _ in range(2):
         other.restore(content)
     assert other.lines() == device.lines()
-    assert other.settings() == {"type": "dot"}
+    assert other.settings() == Settings("dot")
 
 
 def test_names_that_are_no_folder_and_settings_that_cannot_be_read_are_refused(device, tmp_path):
     for name in ("types", "../up", "x" * 65):
         with pytest.raises(InputError, match="device: expected letters, digits"):
             Device(tmp_path, name)
-    for text in ("type = ", "latitud = 32.0"):
+    expected, north, perhaps = "expected .*", "latitude: .*, got 'N'", "mounted: .*, got 'perhaps'"
+    refused = {"type = ": expected, "latitud = 32.0": expected, "latitude = 'N'": north}
+    for text, words in {**refused, "mounted = 'perhaps'": perhaps}.items():
         device.settings_path.write_text(text)
-        with pytest.raises(InputError, match=r"device\.toml: expected .*; correct it"):
+        with pytest.raises(InputError, match=rf"device\.toml: {words}; correct it"):
             device.settings()
+    device.settings_path.write_text('mounted = "false"')  # a text, which was once taken for true
+    assert not device.settings().mounted
 
 
 def test_what_device_toml_says_and_what_options_overrule(device, tmp_path):

@@ -21,7 +21,7 @@ from gyro_pipeline.calibrator.history import MOVING, STILL, UNSURE, Calibration,
 from gyro_pipeline.calibrator.reasons import Reason, reason, reasons_of, unit_reason
 from gyro_pipeline.calibrator.rest import ATTITUDE, MOTION, NOISE, Alarm, Blocks
 from gyro_pipeline.calibrator.stretch import BLOCK_S, LEAST_S, Setup, Stretch
-from gyro_pipeline.conventions import AXES, MDPS, InputError
+from gyro_pipeline.conventions import MDPS, InputError
 from gyro_pipeline.quality.rest import Mask
 
 _JUMP_S = 3600.0  # a clock that moves by more has jumped
@@ -38,19 +38,20 @@ class State:
 
     stretch: Stretch  # that the result is from
     counts: Counter[str]  # samples, gaps, jumps of the clock, samples left out
-    ended: dict[str, Reason]  # why stretches ended, the last reason of each code; dead axes
+    ended: dict[str, Reason]  # why stretches ended, the last reason of each code
+    dead: Mask  # whether an axis has not changed for a while, (3,)
     rest: str  # STILL, MOVING or UNSURE
     time_s: float  # since the first sample
 
     @property
     def bias_dps(self) -> Array:
         """The current bias, deg/s; the settled one where the device warms up."""
-        return self.stretch.bias
+        return self.stretch.result[0]
 
     @cached_property
     def sigma_dps(self) -> Array:
         """Standard deviation of the bias: 1.96 of it are the 95 % limits."""
-        return np.sqrt(self.stretch.variance)
+        return np.sqrt(self.stretch.result[1])
 
     @property
     def seconds_at_rest(self) -> float:
@@ -73,13 +74,10 @@ class State:
         """Whether the device is at rest and the target is reached."""
         return self.rest == STILL and self.reached
 
-    @cached_property
+    @property
     def seconds_left(self) -> Array:
         """Seconds at rest until the target; infinite where never, NaN without a target."""
-        setup = self.stretch.setup
-        if np.isinf(setup.target_dps):
-            return np.full(3, np.nan)
-        return np.maximum(self.stretch.seconds_left(), setup.least_s - self.seconds_at_rest)
+        return self.stretch.seconds_left
 
     @cached_property
     def reasons(self) -> tuple[Reason, ...]:
@@ -108,11 +106,16 @@ class Calibrator:
             got = f"{target_dps / MDPS:g}"
             raise InputError(f"target: expected more than 0 mdps, such as 0.5, got {got}")
         target_dps, now = np.inf if target_dps is None else target_dps, now or Circumstances()
+        if now.latitude_deg is not None and not abs(now.latitude_deg) <= 90:  # noqa: PLR2004
+            raise InputError(f"latitude: expected -90 to 90 degrees, got {now.latitude_deg:g}")
+        if now.since_power_on_s is not None and not 0 <= now.since_power_on_s < np.inf:
+            got = f"{now.since_power_on_s:g}"
+            raise InputError(f"since_power_on: expected 0 s or more, got {got}")
         self.setup = Setup(device_type, float(rate_hz), tuple(history), now, target_dps)
         self.counts, self.ended = Counter[str](), dict[str, Reason]()
-        self._constant = np.zeros(3)  # blocks in a row without any change
+        self._constant, self._dead = np.zeros(3), np.zeros(3, bool)  # blocks without any change
         self._pending = np.empty((_COLUMNS, 0))  # samples of an incomplete block
-        self._last_time: float | None = None
+        self._last_time = -1 / rate_hz
         self._end: float | None = None  # end of the last block, on the clock of the samples
         self._min_rest_s = 0.0  # longer than any stretch that turned out not to be at rest
         self._block_count, self._gaps_s = 0, 0.0
@@ -153,21 +156,21 @@ class Calibrator:
         Raises:
             InputError: A file in the registry is invalid.
         """
-        from gyro_pipeline.calibrator.registry import Device, registry_folder  # noqa: PLC0415
+        from gyro_pipeline.calibrator.registry import Device, Settings, registry_folder  # noqa: PLC0415
 
         folder = registry_folder(registry)
         stored = None if device is None else Device(folder, device)
-        settings = stored.settings() if stored else {}
+        settings = stored.settings() if stored else Settings()
         now = Circumstances(
             started_at,
             since_power_on_s,
-            bool(settings.get("mounted") if same_heading is None else same_heading),
-            settings.get("latitude") if latitude_deg is None else latitude_deg,
+            settings.mounted if same_heading is None else same_heading,
+            settings.latitude if latitude_deg is None else latitude_deg,
             known_still,
             stored.attempt(without) if stored else 1,
             stored.knocks() if stored else 0,
         )
-        resolved = read_type(device_type or settings.get("type"), folder)
+        resolved = read_type(device_type or settings.type, folder)
         history = stored.history(without) if stored else ()
         return cls(resolved, rate_hz, history, now, target_mdps and target_mdps * MDPS)
 
@@ -184,7 +187,7 @@ class Calibrator:
             temperature_c: Temperatures, (n,) or a number, degrees Celsius.
 
         Raises:
-            InputError: The samples do not have three axes.
+            InputError: The samples do not have three axes, or there is not one time for each.
         """
         rows = self._rows(time_s, gyro_dps, accel_g, temperature_c)
         if rows.size:
@@ -210,7 +213,7 @@ class Calibrator:
         rest = self._rest(stretch, finished)
         if finished and rest == MOVING:
             stretch = Stretch.start(self.setup, self.time_s)
-        return State(stretch, self.counts.copy(), self.ended, rest, self.time_s)
+        return State(stretch, self.counts.copy(), self.ended, self._dead, rest, self.time_s)
 
     @property
     def best(self) -> Stretch:
@@ -256,22 +259,23 @@ class Calibrator:
         rates = np.atleast_2d(np.asarray(gyro_dps, np.float64))
         if rates.ndim != 2 or rates.shape[1] != 3:  # noqa: PLR2004
             raise InputError(f"gyro_dps: expected (n, 3) or (3,) deg/s, got {np.shape(gyro_dps)}")
-        rows, rate_hz = np.full((_COLUMNS, len(rates)), np.nan), self.setup.rate_hz
+        count, rate_hz = len(rates), self.setup.rate_hz
         if time_s is None:
-            first = -1 if self._last_time is None else round(self._last_time * rate_hz)
-            time_s = (first + 1 + np.arange(len(rates))) / rate_hz
-        rows[0], rows[1:4] = time_s, rates.T
-        if accel_g is not None:
-            rows[4:7] = np.atleast_2d(accel_g).T
-        if temperature_c is not None:
-            rows[7] = temperature_c
+            time_s = (round(self._last_time * rate_hz) + 1 + np.arange(count)) / rate_hz
+        accel = np.full((1, 3), np.nan) if accel_g is None else np.atleast_2d(accel_g)
+        if np.size(time_s) != count or accel.shape not in (rates.shape, (1, 3)):
+            text = "gyro_dps, time_s and accel_g: expected as many samples of each"
+            raise InputError(f"{text}, got {count}, {np.size(time_s)} and the shape {accel.shape}")
+        rows = np.empty((_COLUMNS, count))
+        rows[0], rows[1:4], rows[4:7] = np.ravel(time_s), rates.T, accel.T
+        rows[7] = np.nan if temperature_c is None else temperature_c
         finite, zero = np.isfinite(rows[:4]).all(axis=0), ~rows[1:4].any(axis=0)
-        invalid = {"not_finite": int(np.sum(~finite)), "zero": int(np.sum(zero))}
-        self.counts.update(samples=len(rates), **invalid)
-        if len(rates) and np.isfinite(rows[0, -1]):
+        self.counts.update(samples=count, not_finite=int(np.sum(~finite)), zero=int(np.sum(zero)))
+        if count and np.isfinite(rows[0, -1]):
             self._last_time = float(rows[0, -1])
         good = finite & ~zero
-        return rows if good.all() else rows[:, good]
+        # an index would return another memory layout, and sums would then differ in the last bit
+        return rows if good.all() else np.compress(good, rows, axis=1)
 
     def _process_blocks(self, rows: Array) -> Array:
         """Process whole blocks of rows without a gap; returns the remaining rows."""
@@ -289,8 +293,7 @@ class Calibrator:
     def _find_dead_axes(self, constant: Mask) -> None:
         for axes in constant if constant.any() or self._constant.any() else ():
             self._constant = np.where(axes, self._constant + 1, 0)
-            for axis in np.flatnonzero(self._constant >= _DEAD_BLOCKS):
-                self.ended = {**self.ended, AXES[axis]: reason("dead", axis=axis)}
+            self._dead = self._dead | (self._constant >= _DEAD_BLOCKS)
 
     def _cross_gap(self, start: float) -> None:
         """Move on to the time at which rows start, if the last block ended at another one."""
@@ -368,7 +371,7 @@ class Calibrator:
         if self.setup.now.known_still:
             return STILL if stretch.blocks else UNSURE
         enough = stretch.seconds >= max(min(self.setup.least_s, 2 * LEAST_S), self._min_rest_s)
-        ended = bool(self.ended.keys() - {ATTITUDE, *AXES})
+        ended = bool(self.ended.keys() - {ATTITUDE})
         if finished:
             half = self._ended_rest_s + self.stretch.seconds >= self.time_s / 2
             cut = any(note.code == "cut" for note in stretch.notes)
@@ -384,4 +387,5 @@ def _blocks(samples: Array) -> Blocks:
     gravity_variances = np.full(samples.shape[1], np.nan)
     if np.isfinite(means[4:7]).any():
         gravity_variances = samples[4:7].var(axis=2, ddof=1).mean(axis=0)
-    return Blocks(means[1:4].T, variances.T, means[4:7].T, gravity_variances, means[7])
+    celsius = np.where(np.isfinite(means[7]), means[7], np.nan)
+    return Blocks(means[1:4].T, variances.T, means[4:7].T, gravity_variances, celsius)

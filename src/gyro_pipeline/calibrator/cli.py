@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from datetime import datetime
+from functools import reduce
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -46,9 +47,19 @@ def _flag(name: str) -> str:
     return "--scale" if name == "scale_dps" else "--" + name.replace("_", "-")
 
 
+def _existing_device(context: click.Context, _: click.Parameter, name: str) -> Device:
+    device = Device(context.params["registry"], name)
+    if not device.folder.is_dir():
+        listed = ", ".join(d.name for d in Device.all(context.params["registry"])) or "none"
+        raise InputError(f"device: expected one of {listed}, got {name!r}; see devices list")
+    return device
+
+
 _REGISTRY = option(
-    "--registry", help="folder of the registry", callback=lambda _, __, path: registry_folder(path)
-)
+    "--registry", help="folder of the registry", is_eager=True,  # the device needs it
+    callback=lambda _, __, path: registry_folder(path),
+)  # fmt: skip
+_DEVICE = argument("device", metavar="NAME", callback=_existing_device)
 _TYPE = option("--type", "device_type", help="type of the device: noise, turn-on spread, ...")
 _JSON = option("--json", "as_json", is_flag=True, help="one JSON object")
 _OPENING = (  # arguments of Calibrator.open
@@ -77,12 +88,8 @@ _READING = tuple(
 
 
 def _with(*options: Any) -> Callable[[Any], Any]:
-    def add(command: Any) -> Any:
-        for add_option in reversed(options):
-            command = add_option(command)
-        return command
-
-    return add
+    """A decorator that adds parameters, which the help lists in this order."""
+    return lambda command: reduce(lambda done, add: add(done), reversed(options), command)
 
 
 def _read_reader_options(texts: dict[str, str]) -> Any:
@@ -178,6 +185,8 @@ def _job(store: bool, **values: Any) -> SimpleNamespace:
 def log(files: tuple[Path, ...], **values: Any) -> int:
     """Calibrate from log files, one after the other."""
     job = _job(**values)
+    if job.plot and len(files) > 1:
+        raise InputError(f"--plot: expected one log, got {len(files)}; plot them one by one")
     return max(_code_of(_calibrate, path, job) for path in files)
 
 
@@ -287,6 +296,8 @@ def stream(port: str | None, baud: int, timeout: float, **values: Any) -> int:
     if calibrator is None:
         text = "expected lines of samples, got none; check the program that sends them"
         raise InputError(f"stream: {text}")
+    if parser.doubt:
+        _remark(parser.doubt)
     if parser.bad:
         _remark(f"{parser.bad} lines were of another shape and were left out")
     source = hashlib.sha256(f"{name} {job.opening['started_at']}".encode()).hexdigest()
@@ -330,44 +341,33 @@ def devices() -> None:
     """List and manage the devices of the registry."""
 
 
-def _existing_device(registry: Path, name: str) -> Device:
-    device = Device(registry, name)
-    if not device.folder.is_dir():
-        listed = ", ".join(d.name for d in Device.all(registry)) or "none"
-        raise InputError(f"device: expected one of {listed}, got {name!r}; see devices list")
-    return device
-
-
 @devices.command("list")
 @_with(_REGISTRY, _JSON)
 def list_devices(registry: Path, as_json: bool) -> None:
     """List devices, their types and the number of calibrations that count."""
     rows = [
-        {"device": d.name, "type": d.settings().get("type"), "calibrations": len(d.history())}
+        {"device": d.name, "type": d.settings().type, "calibrations": len(d.history())}
         for d in Device.all(registry)
     ]
     _print(as_json, rows, output.device_list(rows, type_names(registry)))
 
 
 @devices.command()
-@argument("name")
-@_with(_REGISTRY, _JSON)
-def show(name: str, registry: Path, as_json: bool) -> None:
+@_with(_DEVICE, _REGISTRY, _JSON)
+def show(device: Device, as_json: bool, **_: Any) -> None:
     """Show level over time, turn-on spread, walk, temperature slope, noise and health."""
-    device = _existing_device(registry, name)
     content = {"lines": device.lines(), "model": device.model()}
     _print(as_json, content, output.device_table(device))
 
 
 @devices.command()
-@argument("name")
+@_DEVICE
 @argument("text")
 @option("--knocked", is_flag=True, help="it was knocked or dropped: what came before counts less")
 @_REGISTRY
-def note(name: str, text: str, knocked: bool, registry: Path) -> None:
+def note(device: Device, text: str, knocked: bool, **_: Any) -> None:
     """Append a note to the history of a device."""
-    line = {"event": "note", "time": time.time(), "text": text, "knocked": knocked}
-    _existing_device(registry, name).append(line)
+    device.append({"event": "note", "time": time.time(), "text": text, "knocked": knocked})
 
 
 @devices.command("set", context_settings={"ignore_unknown_options": True})  # -0.1 is a number
@@ -380,6 +380,9 @@ def set_bias(
     device_type: str | None,
 ) -> None:  # fmt: skip
     """Set a bias, deg/s about x, y and z, which replaces the history until it is forgotten."""
+    if not (np.isfinite(bias_dps).all() and 0 <= sigma < np.inf):
+        text = f"{' '.join(map(str, bias_dps))} --sigma {sigma:g}"
+        raise InputError(f"set: expected three rates in deg/s, and a sigma from 0, got {text}")
     device, variance = Device(registry, name), (sigma * MDPS) ** 2
     device.create(device_type)
     typed: Any = {"time": time.time(), "hash": SET, "source": SET, "event": SET}
@@ -387,20 +390,19 @@ def set_bias(
 
 
 @devices.command()
-@argument("name")
+@_DEVICE
 @argument("source", required=False)
 @option("--all", "everything", is_flag=True, help="remove the device's folder")
 @_REGISTRY
-def forget(name: str, source: str | None, everything: bool, registry: Path) -> None:
+def forget(device: Device, source: str | None, everything: bool, **_: Any) -> None:
     """Withdraw a calibration by the name or hash of its file; it stays stored without counting."""
-    device = _existing_device(registry, name)
     if everything:
         shutil.rmtree(device.folder)
         return
     stored = device.calibrations()
-    matches = {key for key in stored if source and key.startswith(source)}
-    hashes = matches | {key for key, c in stored.items() if c.source == source}
-    if not hashes:
+    by_name = [key for key, c in stored.items() if c.source == source]
+    hashes = by_name or [key for key in stored if source and key.startswith(source)]
+    if not by_name and len(hashes) != 1:
         listed = ", ".join(c.source for c in stored.values()) or "none"
         raise InputError(f"forget: expected one of {listed}, or a hash, got {source!r}; or --all")
     for withdrawn in hashes:
@@ -408,13 +410,12 @@ def forget(name: str, source: str | None, everything: bool, registry: Path) -> N
 
 
 @devices.command()
-@argument("name")
+@_DEVICE
 @argument("file", type=click.Path(dir_okay=False, path_type=Path))
 @_REGISTRY
-def save(name: str, file: Path, registry: Path) -> None:
+def save(device: Device, file: Path, **_: Any) -> None:
     """Write a device to a file."""
-    content = _existing_device(registry, name).content()
-    file.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
+    file.write_text(json.dumps(device.content(), indent=1) + "\n", "utf-8")
 
 
 @devices.command()

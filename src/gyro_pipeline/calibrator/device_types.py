@@ -22,8 +22,10 @@ from gyro_pipeline.conventions import MDPS, InputError
 if TYPE_CHECKING:
     from gyro_pipeline.physics.recording_model import RecordingModel
 
-Axes = float | tuple[float, float, float]
-"""One number for all axes, or one each for x, y and z."""
+Axes = float | tuple[float, float, float]  # for all axes, or for x, y and z
+
+
+_POSITIVE = "noise_mdps_rts", "turn_on_factor", "walk_factor"
 
 
 @dataclass(frozen=True)
@@ -99,9 +101,10 @@ def read_type(name: str | None, registry: Path | None = None) -> DeviceType:
     for folder in _folders(registry):
         if (path := folder / f"{name}.json").is_file():
             try:
-                return type_of(json.loads(path.read_text("utf-8")), str(path))
-            except json.JSONDecodeError as error:
+                content = json.loads(path.read_text("utf-8"))
+            except ValueError as error:
                 raise InputError(f"{path}: expected JSON, but: {error}; correct it") from error
+            return type_of(content, str(path))
     raise InputError(
         f"type: expected {', '.join(type_names(registry))}, got {name!r}; "
         "write a file types/<type>.json in the registry, or leave --type out"
@@ -121,23 +124,26 @@ def _folders(registry: Path | None) -> list[Any]:
 
 def type_of(content: Mapping[str, Any], where: str) -> DeviceType:
     """The device type that the content of a file describes."""
-    return validated(DeviceType, content, where)
+    device_type: DeviceType = validated(DeviceType, content, where)
+    positive = {name: getattr(device_type, name) for name in _POSITIVE}
+    if device_type.warm_up is not None:
+        positive["warm_up: time_constant_s"] = device_type.warm_up.time_constant_s
+    for name, value in positive.items():
+        if value is not None and not np.all(np.greater(value, 0)):
+            raise InputError(f"{where}: {name}: expected more than 0, got {value}; correct it")
+    return device_type
 
 
 def validated(kind: Any, content: Mapping[str, Any], where: str) -> Any:
-    """A dataclass made from the content of a file.
-
-    Raises:
-        InputError: A key is unknown, or a value is invalid.
-    """
+    """A dataclass made from the content of a file; an ``InputError`` names the first bad key."""
     from pydantic import ValidationError  # noqa: PLC0415
 
     try:
         return _adapter(kind).validate_python(content)
     except ValidationError as error:
         first = error.errors()[0]
-        key, text = str(first["loc"][0]), first["msg"].lower()
-        raise InputError(f"{where}: {key}: {text}, got {first['input']!r}; correct it") from error
+        text = ": ".join([where, *map(str, first["loc"][:1]), first["msg"].lower()])
+        raise InputError(f"{text}, got {first['input']!r}; correct it") from error
 
 
 @cache

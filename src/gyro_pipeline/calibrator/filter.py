@@ -26,9 +26,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-FLICKER_S = 120.0
-"""Flicker counts down to one cycle in twice this time; slower flicker is turn-on bias."""
-
+FLICKER_S = 120.0  # slower flicker than a cycle in twice this time is turn-on bias
 # Three AR(1) processes. Their block means have, in estimates from 1 to 30 s, the covariance of
 # B = 1 in recordings of FLICKER_S (tests/calibrator/test_filter.py).
 _TIME_CONSTANTS_S = np.array([0.19990, 1.57091, 13.58328])

@@ -26,18 +26,11 @@ from gyro_pipeline.calibrator.filter import Array
 from gyro_pipeline.calibrator.reasons import Reason, reason
 from gyro_pipeline.conventions import MDPS
 
-EARTH_DPS = 4.178e-3
-"""The Earth's rate, 15.041 deg/h."""
+STILL, MOVING, UNSURE = "still", "moving", "unsure"  # unsure: too few blocks to say
+USED, DROPPED, NONE = "used", "dropped", "none"  # how the history was treated on an axis
 
-SAME_ATTITUDE_DEG = 5.0
-"""Attitudes count as different where they differ by more."""
-
-STILL, MOVING, UNSURE = "still", "moving", "unsure"
-"""At rest, not at rest, or too few blocks to say."""
-
-USED, DROPPED, NONE = "used", "dropped", "none"
-"""How the history was treated on an axis."""
-
+EARTH_DPS = 4.178e-3  # the Earth's rate, 15.041 deg/h
+_SAME_ATTITUDE_DEG = 5.0  # attitudes count as different where they differ by more
 _DAY_S = 86400.0
 _GRID = (11, 9)  # points of tau and of the walk, over 2.5 standard deviations on both sides
 _MAX_CALIBRATIONS = 100  # the latest ones are used
@@ -45,8 +38,7 @@ _MIN_DPS = 1e-3 * MDPS
 _MIN_UNKNOWN_C = 5.0  # the least distance of an unknown temperature from those of the history
 
 Triple = tuple[float, float, float]
-Fitted = dict[str, tuple[float, float]]
-"""Level, tau, walk and slope of an axis, each with its standard deviation."""
+Fitted = dict[str, tuple[float, float]]  # level, tau, walk and slope of an axis, each with its σ
 
 
 @dataclass(frozen=True)
@@ -321,8 +313,8 @@ def _earth_rate_variance(
     ups, up, latitude = [c.up for c in past if c.up is not None], now.up, now.latitude_deg
     before = unit(np.sum(ups, axis=0)) if ups else None
     turned = 0.0 if before is None or up is None else angle_deg(up, before)
-    if turned > SAME_ATTITUDE_DEG:
-        cause = reason("attitude history", turned, SAME_ATTITUDE_DEG)
+    if turned > _SAME_ATTITUDE_DEG:
+        cause = reason("attitude history", turned, _SAME_ATTITUDE_DEG)
     elif now.same_heading:
         return np.zeros(3), []
     else:
@@ -333,7 +325,7 @@ def _earth_rate_variance(
         variance = horizontal * (1 - (up**2 + before**2) / 2)
         if latitude is None:
             variance = variance + (EARTH_DPS * (up - before)) ** 2
-    if before is not None and max(angle_deg(u, before) for u in ups) > SAME_ATTITUDE_DEG:
+    if before is not None and max(angle_deg(u, before) for u in ups) > _SAME_ATTITUDE_DEG:
         variance = np.maximum(variance - tau_squared, 0)
     return variance, [cause]
 

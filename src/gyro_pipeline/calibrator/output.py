@@ -15,9 +15,7 @@ from gyro_pipeline.calibrator.history import DROPPED, NONE, STILL, USED
 from gyro_pipeline.calibrator.registry import SET, Device
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 
-HEADING_DEG = 3.6
-"""Drift of the heading in degrees per hour for 1 mdps."""
-
+_HEADING_DEG = 3.6  # drift of the heading in an hour for 1 mdps
 _IN_TEXT = {"conflict", "cut", "floor", "rotation_bound"}  # reasons that the text contains
 
 
@@ -48,7 +46,8 @@ def as_text(state: State) -> Iterator[str]:
     if state.rest != STILL:
         if np.isinf(sigmas).all():
             return
-        yield "The stored value is still the one to use:"
+        stored = "The stored value is still the one to use:"
+        yield "Too short to tell rest from motion; so far:" if state.stretch.blocks else stored
     yield f"{'bias, deg/s':>17}{'σ, mdps':>11}   from"
     for axis, name in enumerate(AXES):
         row = f"{name}{state.bias_dps[axis]:+16.6f}{sigmas[axis]:11.2f}   {_sources(state, axis)}"
@@ -56,7 +55,7 @@ def as_text(state: State) -> Iterator[str]:
     if np.isfinite(target_mdps(state)):
         yield _time_left(state)
     if np.isfinite(sigmas).all():
-        drifts = zip(sigmas * HEADING_DEG, AXES, strict=True)
+        drifts = zip(sigmas * _HEADING_DEG, AXES, strict=True)
         listed = ", ".join(f"{drift:.2g}° about {name}" for drift, name in drifts)
         yield f"In one hour the heading drifts by {listed} (1 σ of the bias alone)."
     yield from (r.sentence for r in state.reasons if r.code == "rotation_bound")
@@ -103,14 +102,12 @@ def _sources(state: State, axis: int) -> str:
 
 
 def _time_left(state: State) -> str:
-    floors = {r.axis: r.value for r in state.reasons if r.code == "floor"}
+    floors = [r for r in state.reasons if r.code == "floor"]
+    why = {floor.axis: f", below its floor of {floor.value:.2g}" for floor in floors}
     target, parts = f"{target_mdps(state):g} mdps", []
     for name, seconds in zip(AXES, state.seconds_left, strict=True):
         if np.isinf(seconds):
-            why = (
-                f", below its floor of {floors[name]:.2g}" if name in floors else " within an hour"
-            )
-            parts.append(f"{name} does not reach {target}{why}")
+            parts.append(f"{name} does not reach {target}{why.get(name, ' within an hour')}")
         elif seconds:
             parts.append(f"{name} needs {math.ceil(seconds)} s more at rest for {target}")
     return f"{'; '.join(parts)}." if parts else f"The target of {target} is reached."
@@ -119,7 +116,7 @@ def _time_left(state: State) -> str:
 def planned(state: State) -> Iterator[str]:
     """A line for each axis: the seconds that a target takes, or why it cannot be reached."""
     target = target_mdps(state)
-    text = f"{target:.3g} mdps ({target * HEADING_DEG:.3g}° of heading an hour)"
+    text = f"{target:.3g} mdps ({target * _HEADING_DEG:.3g}° of heading an hour)"
     floors = state.stretch.floor_dps / MDPS
     for name, needed, floor in zip(AXES, state.seconds_left, floors, strict=True):
         if np.isfinite(needed):

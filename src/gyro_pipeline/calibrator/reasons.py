@@ -12,12 +12,8 @@ if TYPE_CHECKING:
     from gyro_pipeline.calibrator.calibrator import State
     from gyro_pipeline.calibrator.stretch import Stretch
 
-UNUSABLE_CODES = {"dead", "unit"}
-"""Codes of data that cannot be used at all."""
-
-VERTICAL = 0.9
-"""An axis counts as vertical where the cosine of its angle to the vertical is larger."""
-
+UNUSABLE_CODES = {"dead", "unit"}  # of data that cannot be used at all
+VERTICAL = 0.9  # an axis with a larger cosine of its angle to the vertical counts as vertical
 _UNIT_FACTOR = 15.0  # on the noise; a larger one means a wrong unit, not another device
 _WHITE = 4.0  # the noise of samples and of block means differs by a smaller factor at rest
 _WARMING_C = 1.0  # a larger change of temperature over a log is reported
@@ -110,6 +106,7 @@ def unit_reason(factor: float, name: str, inside: float | None = None) -> Reason
 def reasons_of(state: "State") -> Iterator[Reason]:
     """All remarks on a result, the most important first."""
     counts, stretch = state.counts, state.stretch
+    yield from (reason("dead", axis=axis) for axis in np.flatnonzero(state.dead))
     yield from state.ended.values()
     for code in ("zero", "not_finite"):
         if 0 < counts[code] < counts["samples"]:
@@ -163,9 +160,9 @@ def _rotation_reasons(stretch: "Stretch") -> Iterator[Reason]:
     up = stretch.up
     about = "any axis" if up is None else "the vertical"
     axes = stretch.usable & (True if up is None else np.abs(up) > VERTICAL)
-    if not axes.any():
+    spread = np.where(axes, stretch.prior.narrow + stretch.estimate.start_variance, 0.0)
+    bound = 1.96 * float(np.sqrt(spread.max())) / MDPS
+    if 0 < bound < np.inf:
+        yield reason("rotation_bound", bound, about=about)
+    else:
         yield reason("rotation_bound none", about=about)
-        return
-    spread = stretch.prior.narrow + stretch.estimate.start_variance
-    bound = 1.96 * float(np.sqrt(spread[axes].max())) / MDPS
-    yield reason("rotation_bound", bound, about=about)

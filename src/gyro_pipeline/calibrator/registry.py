@@ -9,8 +9,8 @@ import os
 import re
 import tomllib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import asdict
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +22,9 @@ from gyro_pipeline.calibrator.history import STILL, Calibration
 from gyro_pipeline.calibrator.stretch import Setup
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 
-VARIABLE = "GYRO_CALIBRATE_REGISTRY"
-"""Environment variable with the folder of the registry."""
+SET = "set"  # stands in place of a hash where a bias was typed in
 
-SET = "set"
-"""Stands in place of a hash where a bias was typed in."""
-
+_VARIABLE = "GYRO_CALIBRATE_REGISTRY"  # environment variable with the folder of the registry
 _NAME = re.compile(r"[\w][\w.-]{0,63}")
 _LOCK_TIMEOUT_S = 10.0
 _MAX_LINE_BYTES = 4096
@@ -36,7 +33,6 @@ _TEMPLATE = """{type}
 # latitude = 32.1    # degrees
 # notes = ""
 """
-_KEYS = {"type", "mounted", "latitude", "frame", "notes"}
 _TYPE_FIGURES = ("flicker_mdps", "random_walk_mdps_per_rts")
 
 Line = dict[str, Any]
@@ -48,20 +44,26 @@ class RegistryError(Exception):
 
 def registry_folder(path: str | Path | None = None) -> Path:
     """The given folder, or that of the environment variable, or the user's folder for data."""
-    if path or os.environ.get(VARIABLE):
-        return Path(path or os.environ[VARIABLE])
+    if path or os.environ.get(_VARIABLE):
+        return Path(path or os.environ[_VARIABLE])
     import platformdirs  # noqa: PLC0415 - not needed where a folder is named
 
     return Path(platformdirs.user_data_dir("gyro-calibrate"))
 
 
-class Device:
-    """The folder of a device.
+@dataclass(frozen=True)
+class Settings:
+    """The content of ``device.toml``, which people write."""
 
-    Args:
-        registry: The folder of all devices.
-        name: Name of the device: letters, digits, ``.``, ``-`` and ``_``.
-    """
+    type: str | None = None
+    mounted: bool = False  # whether the heading repeats
+    latitude: float | None = None  # degrees
+    frame: Any = None
+    notes: Any = None
+
+
+class Device:
+    """The folder of a device in a registry; a name has letters, digits, ``.``, ``-`` and ``_``."""
 
     def __init__(self, registry: Path, name: str) -> None:
         if not _NAME.fullmatch(name) or name == "types":
@@ -77,23 +79,25 @@ class Device:
         """All devices of a registry, by name."""
         return [cls(registry, path.parent.name) for path in sorted(registry.glob("*/device.toml"))]
 
-    def settings(self) -> dict[str, Any]:
-        """The content of ``device.toml``; empty where there is none."""
+    def settings(self) -> Settings:
+        """The settings in ``device.toml``; the defaults where there is none."""
+        where, keys = str(self.settings_path), sorted(field.name for field in fields(Settings))
         try:
             content = tomllib.loads(_read(self.settings_path).decode())
         except ValueError as error:
-            text = f"{self.settings_path}: expected TOML, but: {error}; correct it"
-            raise InputError(text) from error
-        if extra := set(content) - _KEYS:
-            expected = ", ".join(sorted(_KEYS))
-            text = f"{self.settings_path}: expected {expected}, got {sorted(extra)}; correct it"
-            raise InputError(text)
-        return content
+            raise InputError(f"{where}: expected TOML, but: {error}; correct it") from error
+        if extra := sorted(content.keys() - keys):
+            raise InputError(f"{where}: expected {', '.join(keys)}, got {extra}; correct it")
+        settings: Settings = validated(Settings, content, where)
+        return settings
 
     def lines(self) -> list[Line]:
         """All complete lines of the history, the oldest first."""
-        parsed = map(_parsed, _read(self.lines_path).split(b"\n"))
-        return [line for line in parsed if line is not None]
+        lines = []
+        for line in _read(self.lines_path).split(b"\n"):
+            with suppress(ValueError):
+                lines.append(json.loads(line))
+        return [line for line in lines if isinstance(line, dict) and "event" in line]
 
     def calibrations(self) -> dict[str, Calibration]:
         """Calibrations and failed attempts that were not withdrawn, by hash."""
@@ -225,11 +229,3 @@ def _append(path: Path, data: bytes) -> int:
             file.truncate(size)
             raise
         return size
-
-
-def _parsed(line: bytes) -> Line | None:
-    try:
-        content = json.loads(line)
-    except ValueError:
-        return None
-    return content if isinstance(content, dict) and "event" in content else None

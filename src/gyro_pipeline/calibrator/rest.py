@@ -50,25 +50,23 @@ class Alarm(NamedTuple):
 
 
 class RestMonitor:
-    """The three tests over a stretch; :meth:`update` returns a new monitor.
+    """The three tests over a stretch, for blocks of ``size`` samples and ``block_s`` seconds.
 
-    Args:
-        size: Samples of a block.
-        block_s: Length of a block, seconds.
-        least_dps: Smaller changes of the rate are changes of the bias.
-        freedom: Degrees of freedom of the noise known beforehand, (3,); 0 where it is unknown.
+    Changes of the rate below ``least_dps`` are changes of the bias. ``freedom`` (3,) are the
+    degrees of freedom of the noise known beforehand, 0 where it is unknown.
     """
 
     def __init__(self, size: int, block_s: float, least_dps: float, freedom: Array) -> None:
-        self.block_s, self.blocks, self._squares = block_s, 0, np.zeros(3)
+        self.block_s, self._blocks, self._squares = block_s, 0, np.zeros(3)
         self.freedom = freedom if np.any(freedom > 2) else None  # noqa: PLR2004 - of the limit
         self.detector = RestDetector(size, _FALSE_ALARM, least_dps, least_rise=_MIN_RISE)
-        self._count, self._sums, self._gravity = 0, np.zeros(10), np.full(3, np.nan)
+        # blocks, sums and last gravity of the slope
+        self._slope_blocks, self._sums, self._gravity = 0, np.zeros(10), np.full(3, np.nan)
 
     def restart_slope(self) -> Self:
         """The monitor with a slope of gravity that begins with the next block."""
         after = copy(self)
-        after._count, after._sums, after._gravity = 0, np.zeros(10), np.full(3, np.nan)
+        after._slope_blocks, after._sums = 0, np.zeros(10)
         return after
 
     def update(
@@ -103,8 +101,8 @@ class RestMonitor:
         The cube root of the mean square of innovations is nearly normal (Wilson and Hilferty).
         """
         self._squares = _running_sums(self._squares, innovations**2)
-        count = self.blocks + 1 + np.arange(len(innovations))
-        self.blocks, squares, self._squares = int(count[-1]), self._squares, self._squares[-1]
+        count = self._blocks + 1 + np.arange(len(innovations))
+        self._blocks, squares, self._squares = int(count[-1]), self._squares, self._squares[-1]
         if self.freedom is None:
             return np.full(squares.shape, np.nan)
         ratio, limits = squares / count[:, None], alpha_spending_limits(_FALSE_ALARM / 6)
@@ -120,17 +118,17 @@ class RestMonitor:
         1 / (k (k + 1)) of it is spent on block k. Where gravity is missing, the test ends.
         """
         g, unknown = blocks.gravity, np.full(len(blocks.gravity), np.nan)
-        if self._count < 0 or np.isnan(g[0, 0]):
-            self._count = -1
+        if self._slope_blocks < 0 or np.isnan(g[0, 0]):
+            self._slope_blocks = -1
             return unknown, unknown, np.zeros(len(g), bool)
-        count = self._count + 1 + np.arange(len(g))
+        count = self._slope_blocks + 1 + np.arange(len(g))
         t = ((count - 0.5) * self.block_s)[:, None]
         change = np.sum(np.diff(g, axis=0, prepend=self._gravity[None]) ** 2, axis=1)
         change = np.where(count == 1, 0, change)
         noise = blocks.gravity_variance / self.detector.size
         sums = _running_sums(self._sums, np.hstack([t, t * t, g, g * t, np.c_[noise, change]]))
         measured = np.isfinite(sums).all(axis=1)
-        self._count = int(count[-1]) if measured.all() else -1
+        self._slope_blocks = int(count[-1]) if measured.all() else -1
         self._sums, self._gravity = sums[-1], g[-1]
         rate, sigma = _slope_rates(sums, count[:, None])
         limit = np.sqrt(-2 * np.log(_FALSE_ROTATION / (count * (count + 1))))

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from statistics import NormalDist
-from typing import NamedTuple, SupportsIndex
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,18 +29,13 @@ from gyro_pipeline.conventions import MDPS
 from gyro_pipeline.physics.mixture import log_e, log_ratios, mixture_posterior
 from gyro_pipeline.quality.rest import Mask, student_limits
 
-CONFLICT = 120.0
-"""The e-value at which the history is dropped. A right history is dropped in at most one of this
-many calibrations (Ville's inequality); half as often in simulations."""
-
 BLOCK_S = 0.5
-
-LEAST_S, LEAST_UNKNOWN_S = 1.0, 10.0
-"""Seconds at rest before a target counts as reached, with known and with unknown noise."""
-
-LONGEST_S = 3600.0
-"""The longest time at rest that is predicted as seconds left."""
-
+LEAST_S = 1.0  # seconds at rest before a target counts as reached, where the noise is known
+_LEAST_UNKNOWN_S = 10.0  # the same where the noise is unknown
+_LONGEST_S = 3600.0  # the longest time at rest that is predicted as seconds left
+# The e-value at which the history is dropped. A right history is dropped in at most one of this
+# many calibrations (Ville's inequality); half as often in simulations.
+_CONFLICT = 120.0
 _MIN_BLOCK_SAMPLES = 5  # fewer do not show the noise
 _TEMPERATURE_STEP_C = 0.5  # after which the prior is computed again
 _LOOKAHEAD_BLOCKS = 64  # that are predicted at a time
@@ -64,7 +59,7 @@ class Setup:
         # where it is not.
         self.noise_prior = noise_of(self.history, self.device_type)
         self.noise_known = bool(np.all(self.noise_prior[1] > 0))
-        self.least_s = LEAST_S if self.noise_known else LEAST_UNKNOWN_S
+        self.least_s = LEAST_S if self.noise_known else _LEAST_UNKNOWN_S
         self.noise_factor = np.sqrt(self.noise_prior[0])
         # standard deviation of a block mean
         self.white = self.noise_factor * self.noise.white / np.sqrt(self.block_s)
@@ -163,7 +158,13 @@ class Stretch:
             return self, 0, alarm
         conflict = before._first_conflict(filters[1 : count + 1], temperatures[1:])
         if conflict is None and alarm is None or conflict == len(innovations) - 1:
-            after = before._advance(blocks, filters[-1], monitor, temperatures[-1])
+            after = replace(
+                before,
+                filter=filters[-1],
+                monitor=monitor,
+                gravity=_gravity_sum(before.gravity, blocks.gravity),
+                temperature=temperatures[-1],
+            )
             return (after if conflict is None else after._drop_history()), len(innovations), None
         return self.update(blocks.part(0, count if conflict is None else conflict + 1))
 
@@ -181,23 +182,10 @@ class Stretch:
         moved = _temperature_moved(celsius, before.prior_c)
         return before, blocks.part(0, int(moved.argmax()) if moved.any() else None)
 
-    def _advance(
-        self, blocks: Blocks, after: Filter, monitor: RestMonitor, temperature: Temperature
-    ) -> "Stretch":
-        measured = blocks.gravity[np.isfinite(blocks.gravity).all(axis=1)]
-        added = np.hstack([measured, np.ones((len(measured), 1))])
-        return replace(
-            self,
-            filter=after,
-            monitor=monitor,
-            gravity=np.add.accumulate(np.vstack([self.gravity, added]))[-1],
-            temperature=temperature,
-        )
-
     def cut(self, seconds: float, motion: Reason | None) -> "Stretch":
         """The stretch after seconds without data, or after a motion."""
         if not self.blocks:
-            return self
+            return Stretch.start(self.setup, self.start_s + seconds)
         moved = replace(self, filter=self.filter.skip(seconds))
         if motion is None:
             return moved
@@ -227,10 +215,10 @@ class Stretch:
         if not self.usable.any():
             return None
         estimate = self.filter.stack(filters).estimate()
-        estimate = self._scaled(estimate, *self._noise_with(estimate))
+        estimate = self._scaled(estimate, self._noise_with(estimate))
         rise = [_temperature_rise(self.prior_c, t.mean) for t in temperatures[: len(filters)]]
         off = estimate.start - self.prior.mean - self.prior.slope * np.array(rise)[:, None]
-        high = log_e(self._log_ratios(off, estimate.start_variance)) > np.log(CONFLICT)
+        high = log_e(self._log_ratios(off, estimate.start_variance)) > np.log(_CONFLICT)
         return int(high.argmax()) if high.any() else None
 
     def _log_ratios(self, off: Array, variance: Array) -> Array:
@@ -245,8 +233,12 @@ class Stretch:
         estimate = self.estimate
         off = estimate.start - self._prior_mean
         axes = self.usable & (self._log_ratios(off, estimate.start_variance) > 0)
-        sigma = np.sqrt(self.prior.narrow + estimate.start_variance)
-        notes = [_conflict(axis, off[axis], sigma[axis]) for axis in np.flatnonzero(axes)]
+        sigmas = np.abs(off / np.sqrt(self.prior.narrow + estimate.start_variance))
+        notes = []
+        for axis in np.flatnonzero(axes):
+            away, chance = float(off[axis] / MDPS), max(2 * NormalDist().cdf(-sigmas[axis]), 1e-12)
+            words = {"away": abs(away), "chance": 1 / chance}
+            notes.append(reason("conflict", away, float(sigmas[axis]), axis, **words))
         after = replace(self, dropped=self.dropped | axes, notes=(*self.notes, *notes))
         horizontal = axes if self.up is None else axes & (np.abs(self.up) < VERTICAL)
         return after._with_prior(self.up, self.prior_c, False) if horizontal.any() else after
@@ -271,10 +263,11 @@ class Stretch:
     @cached_property
     def estimate(self) -> Estimate:
         """The estimate from the data alone; 1.96 sigma are its 95 % limits."""
-        return self._scaled(self.unscaled, *self.noise_scale)
+        return self._scaled(self.unscaled, self.noise_scale)
 
-    def _scaled(self, estimate: Estimate, factor: Array, freedom: Array) -> Estimate:
+    def _scaled(self, estimate: Estimate, noise: tuple[Array, Array]) -> Estimate:
         """Scale variances to Student's limits, over all attempts if only this log tells N."""
+        factor, freedom = noise
         if not np.isinf(freedom).all():
             attempts = self.setup.now.attempt if not self.setup.noise_prior[1].any() else 1
             z = -NormalDist().inv_cdf(0.025 / attempts)
@@ -284,23 +277,11 @@ class Stretch:
         return estimate._replace(variance=variance, start_variance=start)
 
     @cached_property
-    def bias(self) -> Array:
-        """The bias in the last block, (3,), deg/s; the settled one where the device warms up."""
-        return self._at_mean_temperature[0] + self.prior.slope * self._rise_c
-
-    @cached_property
-    def variance(self) -> Array:
-        """Variance of the bias, (3,), (deg/s)^2."""
-        return self._at_mean_temperature[1] + (self.prior.slope_sigma * self._rise_c) ** 2
-
-    @cached_property
-    def _at_mean_temperature(self) -> tuple[Array, Array]:
-        return self._posterior(self.estimate)
-
-    @property
-    def _rise_c(self) -> float:
-        """Temperature of the last block less the mean temperature, where both are known."""
-        return _temperature_rise(self.temperature.mean, self.temperature.last)
+    def result(self) -> tuple[Array, Array]:
+        """The bias in the last block and its variance, (3,), deg/s; settled, if warming up."""
+        bias, variance = self._posterior(self.estimate)
+        rise_c = _temperature_rise(self.temperature.mean, self.temperature.last)
+        return bias + self.prior.slope * rise_c, variance + (self.prior.slope_sigma * rise_c) ** 2
 
     @property
     def _prior_mean(self) -> Array:
@@ -345,28 +326,38 @@ class Stretch:
     @property
     def reached(self) -> Mask:
         """Whether an axis is at the target, (3,)."""
-        return np.asarray((self.variance <= self.setup.target_dps**2) & ~self.below_floor)
+        return np.asarray((self.result[1] <= self.setup.target_dps**2) & ~self.below_floor)
 
+    @cached_property
     def seconds_left(self) -> Array:
-        """Seconds at rest until the target, (3,); infinite where that takes over ``LONGEST_S``.
+        """Seconds at rest until the target, (3,); infinite beyond an hour, NaN without a target.
 
         The variances of future blocks do not depend on the data. The distance from the history and
         an unknown noise do, and are assumed to stay as they are now.
         """
         setup, seconds = self.setup, np.where(self.reached, 0.0, np.inf)
+        if np.isinf(setup.target_dps):
+            return np.full(3, np.nan)
         start = self.estimate.start if self.blocks else np.where(self.usable, self.prior.mean, 0.0)
         (scale, freedom), following, count = self.noise_scale, self.filter, 0
         open_axes = ~self.below_floor
-        while np.any(np.isinf(seconds) & open_axes) and count * setup.block_s < LONGEST_S:
+        while np.any(np.isinf(seconds) & open_axes) and count * setup.block_s < _LONGEST_S:
             following, stack = following.ahead(_LOOKAHEAD_BLOCKS)
             number = count + 1 + np.arange(_LOOKAHEAD_BLOCKS)[:, None]
-            later = self._scaled(stack.estimate(), scale, freedom + number)
+            later = self._scaled(stack.estimate(), (scale, freedom + number))
             later = later._replace(start=np.broadcast_to(start, (_LOOKAHEAD_BLOCKS, 3)))
             reached = self._posterior(later)[1] <= setup.target_dps**2
             first = np.where(reached.any(axis=0), count + 1 + reached.argmax(axis=0), np.inf)
             seconds = np.minimum(seconds, first * setup.block_s)
             count += _LOOKAHEAD_BLOCKS
+        seconds = np.maximum(seconds, setup.least_s - self.seconds)
         return np.where(open_axes, seconds, np.inf)
+
+
+def _gravity_sum(before: Array, gravity: Array) -> Array:
+    """The sum of gravity over blocks, and their number, after more blocks."""
+    measured = gravity[np.isfinite(gravity).all(axis=1)]
+    return np.add.accumulate(np.vstack([before, np.c_[measured, np.ones(len(measured))]]))[-1]
 
 
 def _temperature_rise(start: float, end: float) -> float:
@@ -377,9 +368,3 @@ def _temperature_rise(start: float, end: float) -> float:
 def _temperature_moved(now: ArrayLike, before: float) -> Mask:
     """Whether the temperature has moved by a step, or has become known."""
     return np.isfinite(now) & ~(np.abs(np.subtract(now, before)) <= _TEMPERATURE_STEP_C)
-
-
-def _conflict(axis: SupportsIndex, away: float, sigma: float) -> Reason:
-    chance = max(2 * NormalDist().cdf(-abs(away / sigma)), 1e-12)
-    away, sigmas = float(away / MDPS), float(abs(away / sigma))
-    return reason("conflict", away, sigmas, axis, away=abs(away), chance=1 / chance)
