@@ -43,6 +43,21 @@ def test_the_guarded_spread_solves_its_equation_and_matters_with_few_recordings_
     assert turn_on.guarded_spread(0.0, 5, 0.0) == 0
 
 
+def test_the_correlation_of_biases_is_freed_from_their_errors():
+    """Errors as large as the spread halve the correlation of the measured biases."""
+    generator, truth, held = np.random.default_rng(5), 0.8, []
+    for _ in range(300):
+        biases = generator.multivariate_normal([0, 0], [[1, truth], [truth, 1]], 80)
+        measured = biases + generator.normal(0, 1, biases.shape)
+        value, lo, hi = turn_on.bias_correlation(measured, [1.0, 1.0])
+        held.append((value, lo <= truth <= hi))
+    values, covered = np.mean(held, axis=0)
+    assert values == pytest.approx(truth, abs=0.03)
+    assert covered > 0.9
+    assert turn_on.bias_correlation(measured[:4], [1.0, 1.0]) is None
+    assert turn_on.bias_correlation(measured, [9.0, 9.0]) is None
+
+
 def test_a_correlation_between_axes_is_detected_and_rarely_where_there_is_none():
     generator, common = np.random.default_rng(3), np.array([[1.0, 1.0, 0.0]])
     alarms, detected = [], []

@@ -14,6 +14,7 @@ from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.physics.allan import NoiseFigures
 from gyro_pipeline.physics.noise import simulate_noise, warm_up
 from gyro_pipeline.physics.recording_model import constant_bias, mean_squares, outside_noise
+from gyro_pipeline.physics.turn_on import joint_draws
 from gyro_pipeline.pipelines.evaluation.bench import Bench
 from gyro_pipeline.pipelines.evaluation.device import describe_devices
 from gyro_pipeline.pipelines.evaluation.nodes import ceiling_warning, evaluate
@@ -388,9 +389,20 @@ def test_an_interval_wholly_beyond_the_ceiling_is_flagged(bench):
     assert "all windows, truth paper" in ceiling_warning(beyond)["beyond_ceiling"]
     assert not ceiling_warning(bench.scores(bench.mean_errors, LAST))
     scores = by_name(beyond)[PAPER, ALL]
+    assert "ceiling_joint_rmse_dps" not in scores  # its axes are independent
+    joint = joint_draws(*bench.device.biases, 100)
+    device = replace(bench.device, joint=joint)
+    correlated = Bench(bench.recordings, device, bench.tests, WINDOW_S)
+    beyond = correlated.scores(correlated.errors({"hold-out": Off(bench, 1e-5)}), LAST)
     for name in ("joint", "history"):
         limit = beyond[beyond.score == f"ceiling_{name}_accuracy_gain_pct"].iloc[0]
         assert -20 < limit.lo < limit.value < limit.hi < 90
+        assert "all windows" in ceiling_warning(beyond, name)["beyond_ceiling"]
+        # an estimator stands beside the ceiling of what it uses
+        out_of_reach = beyond.assign(value=beyond.value.mask(beyond.score == limit.score, 101))
+        out_of_reach["lo"] = beyond.lo.mask(beyond.score == limit.score, 100.5)
+        out_of_reach["hi"] = beyond.hi.mask(beyond.score == limit.score, 101.5)
+        assert "paper" not in ceiling_warning(out_of_reach, name).get("beyond_ceiling", "")
     assert -1 <= scores["turn_on_correlation_xz"] <= 1
     by_axis = [1 - scores[f"accuracy_gain_pct_{axis}"] / 100 for axis in "xyz"]
     assert 0 < min(by_axis) <= 1 - scores["accuracy_gain_pct"] / 100 <= max(by_axis)

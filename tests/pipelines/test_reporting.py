@@ -401,6 +401,6 @@ def test_a_study_of_ones_own_has_a_figure_and_only_findings_of_its_sensors(make_
     less = tables["mine_comparison"].set_index("Estimator")["Less running mean mdps"]
     assert less["best_linear"].startswith(f"{(best - mean) * 1e3:+.3f}")
     shown = figures["mine_<i>my_own_"].axes[0].get_legend_handles_labels()[1]
-    assert shown == ["running mean", "best linear (recommended)", "ceiling"]
+    assert shown == ["running mean", "best linear (recommended)", "ceiling", "oracle"]
     assert "published gains" not in page and "SparkFun" not in page.partition("## How")[0]
     assert "<i>" not in page.replace("\\<i\\>", "")

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from gyro_pipeline.conventions import InputError
 
 _FEWEST_RECORDINGS = 2
+_FEWEST_CORRELATED = 5
 _CHANCE = 0.01  # probability of detecting a correlation where none exists
 
 
@@ -85,6 +86,32 @@ def joint_draws(
     samples = root @ np.linalg.inv(pivots) @ root.T
     values, vectors = np.linalg.eigh(np.concatenate([scatter[None], samples]) - np.diag(averaging))
     return np.asarray((vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.swapaxes(1, 2))
+
+
+def bias_correlation(
+    biases: NDArray[np.floating], errors: ArrayLike
+) -> tuple[float, float, float] | None:
+    """Correlation of the turn-on bias of two axes, and the ends of its 95 % interval.
+
+    The interval is that of the measured biases (Fisher 1915, Biometrika 10), divided like the
+    correlation by the share of their standard deviations that is turn-on spread.
+
+    Args:
+        biases: Means or fitted biases of recordings, (n, 2), deg/s.
+        errors: Variances of their errors, (2,), (deg/s)^2.
+
+    Returns:
+        None with fewer than five recordings, or if an axis does not scatter beyond its error.
+    """
+    spreads = turn_on_spread(biases, errors)
+    if len(biases) < _FEWEST_CORRELATED or not spreads.all():
+        return None
+    measured = np.corrcoef(biases.T)[0, 1]
+    half = scipy.stats.norm.ppf(0.975) / np.sqrt(len(biases) - 3)
+    ends = np.tanh(np.arctanh(measured) + half * np.array([0, -1, 1]))
+    shares = spreads / biases.std(axis=0, ddof=1)
+    value, lo, hi = np.clip(ends / shares.prod(), -1, 1).tolist()
+    return value, lo, hi
 
 
 def guarded_spread(scatter: ArrayLike, freedom: ArrayLike, averaging: ArrayLike) -> float:

@@ -27,7 +27,8 @@ from gyro_pipeline.estimators.base import Estimator
 from gyro_pipeline.physics.bias import windows_at
 from gyro_pipeline.physics.ceiling import oracle
 from gyro_pipeline.physics.recording_model import LinearEstimate, RecordingModel, best_linear
-from gyro_pipeline.pipelines.evaluation.ceilings import Ceilings, with_draws
+from gyro_pipeline.physics.turn_on import bias_correlation
+from gyro_pipeline.pipelines.evaluation.ceilings import Ceilings
 from gyro_pipeline.pipelines.evaluation.device import TestDevice
 from gyro_pipeline.scoring.scorer import Scorer, View, squares_by_view
 from gyro_pipeline.scoring.scores import (
@@ -361,14 +362,13 @@ class Bench:
 
     def _turn_on_correlations(self) -> dict[str, Estimate]:
         """Correlations of the turn-on bias between axes; none where an axis has no spread."""
-        covariances = self.device.joint
-        if covariances is None or not np.diag(covariances[0]).all():
+        if self.device.biases is None:
             return {}
-        scores, spreads = {}, np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-        for (i, first), (j, second) in combinations(enumerate(AXES), 2):
-            with np.errstate(invalid="ignore"):
-                drawn = covariances[:, i, j] / (spreads[:, i] * spreads[:, j])
-            scores[f"turn_on_correlation_{first}{second}"] = with_draws(drawn[np.isfinite(drawn)])
+        scores = {}
+        for i, j in combinations(range(len(AXES)), 2):
+            biases, errors = (values[..., [i, j]] for values in self.device.biases)
+            if correlation := bias_correlation(biases, errors):
+                scores[f"turn_on_correlation_{AXES[i]}{AXES[j]}"] = Estimate(*correlation)
         return scores
 
 

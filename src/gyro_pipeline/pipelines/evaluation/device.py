@@ -13,7 +13,12 @@ from gyro_pipeline.physics.bias import fill_masked
 from gyro_pipeline.physics.history import BiasHistory
 from gyro_pipeline.physics.recording_model import RecordingModel, fitted_biases
 from gyro_pipeline.physics.reml import FEWEST_RECORDINGS, fit_recording_model
-from gyro_pipeline.physics.turn_on import joint_draws, spread_draws, turn_on_spread
+from gyro_pipeline.physics.turn_on import (
+    axes_are_correlated,
+    joint_draws,
+    spread_draws,
+    turn_on_spread,
+)
 
 UNIT_SPREAD = 1.0
 """Standard deviation of the bias from unit to unit, deg/s; 0.7 to 1.9 on the public DOT files."""
@@ -41,8 +46,11 @@ class TestDevice:
     # Means of the training recordings by test fold, (n, axes), deg/s; empty for unseen devices, and
     # if a fold has none.
     labels: Mapping[str, np.ndarray] = field(default_factory=dict)
-    # Covariance of the turn-on bias of all axes, (1 + draws, axes, axes), (deg/s)^2; None with few
-    # recordings, and on simulated data, where axes are independent.
+    # Biases of the training recordings, (n, axes), deg/s, and the variances of their errors,
+    # (axes,); None with few recordings, and on simulated data, where axes are independent.
+    biases: tuple[np.ndarray, np.ndarray] | None = None
+    # Covariance of the turn-on bias of all axes, (1 + draws, axes, axes), (deg/s)^2; None unless
+    # the biases are correlated.
     joint: np.ndarray | None = None
     # Variance of the bias given earlier calibrations, mean over the test recordings, (1 + draws,
     # axes), (deg/s)^2; None with few recordings, and on simulated data.
@@ -172,12 +180,13 @@ def _describe_known(
     models = _fitted_models(samples, rate_hz) or None
     averaging = np.square(noise) / duration_s + _beyond_white(models, duration_s)
     spread = np.vstack([turn_on_spread(labels, averaging), spread_draws(labels, averaging, _DRAWS)])
-    joint = given_earlier = None
+    joint = given_earlier = biases = None
     if models is not None:
         given_earlier = _given_earlier(models, means, tests)
-        if len(labels) > len(AXES):
-            joint = joint_draws(*fitted_biases(models, samples), _DRAWS)
-    return TestDevice((imu,), noise, spread, None, models, joint=joint, given_earlier=given_earlier)
+        biases = fitted_biases(models, samples)
+        joint = joint_draws(*biases, _DRAWS) if axes_are_correlated(biases[0]) else None
+    device = TestDevice((imu,), noise, spread, None, models, biases=biases)
+    return replace(device, joint=joint, given_earlier=given_earlier)
 
 
 def _given_earlier(

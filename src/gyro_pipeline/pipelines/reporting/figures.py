@@ -47,11 +47,14 @@ _SAVINGS_PCT = (-25.0, 100.0)  # savings outside are drawn at the edge, as arrow
 _ERROR = "RMSE against the recording's mean [mdps]"
 _SECTIONS = {"sparkfun": "IV-E", "dot": "IV-F"}  # of the paper, on virtual gyroscopes
 _GAINS_PCT = (-30.0, 102.0)
+_ON_THE_SAME_WINDOWS = (("constant", "grey", "s"), ("oracle", CEILING, "x"))
 _ON_CURVE = (
     "Left: all windows, the main result. Right: the first window of each recording, the paper's "
     "way. The line is the running mean against its length. Filled markers are the networks with "
     "95 % intervals, hollow ones the error that a published gain would mean on these data, bars "
-    "the ceiling: the expected error of the best estimator under the noise model. Lower is better."
+    "the ceiling: the expected error of the best estimator under the noise model. Beside them "
+    "stand the errors of a constant and, on simulated data, of the oracle on the same windows. "
+    "Lower is better."
 )
 
 
@@ -193,6 +196,10 @@ def _draw_curve(  # noqa: PLR0917 - contents of a panel
     limits = where(results, estimator=MEAN).sort_values("window_s")
     bars = limits[column("ceiling_rmse_dps", windows)] / MDPS
     ax.plot(limits.window_s, bars, "_", color=CEILING, ms=30, mew=2, label="ceiling")
+    for name, colour, marker in _ON_THE_SAME_WINDOWS:
+        errors = limits.get(column(f"{name}_rmse_dps", windows))
+        if errors is not None and errors.notna().any():
+            ax.plot(limits.window_s * 1.25, errors / MDPS, marker, color=colour, label=name)
     networks = where(results, estimator=CNN)
     sizes = sorted(networks[by].unique())
     for i, size in enumerate(sizes):
@@ -258,6 +265,10 @@ def _draw_bars(
     ax.axhline(mean, color="black", lw=1.5, label="model-based: running mean")
     limit = float(networks[column("ceiling_rmse_dps", windows)].iloc[0]) / MDPS
     ax.axhline(limit, color=CEILING, ls="--", lw=1.5, label="ceiling")
+    for name, colour, _ in _ON_THE_SAME_WINDOWS:
+        error, _, _ = ends(networks.iloc[0], f"{name}_rmse_dps", windows)
+        if not np.isnan(error):
+            ax.axhline(error / MDPS, color=colour, ls=":", lw=1.5, label=name)
     gains_pct = {claim.real_gyros: claim.accuracy_gain_pct for claim in claims}
     errors = mean * (1 - networks.real_gyros.map(gains_pct) / 100)
     ax.plot(x, errors, "D", color=COLOURS[1], ms=9, mfc="none", mew=1.8, label="published")
@@ -396,6 +407,11 @@ def _draw_estimators(left: Axes, right: Axes, rows: pd.DataFrame) -> None:
     for ax, values in ((left, limit / MDPS), (right, limit / means.test_rmse_dps)):
         dash = "--" if len(values) > 1 else "_"
         ax.plot(values.index, values, dash, color=CEILING, lw=2, ms=30, mew=2, label="ceiling")
+    if "oracle_rmse_dps" in means and means.oracle_rmse_dps.notna().any():
+        oracle = means.oracle_rmse_dps.astype(float)
+        for ax, values in ((left, oracle / MDPS), (right, oracle / means.test_rmse_dps)):
+            ax.plot(values.index, values, "x", color=CEILING, label="oracle")
+    for ax in (left, right):
         ax.set(xscale="log", yscale="log", xlabel="window length [s], points side by side")
         ax.set_xticks(means.index.tolist(), minor=False)
         low, high = ax.get_ylim()
