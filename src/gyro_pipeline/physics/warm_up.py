@@ -63,7 +63,8 @@ class CommonWarmUp:
     Attributes:
         amplitude: (axes,), deg/s.
         half: Half of its 95 % interval over recordings, (axes,), deg/s.
-        p: Chance of an amplitude at least as large where there is no warm-up, (axes,).
+        p: Chance of an amplitude at least as large where there is no warm-up, (axes,); NaN for a
+            single recording.
     """
 
     amplitude: Array
@@ -90,9 +91,9 @@ def fit_common_warm_up(
     decay = profiles(edges, rate_hz, time_constant_s)[:, 1]
     shape = decay - decay.mean()
     amplitudes = block_means(recordings, edges) @ shape / (shape @ shape)
-    with np.errstate(invalid="ignore"):
-        p = scipy.stats.ttest_1samp(amplitudes, 0.0).pvalue  # NaN for a single recording
-    return CommonWarmUp(amplitudes.mean(axis=0), _half(amplitudes), np.asarray(p))
+    mean, freedom = amplitudes.mean(axis=0), len(amplitudes) - 1
+    p = 2 * scipy.stats.t.sf(np.abs(mean) / _standard_error(amplitudes), freedom)
+    return CommonWarmUp(mean, _half(amplitudes), np.asarray(p))
 
 
 def amplitude_needed(
@@ -132,8 +133,12 @@ def amplitude_needed(
 
 def _half(values: Array) -> Array:
     """Half of the 95 % interval of a mean over the first axis."""
+    return np.asarray(scipy.stats.t.ppf(0.975, len(values) - 1) * _standard_error(values))
+
+
+def _standard_error(values: Array) -> Array:
+    """Standard error of a mean over the first axis; NaN for a single value."""
     n = len(values)
     if n == 1:
         return np.full(values.shape[1:], np.nan)
-    error = values.std(axis=0, ddof=1) / np.sqrt(n)
-    return np.asarray(scipy.stats.t.ppf(0.975, n - 1) * error)
+    return np.asarray(values.std(axis=0, ddof=1) / np.sqrt(n))
