@@ -75,7 +75,7 @@ def _networks(rows: pd.DataFrame) -> str:
         oracle = _range(shortest[_ORACLE_GAIN].dropna())
         parts.append(f"{oracle} % for the oracle, which knows the drawn values")
     limit = _range(shortest[_CEILING_GAIN].dropna())
-    parts.append(f"and {limit} % for the ceiling, the best that the noise model lets expect")
+    parts.append(f"and {limit} % for the ceiling, the best expected under the noise model")
     return f"{'; '.join(parts)}."
 
 
