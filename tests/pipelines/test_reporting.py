@@ -8,8 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from gyro_pipeline.estimators import ESTIMATORS
 from gyro_pipeline.parameters import Grid, Only, Study
-from gyro_pipeline.pipelines.reporting.nodes import write_report
+from gyro_pipeline.pipelines.reporting.nodes import _explained, write_report
 from gyro_pipeline.pipelines.reporting.results import pool_results
 from gyro_pipeline.studies import CNN, CONSTANT, LEFT_OUT, MEAN, RunSpec, run_params, run_spec
 from gyro_pipeline.tracking import CURVE, ERRORS, FINGERPRINT, SCORES, StoredRun
@@ -363,6 +364,13 @@ def test_what_beats_the_oracle_is_called_a_defect(make_run, mean, pool, write, r
     page = write(stored_as("augmentation", pool([run, mean])))[2]
     assert "DEFECT OF THE EVALUATION: 1 beat the oracle" in page
     assert "No estimator beats the oracle" in report[2]
+
+
+def test_every_estimator_and_its_fixed_options_are_explained():
+    explained = dict(_explained(ESTIMATORS))
+    assert explained["network"].startswith("The paper's network: convolution")
+    assert explained["best linear fallback"].endswith("It allows for a wrong prior.")
+    assert len(explained) == len(ESTIMATORS)
 
 
 def test_what_was_not_made_is_named_with_the_fewest_commands(grid, write, pool, make_run, mean):

@@ -48,7 +48,7 @@ class Architecture:
 
 
 class CalibrationNetwork(nn.Module):
-    """Convolution, LeakyReLU, max-pool, flatten, linear, LeakyReLU, linear.
+    """The paper's network: convolution, LeakyReLU, max-pool, flatten, linear, LeakyReLU, linear.
 
     LeakyReLU is monotonic, so it may follow the pooling, where it has only a quarter of the values;
     and features are flattened time by time, which needs no copy for packed windows. Neither changes

@@ -35,7 +35,7 @@ def answer(material: Material) -> list[str]:
     """The answer in at most three sentences."""
     rows = distinct(material)
     beyond = [claim for claim in material.claims if material.beyond_white_noise(claim)]
-    sentences = [_networks(rows) or _estimators(rows)]
+    sentences = [_networks(material, rows) or _estimators(rows)]
     sentences += [_published(material, beyond), _explanations(material, beyond)]
     return [sentence for sentence in sentences if sentence]
 
@@ -56,25 +56,29 @@ def findings(material: Material) -> list[str]:
     return [sentence for sentence in sentences if sentence]
 
 
-def _networks(rows: pd.DataFrame) -> str:
-    """Accuracy gains of the network, a constant and the best linear predictor, shortest window."""
+def _networks(material: Material, rows: pd.DataFrame) -> str:
+    """Accuracy gains of the network, a constant and the best linear predictor.
+
+    The window is that of the published results, or else the shortest one.
+    """
     networks = where(rows, estimator=CNN)
     if networks.empty:
         return ""
-    window_s = networks.window_s.min()
-    shortest = where(rows, window_s=window_s)
+    published = networks.window_s[networks.window_s.isin([c.window_s for c in material.claims])]
+    window_s = (published if len(published) else networks.window_s).min()
+    chosen = where(rows, window_s=window_s)
     words = {
         CNN: f"Over all windows of {window_s:g} s, the gain in accuracy over the mean of the "
         "window is {} % for the paper's network",
         CONSTANT: "{} % for a constant, the mean of the device's training recordings",
         DEFAULT: f"{{}} % for the {label(DEFAULT)} predictor",
     }
-    gains = {name: where(shortest, estimator=name)[_GAIN] for name in words}
+    gains = {name: where(chosen, estimator=name)[_GAIN] for name in words}
     parts = [words[name].format(_range(gain)) for name, gain in gains.items() if len(gain)]
-    if _ORACLE_GAIN in shortest and shortest[_ORACLE_GAIN].notna().any():
-        oracle = _range(shortest[_ORACLE_GAIN].dropna())
+    if _ORACLE_GAIN in chosen and chosen[_ORACLE_GAIN].notna().any():
+        oracle = _range(chosen[_ORACLE_GAIN].dropna())
         parts.append(f"{oracle} % for the oracle, which knows the drawn values")
-    limit = _range(shortest[_CEILING_GAIN].dropna())
+    limit = _range(chosen[_CEILING_GAIN].dropna())
     parts.append(f"and {limit} % for the ceiling, the best expected under the noise model")
     return f"{'; '.join(parts)}."
 
@@ -127,13 +131,15 @@ def _explanations(material: Material, beyond: Sequence[PublishedResult]) -> str:
 def _test_of_warm_up(material: Material, names: Sequence[str]) -> str:
     """How to recognise a warm-up; on measured data, the largest warm-up that they allow."""
     allowed = material.warm_ups_allowed_mdps
-    sizes = "; ".join(f"{name} {from_to(allowed[name])}" for name in allowed if name in names)
+    sizes = "; ".join(
+        f"{from_to(allowed[name])} mdps ({name})" for name in allowed if name in names
+    )
     if material.simulated or not sizes:
         return (
             "The mean rate against time after power-on, on measured data, bounds a warm-up, and so "
             "can exclude the first."
         )
-    return f"These recordings allow a warm-up of at most {sizes} mdps (95 % intervals)."
+    return f"These recordings allow a warm-up of at most {sizes}, by their 95 % intervals."
 
 
 def _signs(rows: pd.DataFrame, name: str) -> tuple[int, int]:

@@ -11,7 +11,7 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from gyro_pipeline.conventions import AXES
-from gyro_pipeline.estimators import DEFAULT, ESTIMATORS, estimator_class
+from gyro_pipeline.estimators import DEFAULT, ESTIMATORS, named_class
 from gyro_pipeline.markup import escape, pipe_table
 from gyro_pipeline.parameters import GroundTruth, Only, Published, Study
 from gyro_pipeline.pipelines.reporting import tables
@@ -25,6 +25,15 @@ PAPER_STUDIES = ("augmentation", "real2real", "input_channels", tables.FIRST_WIN
 """Studies that repeat the paper's; any other one has a figure and a table for each sensor."""
 
 _BASE = ("base", "local")
+_OPTIONS = {
+    "warm_up": "It models a warm-up.",
+    "history": "Its prior follows from the earlier calibrations, in their order.",
+    "fallback": "It allows for a wrong prior.",
+    "noise": "Its N, B and K are those of the Allan fit.",
+    "same_time": "There is a regression for each start of a window.",
+    "shuffled": "The labels are shuffled, so it can learn nothing.",
+}
+"""What the fixed options of estimators mean."""
 _COLUMNS = [*ROW, "study", "status", "run_ids", "fingerprints", "env", "simulated"]
 _COLUMNS += ["recommended", "own_ceiling", "beats_oracle_p", *WARNINGS]
 """Columns that the table of results has even without a row."""
@@ -166,14 +175,9 @@ def _explained(estimators: Iterable[str]) -> list[tuple[str, str]]:
 
 def _description(name: str) -> str:
     """The first sentence of the docstring of an estimator, and its fixed options."""
-    first = " ".join((estimator_class(name).__doc__ or "No description.").split("\n\n")[0].split())
+    first = " ".join((named_class(name).__doc__ or "No description.").split("\n\n")[0].split())
     _, options = ESTIMATORS.get(name, (name, {}))
-    words = [
-        f"{key}={value}".removesuffix("=True").replace("_", " ")
-        for key, value in options.items()
-        if value is not None
-    ]
-    return first + (f" With {', '.join(words)}." if words else "")
+    return " ".join([first, *(_OPTIONS[key] for key, value in options.items() if value)])
 
 
 def _facts(material: Material, only: Only, fresh: Collection[str]) -> dict[str, str]:

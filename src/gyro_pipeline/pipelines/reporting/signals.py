@@ -65,10 +65,10 @@ def _bounds(material: Material) -> str:
     """The largest warm-up amplitude that recordings allow, by sensor and time constant."""
     times_s = "/".join(f"{time_s:g}" for time_s in WARM_UPS_S)
     sizes = ", ".join(
-        f"{name} " + "/".join(f"{bound:.2g}" for bound in bounds)
+        "/".join(f"{bound:.2g}" for bound in bounds) + f" mdps ({name})"
         for name, bounds in material.warm_ups_allowed_mdps.items()
     )
-    return f"{sizes} mdps for time constants of {times_s} s, on the worst axis"
+    return f"{sizes} for time constants of {times_s} s, on the worst axis"
 
 
 def allan_deviation(material: Material) -> Exhibit | None:
