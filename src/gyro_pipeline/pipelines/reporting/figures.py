@@ -196,10 +196,7 @@ def _draw_curve(  # noqa: PLR0917 - contents of a panel
     limits = where(results, estimator=MEAN).sort_values("window_s")
     bars = limits[column("ceiling_rmse_dps", windows)] / MDPS
     ax.plot(limits.window_s, bars, "_", color=CEILING, ms=30, mew=2, label="ceiling")
-    for name, colour, marker in _ON_THE_SAME_WINDOWS:
-        errors = limits.get(column(f"{name}_rmse_dps", windows))
-        if errors is not None and errors.notna().any():
-            ax.plot(limits.window_s * 1.25, errors / MDPS, marker, color=colour, label=name)
+    _draw_on_the_same_windows(ax, limits, windows)
     networks = where(results, estimator=CNN)
     sizes = sorted(networks[by].unique())
     for i, size in enumerate(sizes):
@@ -224,6 +221,14 @@ def _draw_curve(  # noqa: PLR0917 - contents of a panel
     ax.yaxis.set_major_formatter("{x:g}")
     # The error of the mean of the whole recording is 0, which has no logarithm.
     ax.set_ylim(0.08, 1.5 * (curve.rmse_dps / MDPS)[curve.time_s >= _TICKS_S[0]].max())
+
+
+def _draw_on_the_same_windows(ax: Axes, limits: pd.DataFrame, windows: str) -> None:
+    """The errors of a constant and the oracle, beside those of the networks."""
+    for name, colour, marker in _ON_THE_SAME_WINDOWS:
+        errors = limits.get(column(f"{name}_rmse_dps", windows))
+        if errors is not None and errors.notna().any():
+            ax.plot(limits.window_s * 1.25, errors / MDPS, marker, color=colour, label=name)
 
 
 def _time_axis(ax: Axes, recording_s: float) -> None:

@@ -287,13 +287,7 @@ def ratios(material: Material, study: str, sensor: str) -> Exhibit | None:
         texts = {"running mean, RMSE in mdps": f"{mean.test_rmse_dps / MDPS:.3f}"}
         for _, row in group[group.estimator != MEAN].iterrows():
             texts[in_full(row, rows)] = _ratio(row, "accuracy_gain_pct")
-        texts[_CEILING] = _ratio(mean, "ceiling_accuracy_gain_pct")
-        for kind, name in _OWN_CEILINGS.items():
-            if (group.own_ceiling == kind).any():
-                texts[name] = _ratio(mean, f"ceiling_{kind}_accuracy_gain_pct")
-        if pd.notna(mean.get("oracle_accuracy_gain_pct")):
-            texts[_ORACLE] = _ratio(mean, "oracle_accuracy_gain_pct")
-        table[f"{float(str(window_s)):g} s"] = texts
+        table[f"{float(str(window_s)):g} s"] = texts | _limits(mean, group)
     errors = pd.DataFrame(table)
     limits = (_CEILING, *_OWN_CEILINGS.values(), _ORACLE)
     last = [name for name in limits if name in errors.index]
@@ -314,6 +308,18 @@ def ratios(material: Material, study: str, sensor: str) -> Exhibit | None:
     ) + unseen * ("device" in split(rows.iloc[0]))
     title = f"{material.sensor_name(sensor)}, {study.replace('_', ' ')}: error relative to the mean"
     return Exhibit(f"{study}_{sensor}", title, caption, errors, columns)
+
+
+def _limits(mean: pd.Series, group: pd.DataFrame) -> dict[str, str]:
+    """The ratios of the ceilings that estimators use, and of the oracle."""
+    names = {"ceiling": _CEILING}
+    names |= {
+        f"ceiling_{kind}": name
+        for kind, name in _OWN_CEILINGS.items()
+        if (group.own_ceiling == kind).any()
+    }
+    names |= {"oracle": _ORACLE} if pd.notna(mean.get("oracle_accuracy_gain_pct")) else {}
+    return {name: _ratio(mean, f"{base}_accuracy_gain_pct") for base, name in names.items()}
 
 
 def in_full(row: pd.Series, rows: pd.DataFrame) -> str:
