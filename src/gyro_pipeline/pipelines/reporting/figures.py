@@ -74,6 +74,7 @@ def forest(material: Material) -> Exhibit | None:
             ax.grid(False, axis="y")
             ax.set_yticks(range(len(claims)), names)
             ax.set_ylim(len(claims) - 0.5, -0.5)
+        axes[ALL].set_ylabel("tested sensor, gyroscopes in training")
     caption = (
         "A row for each published result. A, the accuracy gain, says how much smaller the error is "
         "than that of the mean of the same window: 0 is the running mean, 100 no error. Bars are "

@@ -107,7 +107,8 @@ def _published(material: Material, beyond: Sequence[PublishedResult]) -> str:
     return (
         f"{len(beyond)} of {len(material.claims)} published gains on these sensors "
         f"{'exceeds' if len(beyond) == 1 else 'exceed'} the gain that is expected at most in white "
-        "noise without drift, A = 1 − √(T0/T), even if the bias is known exactly."
+        "noise without drift, even if the bias is known exactly: one minus the square root of the "
+        "window's share of the recording."
     )
 
 
@@ -120,7 +121,11 @@ def _explanations(material: Material, beyond: Sequence[PublishedResult]) -> str:
         name = material.sensor_name(claim.sensor)
         needed.setdefault(name, []).extend(material.warm_up_needed_mdps(claim))
     sizes = "; ".join(f"{name} {from_to(a)}" for name, a in needed.items() if a)
-    amount = f" ({sizes} mdps at power-on, for time constants of 5 to 60 s)" if sizes else ""
+    amount = (
+        f" ({sizes} thousandths of a deg/s (mdps) at power-on, for time constants of 5 to 60 s)"
+        if sizes
+        else ""
+    )
     return (
         f"Possible explanations are a warm-up{amount}, which a constant could also correct; "
         "another truth than the mean of the recording; coloured noise; chance; or a leak between "

@@ -59,7 +59,7 @@ def panels(
     columns: int = 3,
     **shared: Any,
 ) -> Iterator[tuple[Figure, list[Axes]]]:
-    """A figure whose panels are drawn in this context, and share the legend below them.
+    """A figure whose panels are drawn in this context, and share the legend above them.
 
     Args:
         title: Title of the figure.
@@ -76,10 +76,9 @@ def panels(
         for ax in axes:
             for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
                 handles.setdefault(str(label), handle)
-        layout: Any = {"loc": "outside lower center", "ncols": columns, "frameon": False}
+        layout: Any = {"loc": "outside upper center", "ncols": columns, "frameon": False}
+        layout |= {"title": title, "title_fontsize": "large"}
         figure.legend(list(handles.values()), list(handles), **layout)
-        if title:
-            figure.suptitle(title)
 
 
 def grid_shape(count: int) -> tuple[int, int]:
