@@ -165,7 +165,7 @@ def test_an_edit_of_any_module_that_is_imported_changes_the_hash_and_no_other(tm
     done = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
     counting = set(done.stdout.split())
     names = ["__init__", "conventions", "parameters", "units"]
-    names += [f"estimators/{name}" for name in ("__init__", "base", "training")]
+    names += [f"estimators/{name}" for name in ("__init__", "base", "training_set")]
     names += [f"physics/{name}" for name in ("__init__", "allan", "bias")]
     inside = ("__init__", "jobs", "fused", "examples", "network", "packing", "trainer")
     names += [f"learning/{name}" for name in inside]

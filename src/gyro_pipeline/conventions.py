@@ -25,6 +25,8 @@ A windows table has a row per window: ``protocol, window_s, window_stride_s``; `
 
 AXES = ("x", "y", "z")
 DIMENSIONS = ("imu", "recording", "axis", "sample")
+NOISE_COLUMNS = ("white_dps_rts", "instability_dps", "random_walk_dps_per_rts")
+"""Columns of tables with N, B and K."""
 
 MDPS = 1e-3
 """One mdps in deg/s."""

@@ -7,7 +7,7 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyro_pipeline.conventions import AXES, MDPS, InputError
+from gyro_pipeline.conventions import AXES, MDPS, NOISE_COLUMNS, InputError
 from gyro_pipeline.parameters import GroundTruth
 from gyro_pipeline.physics.allan import (
     allan_variance,
@@ -18,8 +18,6 @@ from gyro_pipeline.physics.bias import settling_time_s
 from gyro_pipeline.recordings import bias_rows, iterate_recordings
 
 logger = logging.getLogger(__name__)
-
-NOISE_COLUMNS = ["white_dps_rts", "instability_dps", "random_walk_dps_per_rts"]
 
 
 def measure_allan_variance(recordings: xr.Dataset) -> xr.Dataset:
@@ -99,7 +97,7 @@ def measure_noise(recordings: xr.Dataset, allan: xr.Dataset, bias: pd.DataFrame)
         )
     index = pd.MultiIndex.from_product([[*fitted], AXES], names=["imu", "axis"])
     rows = np.concatenate([figures for figures, _ in fitted.values()])
-    table = pd.DataFrame(rows, index, NOISE_COLUMNS)
+    table = pd.DataFrame(rows, index, list(NOISE_COLUMNS))
     squares = bias.assign(square=bias.sample_sigma_dps**2).groupby(["imu", "axis"])["square"]
     table.insert(0, "sample_sigma_dps", np.sqrt(squares.mean()))
     table = table.reset_index()

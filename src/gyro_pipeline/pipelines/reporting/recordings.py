@@ -8,7 +8,7 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyro_pipeline.conventions import AXES, MDPS, TEST, InputError
+from gyro_pipeline.conventions import AXES, MDPS, NOISE_COLUMNS, TEST, InputError
 from gyro_pipeline.logs import KEPT, REJECTED, REPAIRED
 from gyro_pipeline.parameters import GroundTruth
 from gyro_pipeline.physics.allan import FLICKER_FLOOR, SHORTEST_FIT_SAMPLES
@@ -16,7 +16,6 @@ from gyro_pipeline.physics.bias import fill_masked, settling_time_s
 from gyro_pipeline.physics.recording_model import block_edges, block_means
 from gyro_pipeline.physics.turn_on import turn_on_spread
 from gyro_pipeline.physics.warm_up import LAST, fit_common_warm_up, settling
-from gyro_pipeline.pipelines.ground_truth.nodes import NOISE_COLUMNS
 from gyro_pipeline.recordings import iterate_recordings, tested_imu
 
 SIGMAS_MDPS = (1.0, 0.5)
@@ -125,7 +124,7 @@ def start_up(recordings: xr.Dataset, bias: pd.DataFrame, noise: pd.DataFrame) ->
         longer than a recording, NaN if the noise is unknown.
     """
     rate_hz, own = recordings.attrs["rate_hz"], noise[noise.imu == tested_imu(recordings)]
-    white, flicker, walk = own.set_index("axis").loc[list(AXES), NOISE_COLUMNS].T.to_numpy()
+    white, flicker, walk = own.set_index("axis").loc[list(AXES), list(NOISE_COLUMNS)].T.to_numpy()
     recording_s = float(recordings["samples"].max()) / rate_hz
     averaging = white**2 / recording_s
     spread, count = _turn_on_spread(recordings, bias, averaging)
@@ -260,7 +259,7 @@ def _allan_lines(allan: xr.Dataset, noise: pd.DataFrame) -> Iterator[pd.DataFram
         for axis in AXES:
             deviation = np.sqrt(variance.sel(imu=imu, axis=axis).to_numpy())
             yield _line("allan", f"IMU {imu}, axis {axis}", times_s, deviation)
-    white, flicker, walk = (noise[NOISE_COLUMNS] ** 2).mean().to_numpy()
+    white, flicker, walk = (noise[list(NOISE_COLUMNS)] ** 2).mean().to_numpy()
     fitted_s = times_s[SHORTEST_FIT_SAMPLES * times_s[0] <= times_s]
     model = white / fitted_s + FLICKER_FLOOR * flicker + walk * fitted_s / 3
     yield _line("allan", "fit of N, B, K", fitted_s, np.sqrt(model))
