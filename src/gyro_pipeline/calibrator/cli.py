@@ -4,6 +4,7 @@ The exit code is the highest of all files: 0 done; 2 usage; 3 target not reached
 5 history not used, with --require-history; 6 data unusable; 7 nothing can be stored.
 """
 
+import errno
 import hashlib
 import json
 import re
@@ -33,7 +34,18 @@ from gyro_pipeline.calibrator.stretch import BLOCK_S
 from gyro_pipeline.conventions import IN_READER, MDPS, InputError
 from gyro_pipeline.parameters import ReaderOptions
 
+_ARGUMENT = r"^(rate_hz|target|latitude|since_power_on|type)(?=:)"  # of Calibrator.open
+_LONGEST_S = 86400.0  # of silence
+_OF_ONE_LOG = {
+    "plot": "--plot", "started_at": "--started-at", "since_power_on_s": "--since-power-on",
+}  # fmt: skip
+_UNKNOWN_HZ = 100.0  # stands for the rate before samples show it
+_COLUMN = "a name, or a number from 0"
 DONE, USAGE, NOT_REACHED, NOT_AT_REST, NO_HISTORY, UNUSABLE, NOT_STORED = 0, 2, 3, 4, 5, 6, 7
+
+
+class Rejected(InputError):
+    """Data that quality control rejects, whatever the options."""
 
 
 def _posix_seconds(_: click.Context, __: click.Parameter, text: str | None) -> float | None:
@@ -45,6 +57,15 @@ def _posix_seconds(_: click.Context, __: click.Parameter, text: str | None) -> f
 
 def _flag(name: str) -> str:
     return "--scale" if name == "scale_dps" else "--" + name.replace("_", "-")
+
+
+def _typed(advice: str, end: str = r"\b(?!-):?") -> str:
+    """Advice about catalog keys, with options and values as they are typed."""
+    advice = re.sub(r"(the sensor's )?\brate_hz(, or samples and recording_s)?", "--rate", advice)
+    for name in sorted(ReaderOptions.model_fields, key=len, reverse=True):
+        advice = re.sub(rf"(?<![\w-]){name}{end}", _flag(name), advice)
+    advice = re.sub(r"\[([^\]]*)\]", lambda match: match[1].replace(", ", ","), advice)
+    return re.sub(r"\{(\w+): (\w+)\}", r"\1=\2", advice).replace("`", "")
 
 
 def _existing_device(context: click.Context, _: click.Parameter, name: str) -> Device:
@@ -82,7 +103,7 @@ _MEASURING = (  # of log and stream; the first three are arguments of Calibrator
     _JSON,
 )
 _READING = tuple(
-    option(_flag(name), name, metavar="VALUE", help=f.description or "a name, or a number from 0")
+    option(_flag(name), name, metavar="VALUE", help=_typed(f.description or _COLUMN, ":"))
     for name, f in ReaderOptions.model_fields.items()
 )
 
@@ -121,13 +142,13 @@ def _parse(text: str) -> Any:
 
 
 def _name_options(message: str) -> str:
-    """A message of a reader, with options of the command line in place of catalog keys."""
+    """A message, with options of the command line in place of catalog keys and arguments."""
+    message = re.sub(_ARGUMENT, lambda match: _flag(match[1].removesuffix("_hz")), message)
     if IN_READER not in message:
         return message
-    text, _, advice = message.replace(f" {IN_READER}", "").partition("; ")
-    for name in sorted(ReaderOptions.model_fields, key=len, reverse=True):
-        advice = re.sub(rf"(?<![\w-])`?{name}\b(?!-):?`?", _flag(name), advice)
-    return f"{text}; {advice}"
+    text, *advice = message.replace(f" {IN_READER}", "").split("; ", 1)
+    named = re.sub(r"`(\w+)\b[^`]*`", lambda match: _typed(match[0]), text)
+    return "; ".join([named, *map(_typed, advice)])
 
 
 def _remark(text: str, colour: str = "yellow") -> None:
@@ -135,16 +156,32 @@ def _remark(text: str, colour: str = "yellow") -> None:
 
 
 def _print(as_json: bool, result: Any, lines: Iterable[str]) -> None:
-    click.echo(json.dumps(result, allow_nan=False) if as_json else "\n".join(lines))
+    """Print a result; nothing more is printed where standard output is full or closed."""
+    try:
+        click.echo(json.dumps(result, allow_nan=False) if as_json else "\n".join(lines))
+    except OSError:
+        sys.stdout = None  # which Python would flush again at the exit
+        raise
 
 
-def _code_of(command: Callable[..., Any], *arguments: Any) -> Any:
+def _changed(as_json: bool, device: str, event: str) -> None:
+    if as_json:
+        _print(True, {"device": device, "event": event}, ())
+
+
+def _code_of(command: Callable[..., Any], *arguments: Any) -> int:
     """The exit code that a command returns, or that of the error it raises, which is shown."""
     try:
-        return command(*arguments)
+        return command(*arguments) or DONE
     except (InputError, RegistryError) as error:
         _remark(_name_options(str(error)), "red")
         return USAGE if isinstance(error, InputError) else NOT_STORED
+    except OSError as error:
+        if error.errno == errno.EPIPE:  # the reader of the results has seen enough
+            return DONE
+        where = error.filename or "standard output"
+        _remark(f"{where}: not read or written: {error.strerror}; give another file", "red")
+        return USAGE
 
 
 class Commands(click.Group):
@@ -152,7 +189,7 @@ class Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> None:
         """Run a command and exit with its code."""
-        ctx.exit(_code_of(super().invoke, ctx) or DONE)
+        ctx.exit(_code_of(super().invoke, ctx))
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
@@ -171,7 +208,7 @@ def _job(store: bool, **values: Any) -> SimpleNamespace:
     job = SimpleNamespace(reader=reader, device=None, **{name: values.pop(name) for name in names})
     if job.plot:
         output.check_plot(job.plot)
-    Calibrator.open(rate_hz=100.0, **values)
+    Calibrator.open(rate_hz=_UNKNOWN_HZ if job.rate_hz is None else job.rate_hz, **values)
     if values["device"] is not None and store:
         job.device = Device(values["registry"], values["device"])
         job.device.create(values["device_type"])
@@ -180,28 +217,45 @@ def _job(store: bool, **values: Any) -> SimpleNamespace:
 
 
 @main.command()
-@argument("files", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
 @_with(*_OPENING, *_MEASURING, *_READING)
 def log(files: tuple[Path, ...], **values: Any) -> int:
     """Calibrate from log files, one after the other."""
     job = _job(**values)
-    if job.plot and len(files) > 1:
-        raise InputError(f"--plot: expected one log, got {len(files)}; plot them one by one")
-    return max(_code_of(_calibrate, path, job) for path in files)
+    for name, value in {"plot": job.plot, **job.opening}.items():
+        if name in _OF_ONE_LOG and value is not None and len(files) > 1:
+            text = f"{_OF_ONE_LOG[name]}: expected one log, got {len(files)}"
+            raise InputError(f"{text}; calibrate them one by one")
+    return max(_answer(job, path.name, _calibrate, path, job) for path in files)
+
+
+def _answer(job: SimpleNamespace, name: str, command: Callable[..., int], *arguments: Any) -> int:
+    """The exit code of a calibration; with --json, a refusal is an object as well.
+
+    A refusal is a matter of usage where an option would help, and else, or where the data
+    contradict the options, of data that cannot be used.
+    """
+    try:
+        return command(*arguments)
+    except InputError as error:
+        sentence = _name_options(str(error))
+        _remark(sentence, "red")
+        if job.as_json:
+            refused = output.refused(sentence, job.opening["device"], source=name)
+            _code_of(_print, True, refused, ())
+        rejected = isinstance(error, Rejected) or "trust: options" in str(error)
+        lacking = IN_READER in str(error) or " --" in sentence
+        missing = isinstance(error.__cause__, FileNotFoundError)
+        return USAGE if missing or (lacking and not rejected) else UNUSABLE
 
 
 def _calibrate(path: Path, job: SimpleNamespace) -> int:
     from gyro_pipeline.readers import read_log  # noqa: PLC0415
 
-    try:
-        recording = read_log(path, job.reader, job.rate_hz)
-    except InputError as error:
-        _remark(_name_options(str(error)), "red")
-        return USAGE if IN_READER in str(error) else UNUSABLE
+    recording = read_log(path, job.reader, job.rate_hz)
     for finding in recording.findings:
         if finding.outcome == "rejected":
-            _remark(_name_options(f"{path}: {finding.check}: {finding.detail}"), "red")
-            return UNUSABLE
+            raise Rejected(f"{path}: {finding.check}: {finding.detail} {IN_READER}")
     rate_hz = recording.rate_hz or job.rate_hz
     if rate_hz is None:
         raise InputError(f"{path}: expected times that show the rate, got none; give --rate")
@@ -227,20 +281,21 @@ def _feed(calibrator: Calibrator, recording: Any, chunk_s: float) -> list[State]
 def _report(
     calibrator: Calibrator, job: SimpleNamespace, states: Sequence[State], source: str, name: str
 ) -> int:
-    """Print, store and plot the result; returns the exit code."""
+    """Store, print and plot the result; returns the exit code."""
     state = calibrator.finish()
-    code = _exit_code(state, job.require_history)
-    if job.as_json or code != UNUSABLE:
-        result = output.as_json(state, job.opening["device"], source=name)
-        _print(job.as_json, result, output.as_text(state))
+    result = _exit_code(state, job.require_history)
+    codes = [result]
+    if job.device is not None and result != UNUSABLE:
+        codes.append(_code_of(_store, calibrator, job, source, name))
+    if job.as_json or result != UNUSABLE:
+        content = output.as_json(state, job.opening["device"], source=name)
+        codes.append(_code_of(_print, job.as_json, content, output.as_text(state)))
     if not job.as_json:
         for sentence in output.notes(state):
-            _remark(sentence, "red" if code in {UNUSABLE, NOT_AT_REST} else "yellow")
-    if job.device is not None and code != UNUSABLE:
-        _store(calibrator, job, source, name)
+            _remark(sentence, "red" if result in {UNUSABLE, NOT_AT_REST} else "yellow")
     if job.plot:
-        output.plot(job.plot, [*states, state])
-    return code
+        codes.append(_code_of(output.plot, job.plot, [*states, state]))
+    return max(codes)
 
 
 def _store(calibrator: Calibrator, job: SimpleNamespace, source: str, name: str) -> None:
@@ -274,34 +329,43 @@ def stream(port: str | None, baud: int, timeout: float, **values: Any) -> int:
     """Calibrate from a live stream until the target is reached; prints a JSON line a second."""
     from gyro_pipeline.calibrator import stream as lines  # noqa: PLC0415
 
-    job = _job(**values)
-    parser, name = lines.Parser(job.reader, job.rate_hz), port or "standard input"
+    if not 0 < timeout <= _LONGEST_S:
+        raise InputError(f"--timeout: expected more than 0 and at most a day, got {timeout:g} s")
+    job, name = _job(**values), port or "standard input"
     job.opening["started_at"] = job.opening["started_at"] or time.time()
-    calibrator, states = None, list[State]()
+    parser = lines.Parser(job.reader, job.rate_hz, port is not None)
+    with lines.interruption() as interrupted, lines.source(port, baud) as descriptor:
+        received = parser.lines_of([descriptor, interrupted], timeout, _remark)
+        return _answer(job, name, _follow, parser, parser.seconds(received), job, name)
 
-    def show(state: State) -> None:
-        click.echo(json.dumps(output.as_json(state, job.opening["device"]), allow_nan=False))
-        states.append(state)
 
-    with lines.source(port, baud) as descriptor:
-        for samples in parser.seconds(lines.lines_of(descriptor, timeout, _remark)):
-            if calibrator is None:  # the first result is that of the history
-                calibrator = Calibrator.open(rate_hz=parser.rate_hz or 0.0, **job.opening)
-                show(calibrator.state())
-            state = calibrator.update(*samples)
-            if int(state.time_s) > int(states[-1].time_s):
-                show(state)
-            if state.done and job.opening["target_mdps"] is not None:
-                break
-    if calibrator is None:
-        text = "expected lines of samples, got none; check the program that sends them"
-        raise InputError(f"stream: {text}")
+def _follow(parser: Any, seconds: Iterable[Any], job: SimpleNamespace, name: str) -> int:
+    """Calibrate until the target is reached, or the samples or standard output end."""
+    calibrator = Calibrator.open(rate_hz=job.rate_hz or _UNKNOWN_HZ, **job.opening)
+    states, target, out, code = [calibrator.state()], job.opening["target_mdps"], sys.stdout, DONE
+
+    def show(state: State) -> int:
+        return _code_of(_print, True, output.as_json(state, job.opening["device"]), ())
+
+    code = show(states[0])  # the history's, before any sample
+    for samples in seconds:
+        if calibrator.setup.rate_hz != parser.rate_hz:
+            calibrator = Calibrator.open(rate_hz=parser.rate_hz, **job.opening)
+        state = calibrator.update(*samples)
+        if int(state.time_s) > int(states[-1].time_s):
+            code = max(code, show(state))
+            states.append(state)
+        if (state.done and target is not None) or sys.stdout is not out:
+            break
+    if not calibrator.counts["samples"]:
+        raise InputError("stream: expected samples, got none; check the program that sends them")
+    parser.check_rate()
     if parser.doubt:
         _remark(parser.doubt)
     if parser.bad:
         _remark(f"{parser.bad} lines were of another shape and were left out")
     source = hashlib.sha256(f"{name} {job.opening['started_at']}".encode()).hexdigest()
-    return _report(calibrator, job, states, source, name)
+    return max(code, _report(calibrator, job, states, source, name))
 
 
 @main.command()

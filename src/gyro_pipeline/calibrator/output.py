@@ -12,6 +12,7 @@ import numpy as np
 from gyro_pipeline.calibrator.calibrator import State
 from gyro_pipeline.calibrator.filter import Array
 from gyro_pipeline.calibrator.history import DROPPED, NONE, STILL, USED
+from gyro_pipeline.calibrator.reasons import Reason
 from gyro_pipeline.calibrator.registry import SET, Device
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 
@@ -32,6 +33,14 @@ def as_json(state: State, device: str | None, **more: Any) -> dict[str, Any]:
         "reasons": [vars(reason) for reason in state.reasons],
         **more,
     }
+
+
+def refused(sentence: str, device: str | None, **more: Any) -> dict[str, Any]:
+    """A refusal as an object with the keys of a result."""
+    nothing = dict.fromkeys(("bias_dps", "sigma_dps", "seconds_left"), [None] * len(AXES))
+    why = [vars(Reason("refused", sentence))]
+    rest: dict[str, Any] = {"rest": None, "seconds_at_rest": 0.0, "history": [NONE] * len(AXES)}
+    return {"device": device, **nothing, **rest, "reasons": why, **more}
 
 
 def numbers(values: Array) -> list[float | None]:
