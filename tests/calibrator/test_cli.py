@@ -122,6 +122,31 @@ def test_what_is_lacking_is_named_as_an_option(csv, tmp_path):
     assert "at rest for 20.0 of 20.0 s" in result.stdout
 
 
+def test_each_log_has_an_answer_and_advice_can_be_typed(csv, tmp_path):
+    (tmp_path / "empty.csv").write_text("")
+    np.save(tmp_path / "still.npy", rates(20))
+    paths = csv(rates(20)), "empty.csv", tmp_path / "still.npy", "missing.csv"
+    answers = [json.loads(line) for line in run("log", *paths, "--json").stdout.splitlines()]
+    assert len({frozenset(answer) for answer in answers}) == 1  # the same keys
+    assert [answer["rest"] for answer in answers] == ["still", None, None, None]
+    bare = csv(rates(20), "bare.csv", header="")
+    wrong_unit = csv(rates(20) * 1000, "mdps.csv")
+    given = ("--columns", "1,2,3", "--units", "deg/s", "--rate", "0")
+    for arguments, code, words in (
+        (("missing.csv",), 2, "missing.csv: cannot be read"),
+        ((bare,), 2, "give --columns, such as gx,gy,gz, and --units"),
+        ((bare, *given), 2, "--rate: expected at least 2 samples"),
+        ((wrong_unit,), 6, "check --units and --scale"),
+        ((bare, "--units", "raw"), 2, "raw and --scale go together"),
+        ((bare, wrong_unit, "--started-at", "2026-01-31"), 2, "--started-at: expected one log"),
+    ):
+        result = run("log", *arguments)
+        assert (result.exit_code, words in result.stderr) == (code, True)
+    assert "such as sensor=1" in " ".join(run("log", "--help").stdout.split())
+    for timeout in ("-1", "nan"):
+        assert "--timeout: expected" in run("stream", "--timeout", timeout).stderr
+
+
 def test_a_registry_that_cannot_be_written_is_said_before_measuring(csv, tmp_path):
     (tmp_path / "file").write_text("")
     about = ("log", csv(rates(20)), "--device", "B17", "--registry", tmp_path / "file")
@@ -136,13 +161,18 @@ def test_plan_says_how_long_or_that_it_is_not_possible():
     assert float(result.stdout.split()[1]) == pytest.approx(seconds, rel=0.01)
     result = run("plan", "--target", "1", "--type", "dot")
     assert (result.exit_code, "not with this sensor: its floor is" in result.stdout) == (3, True)
+    answer, _ = said("plan", "--target", "1", "--type", "dot")
+    assert answer["seconds"][0] is None
+    assert "its floor is" in answer["reasons"][0]
     assert "give --type" in run("plan", "--target", "1").stderr
 
 
 def test_a_bias_that_was_typed_in_stays_until_it_is_forgotten(csv):
-    for bad in (("nan", "-0.1", "0.09"), ("0.5", "-0.1", "0.09", "--sigma", "-1")):
-        result = run("devices", "set", "B17", *bad)
-        assert (result.exit_code, "expected three rates" in result.stderr) == (2, True)
+    zero, lacking = ("0.5", "-0.1", "0.09", "--sigma", "0"), ("0.5", "-0.1", "0.09")
+    bad = {("nan", *zero[1:4], "1"): "expected three rates", zero: "sigma above 0"}
+    for arguments, words in {**bad, lacking: "--sigma"}.items():
+        result = run("devices", "set", "B17", *arguments)
+        assert (result.exit_code, words in result.stderr) == (2, True)
     typed = ("0.5", "-0.1", "0.09", "--sigma", "0.4", "--type", "memsense")
     assert run("devices", "set", "B17", *typed).exit_code == 0
     for seed in range(2):
@@ -150,7 +180,7 @@ def test_a_bias_that_was_typed_in_stays_until_it_is_forgotten(csv):
     answer, _ = said("log", csv(rates(2)), "--device", "B17", "--same-heading", "--no-store")
     assert answer["history"][0] == "dropped"  # x was typed in wrong
     assert "set by hand" in run("log", csv(rates(2)), "--device", "B17", "--no-store").stdout
-    run("devices", "set", "B18", *typed[:3])  # one block of unknown noise has no bound, but JSON
+    run("devices", "set", "B18", *typed[:5])  # one block of unknown noise has no bound, but JSON
     answer, _ = said("log", csv(rates(1)[:60]), "--device", "B18")
     assert [None] * 3 != answer["bias_dps"]
     run("devices", "forget", "B17", "set")
@@ -188,6 +218,17 @@ def test_notes_and_withdrawals_are_appended(csv, tmp_path):
     assert run("devices", "save", "B17", tmp_path / "b17.json").exit_code == 0
     assert run("devices", "load", tmp_path / "b17.json", "--as", "B18").exit_code == 0
     assert json.loads(run("devices", "list", "--json").stdout)[1]["device"] == "B18"
+    noted, _ = said("devices", "note", "B18", "back")
+    assert noted == {"device": "B18", "noted": "back"}
+    assert "not read or written" in run("devices", "save", "B17", tmp_path / "no/b.json").stderr
+    # one device that cannot be read is said, and the others are listed
+    for part, text in (("model.json", "[1]"), ("device.toml", "type =")):
+        (tmp_path / "registry/B18" / part).write_text(text)
+    result = run("devices", "show", "B18")
+    assert (result.exit_code, "model.json: expected figures" in result.stderr) == (2, True)
+    result = run("devices", "list")
+    assert (result.exit_code, "device.toml: expected TOML" in result.stderr) == (2, True)
+    assert result.stdout.startswith("B17")
     assert run("devices", "forget", "B17", "--all").exit_code == 0
     assert run("devices", "show", "B17").exit_code == 2
 

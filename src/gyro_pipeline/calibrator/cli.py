@@ -62,6 +62,7 @@ def _flag(name: str) -> str:
 def _typed(advice: str, end: str = r"\b(?!-):?") -> str:
     """Advice about catalog keys, with options and values as they are typed."""
     advice = re.sub(r"(the sensor's )?\brate_hz(, or samples and recording_s)?", "--rate", advice)
+    advice = advice.replace("scale_dps", "--scale")
     for name in sorted(ReaderOptions.model_fields, key=len, reverse=True):
         advice = re.sub(rf"(?<![\w-]){name}{end}", _flag(name), advice)
     advice = re.sub(r"\[([^\]]*)\]", lambda match: match[1].replace(", ", ","), advice)
@@ -129,8 +130,10 @@ def _read_reader_options(texts: dict[str, str]) -> Any:
         first = error.errors()[0]
         text = first["msg"].removeprefix("Value error, ")
         name, _, rest = text.partition(": ")
-        name, rest = (str(first["loc"][0]), text) if first["loc"] else (name, rest)
-        raise InputError(f"{_flag(name)}: {rest}") from error
+        if first["loc"]:
+            name = str(first["loc"][0])
+            rest = text.removeprefix(f"{name}: ")
+        raise InputError(f"{_flag(name)}: {_typed(rest, ':')}") from error
 
 
 def _parse(text: str) -> Any:
@@ -164,9 +167,9 @@ def _print(as_json: bool, result: Any, lines: Iterable[str]) -> None:
         raise
 
 
-def _changed(as_json: bool, device: str, event: str) -> None:
+def _changed(as_json: bool, device: Device, **what: Any) -> None:
     if as_json:
-        _print(True, {"device": device, "event": event}, ())
+        _print(True, {"device": device.name, **what}, ())
 
 
 def _code_of(command: Callable[..., Any], *arguments: Any) -> int:
@@ -384,8 +387,10 @@ def plan(heading: str | None, as_json: bool, **opening: Any) -> int:
         text = f"expected a device of known noise; give --type ({listed})"
         raise InputError(f"plan: {text} or a --device with history")
     state = calibrator.state()
-    result = {"target_mdps": target_mdps, "seconds": output.numbers(state.seconds_left)}
-    _print(as_json, result, output.planned(state))
+    lines, seconds = list(output.planned(state)), output.numbers(state.seconds_left)
+    reasons = [line for line, needed in zip(lines, seconds, strict=True) if needed is None]
+    result = {"target_mdps": target_mdps, "seconds": seconds, "reasons": reasons}
+    _print(as_json, result, lines)
     return DONE if np.isfinite(state.seconds_left).all() else NOT_REACHED
 
 
@@ -407,13 +412,17 @@ def devices() -> None:
 
 @devices.command("list")
 @_with(_REGISTRY, _JSON)
-def list_devices(registry: Path, as_json: bool) -> None:
+def list_devices(registry: Path, as_json: bool) -> int:
     """List devices, their types and the number of calibrations that count."""
-    rows = [
-        {"device": d.name, "type": d.settings().type, "calibrations": len(d.history())}
-        for d in Device.all(registry)
-    ]
+    rows, codes = [], [DONE]
+
+    def add(device: Device) -> None:
+        counts = {"type": device.settings().type, "calibrations": len(device.history())}
+        rows.append({"device": device.name, **counts})
+
+    codes += [_code_of(add, device) for device in Device.all(registry)]
     _print(as_json, rows, output.device_list(rows, type_names(registry)))
+    return max(codes)
 
 
 @devices.command()
@@ -428,41 +437,43 @@ def show(device: Device, as_json: bool, **_: Any) -> None:
 @_DEVICE
 @argument("text")
 @option("--knocked", is_flag=True, help="it was knocked or dropped: what came before counts less")
-@_REGISTRY
-def note(device: Device, text: str, knocked: bool, **_: Any) -> None:
+@_with(_REGISTRY, _JSON)
+def note(device: Device, text: str, knocked: bool, as_json: bool, **_: Any) -> None:
     """Append a note to the history of a device."""
     device.append({"event": "note", "time": time.time(), "text": text, "knocked": knocked})
+    _changed(as_json, device, noted=text)
 
 
 @devices.command("set", context_settings={"ignore_unknown_options": True})  # -0.1 is a number
 @argument("name")
 @argument("bias_dps", nargs=3, type=float)
-@option("--sigma", type=float, default=0.0, show_default=True, help="its standard deviation, mdps")
-@_with(_REGISTRY, _TYPE)
+@option("--sigma", type=float, required=True, help="its standard deviation, mdps")
+@_with(_REGISTRY, _TYPE, _JSON)
 def set_bias(
     name: str, bias_dps: tuple[float, float, float], sigma: float, registry: Path,
-    device_type: str | None,
+    device_type: str | None, as_json: bool,
 ) -> None:  # fmt: skip
     """Set a bias, deg/s about x, y and z, which replaces the history until it is forgotten."""
-    if not (np.isfinite(bias_dps).all() and 0 <= sigma < np.inf):
+    if not (np.isfinite(bias_dps).all() and 0 < sigma < np.inf):
         text = f"{' '.join(map(str, bias_dps))} --sigma {sigma:g}"
-        raise InputError(f"set: expected three rates in deg/s, and a sigma from 0, got {text}")
+        raise InputError(f"set: expected three rates in deg/s, and a sigma above 0, got {text}")
     device, variance = Device(registry, name), (sigma * MDPS) ** 2
     device.create(device_type)
     typed: Any = {"time": time.time(), "hash": SET, "source": SET, "event": SET}
     device.append(Calibration(bias_dps, (variance,) * 3, knocks=device.knocks(), **typed))
+    _changed(as_json, device, bias_dps=bias_dps)
 
 
 @devices.command()
 @_DEVICE
 @argument("source", required=False)
 @option("--all", "everything", is_flag=True, help="remove the device's folder")
-@_REGISTRY
-def forget(device: Device, source: str | None, everything: bool, **_: Any) -> None:
+@_with(_REGISTRY, _JSON)
+def forget(device: Device, source: str | None, everything: bool, as_json: bool, **_: Any) -> None:
     """Withdraw a calibration by the name or hash of its file; it stays stored without counting."""
     if everything:
         shutil.rmtree(device.folder)
-        return
+        return _changed(as_json, device, forgotten="all")
     stored = device.calibrations()
     by_name = [key for key, c in stored.items() if c.source == source]
     hashes = by_name or [key for key in stored if source and key.startswith(source)]
@@ -471,30 +482,32 @@ def forget(device: Device, source: str | None, everything: bool, **_: Any) -> No
         raise InputError(f"forget: expected one of {listed}, or a hash, got {source!r}; or --all")
     for withdrawn in hashes:
         device.append({"event": "forget", "time": time.time(), "of": withdrawn})
+    _changed(as_json, device, forgotten=hashes)
 
 
 @devices.command()
 @_DEVICE
 @argument("file", type=click.Path(dir_okay=False, path_type=Path))
-@_REGISTRY
-def save(device: Device, file: Path, **_: Any) -> None:
+@_with(_REGISTRY, _JSON)
+def save(device: Device, file: Path, as_json: bool, **_: Any) -> None:
     """Write a device to a file."""
     file.write_text(json.dumps(device.content(), indent=1) + "\n", "utf-8")
+    _changed(as_json, device, saved=str(file))
 
 
 @devices.command()
 @argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @option("--as", "name", help="new name of the device")
-@_REGISTRY
-def load(file: Path, name: str | None, registry: Path) -> None:
+@_with(_REGISTRY, _JSON)
+def load(file: Path, name: str | None, registry: Path, as_json: bool) -> None:
     """Read a device from a file that ``devices save`` wrote; stored lines are kept, once each."""
     try:
         content = json.loads(file.read_text("utf-8"))
-        Device(registry, name or content["device"]).restore(content)
-    except InputError:
-        raise
-    except (ValueError, KeyError, TypeError) as error:
+        device = Device(registry, name or content["device"])
+        device.restore(content, str(file))
+    except (AttributeError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{file}: expected a file from devices save, but: {error!r}") from error
+    _changed(as_json, device, loaded=len(content["lines"]))
 
 
 if __name__ == "__main__":
