@@ -36,16 +36,9 @@ from gyro_pipeline.parameters import ReaderOptions
 
 _ARGUMENT = r"^(rate_hz|target|latitude|since_power_on|type)(?=:)"  # of Calibrator.open
 _LONGEST_S = 86400.0  # of silence
-_OF_ONE_LOG = {
-    "plot": "--plot", "started_at": "--started-at", "since_power_on_s": "--since-power-on",
-}  # fmt: skip
 _UNKNOWN_HZ = 100.0  # stands for the rate before samples show it
 _COLUMN = "a name, or a number from 0"
 DONE, USAGE, NOT_REACHED, NOT_AT_REST, NO_HISTORY, UNUSABLE, NOT_STORED = 0, 2, 3, 4, 5, 6, 7
-
-
-class Rejected(InputError):
-    """Data that quality control rejects, whatever the options."""
 
 
 def _posix_seconds(_: click.Context, __: click.Parameter, text: str | None) -> float | None:
@@ -224,11 +217,11 @@ def _job(store: bool, **values: Any) -> SimpleNamespace:
 @_with(*_OPENING, *_MEASURING, *_READING)
 def log(files: tuple[Path, ...], **values: Any) -> int:
     """Calibrate from log files, one after the other."""
+    for name in ("plot", "started_at", "since_power_on"):  # of one log
+        if values.get(name, values.get(f"{name}_s")) is not None and len(files) > 1:
+            text = f"expected one log, got {len(files)}; calibrate them one by one"
+            raise InputError(f"{_flag(name)}: {text}")
     job = _job(**values)
-    for name, value in {"plot": job.plot, **job.opening}.items():
-        if name in _OF_ONE_LOG and value is not None and len(files) > 1:
-            text = f"{_OF_ONE_LOG[name]}: expected one log, got {len(files)}"
-            raise InputError(f"{text}; calibrate them one by one")
     return max(_answer(job, path.name, _calibrate, path, job) for path in files)
 
 
@@ -244,12 +237,10 @@ def _answer(job: SimpleNamespace, name: str, command: Callable[..., int], *argum
         sentence = _name_options(str(error))
         _remark(sentence, "red")
         if job.as_json:
-            refused = output.refused(sentence, job.opening["device"], source=name)
-            _code_of(_print, True, refused, ())
-        rejected = isinstance(error, Rejected) or "trust: options" in str(error)
-        lacking = IN_READER in str(error) or " --" in sentence
+            _code_of(_print, True, output.refused(sentence, job.opening["device"], name), ())
+        lacking = IN_READER in str(error) and "trust: options" not in str(error)
         missing = isinstance(error.__cause__, FileNotFoundError)
-        return USAGE if missing or (lacking and not rejected) else UNUSABLE
+        return USAGE if missing or lacking or "; give --" in str(error) else UNUSABLE
 
 
 def _calibrate(path: Path, job: SimpleNamespace) -> int:
@@ -258,7 +249,8 @@ def _calibrate(path: Path, job: SimpleNamespace) -> int:
     recording = read_log(path, job.reader, job.rate_hz)
     for finding in recording.findings:
         if finding.outcome == "rejected":
-            raise Rejected(f"{path}: {finding.check}: {finding.detail} {IN_READER}")
+            text = f"{path}: {finding.check}: {finding.detail} {IN_READER}"
+            raise InputError(_name_options(text))
     rate_hz = recording.rate_hz or job.rate_hz
     if rate_hz is None:
         raise InputError(f"{path}: expected times that show the rate, got none; give --rate")

@@ -36,12 +36,11 @@ def as_json(state: State, device: str | None, **more: Any) -> dict[str, Any]:
     }
 
 
-def refused(sentence: str, device: str | None, **more: Any) -> dict[str, Any]:
+def refused(sentence: str, device: str | None, source: str) -> dict[str, Any]:
     """A refusal as an object with the keys of a result."""
-    nothing = dict.fromkeys(("bias_dps", "sigma_dps", "seconds_left"), [None] * len(AXES))
-    why = [vars(Reason("refused", sentence))]
-    rest: dict[str, Any] = {"rest": None, "seconds_at_rest": 0.0, "history": [NONE] * len(AXES)}
-    return {"device": device, **nothing, **rest, "reasons": why, **more}
+    result = dict.fromkeys(("bias_dps", "sigma_dps", "seconds_left"), [None] * len(AXES))
+    rest = {"rest": None, "seconds_at_rest": 0.0, "history": [NONE] * len(AXES), "source": source}
+    return {"device": device, **result, **rest, "reasons": [vars(Reason("refused", sentence))]}
 
 
 def numbers(values: Array) -> list[float | None]:

@@ -33,6 +33,7 @@ _TEMPLATE = """{type}
 # latitude = 32.1    # degrees
 # notes = ""
 """
+_KEYS = {"note": "text", "forget": "of"}  # that these events need
 _TYPE_FIGURES = ("flicker_mdps", "random_walk_mdps_per_rts")
 
 Line = dict[str, Any]
@@ -60,27 +61,6 @@ class Settings:
     latitude: float | None = None  # degrees
     frame: Any = None
     notes: Any = None
-
-
-@dataclass(frozen=True)
-class Note:
-    """A note in the history of a device."""
-
-    event: str
-    text: str
-    time: float | None = None
-    knocked: bool = False
-    schema: int = 1
-
-
-@dataclass(frozen=True)
-class Forget:
-    """The withdrawal of a calibration, by its hash."""
-
-    event: str
-    of: str
-    time: float | None = None
-    schema: int = 1
 
 
 class Device:
@@ -190,11 +170,9 @@ class Device:
         """The figures in ``model.json`` of each axis, with their σ; empty where there is none."""
         try:
             content = json.loads(_read(self.model_path) or "{}")
-            axes = {axis: content[axis] for axis in AXES if axis in content}
-            return content | {
-                axis: {key: (float(value), float(sigma)) for key, (value, sigma) in figures.items()}
-                for axis, figures in axes.items()
-            }
+            for axis in content.keys() & set(AXES):
+                np.reshape([*content[axis].values()], (-1, 2)).astype(float)
+            return dict(content)
         except (AttributeError, TypeError, ValueError) as error:
             text = f"{self.model_path}: expected figures, each with its σ, but: {error}"
             raise InputError(f"{text}; remove it, the next calibration writes it") from error
@@ -260,16 +238,18 @@ def _settings(text: str, where: str | Path) -> Settings:
 
 def _checked(line: Any, where: str) -> Any:
     """The event in a line of the history."""
-    event = line.get("event") if isinstance(line, dict) else line
-    kinds = {"calibration": Calibration, SET: Calibration, "note": Note, "forget": Forget}
-    if not isinstance(event, str) or event not in kinds:
-        text = f"expected {', '.join(kinds)}, got {event!r}; correct it, or remove the line"
-        raise InputError(f"{where}: event: {text}")
-    checked = validated(kinds[event], line, where)
-    variance = getattr(checked, "variance_dps2", None)
-    if variance is not None and not min(variance) >= 0:
-        raise InputError(f"{where}: variance_dps2: expected 0 or more, got {variance}; correct it")
-    return checked
+    line = line if isinstance(line, dict) else {"event": line}
+    event = str(line.get("event"))
+    if isinstance(line.get(_KEYS.get(event, "")), str):
+        return line
+    if event not in ("calibration", SET):
+        text = f"expected a calibration, a note with text, or forget with of, got {line}"
+        raise InputError(f"{where}: {text:.200}; correct it, or remove the line")
+    calibration = validated(Calibration, line, where)
+    if min(calibration.variance_dps2 or [0]) < 0:
+        text = f"variance_dps2: expected 0 or more, got {calibration.variance_dps2}; correct it"
+        raise InputError(f"{where}: {text}")
+    return calibration
 
 
 def _read(path: Path) -> bytes:

@@ -4,6 +4,7 @@ import json
 import os
 import select
 import signal
+import socket
 import sys
 import time
 from collections import Counter
@@ -56,37 +57,29 @@ def source(port: str | None, baud: int) -> Iterator[int]:
 @contextmanager
 def interruption() -> Iterator[int]:
     """A file descriptor to read from after SIGINT or SIGTERM; a second one acts as usual."""
-    reading, writing = os.pipe()
+    reading, writing = socket.socketpair()
     before = {number: signal.getsignal(number) for number in _SIGNALS}
 
     def end(*_: Any) -> None:
-        os.write(writing, b" ")
-        restore()
+        writing.send(b" ")
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
-    def restore() -> None:
+    with reading, writing:
         for number in _SIGNALS:
-            signal.signal(number, before[number])
-
-    for number in _SIGNALS:
-        signal.signal(number, end)
-    try:
-        yield reading
-    finally:
-        restore()
-        os.close(reading)
-        os.close(writing)
+            signal.signal(number, end)
+        try:
+            yield reading.fileno()
+        finally:
+            end()
 
 
 class Parser:
     """Finds the columns in the first lines, as the readers of files do, and parses all lines.
 
     Without ``rate_hz``, the rate is inferred from the times. ``bad`` counts lines of another shape;
-    ``doubt`` says that the times contradict the rate.
-
-    Args:
-        options: Options of the readers.
-        rate_hz: The rate, if it is given.
-        within: Whether the first line may have begun before it was received.
+    ``doubt`` says that the times contradict the rate; ``within`` that the first line may be the end
+    of one.
 
     Raises:
         InputError: An option would change the samples of a file, but not those of a stream.
@@ -118,10 +111,8 @@ class Parser:
             silence_s = time.monotonic() - since
             ready = select.select(descriptors, [], [], max(timeout_s - silence_s, 0))[0]
             if not ready or silence_s > timeout_s:
-                text = f"no usable sample came for {timeout_s:g} s"
-                say(f"{text}; the result is from the samples before")
-                return
-            if ready != [descriptors[0]]:
+                say(f"no usable sample came for {timeout_s:g} s; the result is from those before")
+            if ready != [descriptors[0]] or silence_s > timeout_s:
                 return
             try:
                 data = os.read(descriptors[0], 1 << 16)
