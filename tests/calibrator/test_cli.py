@@ -16,6 +16,8 @@ import pytest
 from click.testing import CliRunner
 
 from gyro_pipeline.calibrator.cli import main
+from gyro_pipeline.calibrator.stream import Parser
+from gyro_pipeline.parameters import ReaderOptions
 
 RATE = 100
 BIAS = np.array([0.412, -0.104, 0.087])
@@ -163,7 +165,7 @@ def test_plan_says_how_long_or_that_it_is_not_possible():
     assert (result.exit_code, "not with this sensor: its floor is" in result.stdout) == (3, True)
     answer, _ = said("plan", "--target", "1", "--type", "dot")
     assert answer["seconds"][0] is None
-    assert "its floor is" in answer["reasons"][0]
+    assert "its floor is" in answer["reasons"][0]["sentence"]
     assert "give --type" in run("plan", "--target", "1").stderr
 
 
@@ -280,6 +282,14 @@ def test_a_stream_with_bursts_comments_or_no_header_is_read_as_a_file():
         last = json.loads(streamed("--json", *options, send=send).stdout.splitlines()[-1])
         assert 11.4 < last["seconds_at_rest"] <= 12
         assert last["sigma_dps"][0] == pytest.approx(5.2e-3 / 12**0.5, rel=0.1)
+
+
+def test_a_first_line_that_may_lack_its_beginning_is_left_out():
+    options = ReaderOptions(columns=(0, 1, 2), units="deg/s", time_column=3, time_units="s")
+    lines = [f"0.1,0.2,0.3,{n / RATE}" for n in range(200)]
+    for within, header, count in ((True, [], 199), (False, [], 200), (True, ["gx,gy,gz,t"], 200)):
+        parser = Parser(options, None, within)
+        assert sum(len(rates) for _, rates, *_ in parser.seconds([header + lines])) == count
 
 
 def test_a_rate_that_changes_is_refused_and_nothing_is_stored():

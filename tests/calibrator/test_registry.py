@@ -116,10 +116,10 @@ def test_lines_and_saved_devices_that_are_invalid_are_refused(device, tmp_path):
     device.append(line(1))
     before, content = device.lines_path.read_bytes(), device.content()
     for text, words in {
-        '{"event": "calibration", "hash": }': "expected JSON",
-        '{"hash": "0002"}': "expected a calibration, a note with text",
-        '{"event": "forget", "time": 0.0}': "expected a .* forget with of, got",
-        '{"event": "note", "time": 0.0}': "expected a .* note with text",
+        '{"event": "calibration", "hash": }': "expected JSON of a calibration",
+        '{"hash": "0002"}': "expected JSON of a calibration",
+        '{"event": "forget", "time": 0.0}': "expected JSON .* forget with of, got",
+        '{"event": "note", "time": 0.0}': "expected JSON .* note with text",
         json.dumps(line(2, variance_dps2=(-1e-6, 1e-6, 1e-6))): "variance_dps2: expected 0 or more",
     }.items():
         device.lines_path.write_bytes(before + text.encode() + b"\n")

@@ -28,10 +28,10 @@ from gyro_pipeline.calibrator import output
 from gyro_pipeline.calibrator.calibrator import Calibrator, State
 from gyro_pipeline.calibrator.device_types import type_names
 from gyro_pipeline.calibrator.history import STILL, USED, Calibration
-from gyro_pipeline.calibrator.reasons import UNUSABLE_CODES
+from gyro_pipeline.calibrator.reasons import UNUSABLE_CODES, Reason
 from gyro_pipeline.calibrator.registry import SET, Device, RegistryError, registry_folder
 from gyro_pipeline.calibrator.stretch import BLOCK_S
-from gyro_pipeline.conventions import IN_READER, MDPS, InputError
+from gyro_pipeline.conventions import AXES, IN_READER, MDPS, InputError
 from gyro_pipeline.parameters import ReaderOptions
 
 _ARGUMENT = r"^(rate_hz|target|latitude|since_power_on|type)(?=:)"  # of Calibrator.open
@@ -337,7 +337,7 @@ def stream(port: str | None, baud: int, timeout: float, **values: Any) -> int:
 def _follow(parser: Any, seconds: Iterable[Any], job: SimpleNamespace, name: str) -> int:
     """Calibrate until the target is reached, or the samples or standard output end."""
     calibrator = Calibrator.open(rate_hz=job.rate_hz or _UNKNOWN_HZ, **job.opening)
-    states, target, out, code = [calibrator.state()], job.opening["target_mdps"], sys.stdout, DONE
+    states, target, out = [calibrator.state()], job.opening["target_mdps"], sys.stdout
 
     def show(state: State) -> int:
         return _code_of(_print, True, output.as_json(state, job.opening["device"]), ())
@@ -380,9 +380,8 @@ def plan(heading: str | None, as_json: bool, **opening: Any) -> int:
         raise InputError(f"plan: {text} or a --device with history")
     state = calibrator.state()
     lines, seconds = list(output.planned(state)), output.numbers(state.seconds_left)
-    reasons = [line for line, needed in zip(lines, seconds, strict=True) if needed is None]
-    result = {"target_mdps": target_mdps, "seconds": seconds, "reasons": reasons}
-    _print(as_json, result, lines)
+    why = [vars(Reason("unreached", lines[n], AXES[n])) for n in range(3) if seconds[n] is None]
+    _print(as_json, {"target_mdps": target_mdps, "seconds": seconds, "reasons": why}, lines)
     return DONE if np.isfinite(state.seconds_left).all() else NOT_REACHED
 
 

@@ -176,7 +176,9 @@ def device_table(device: Device) -> Iterator[str]:
 def _date(line: Mapping[str, Any]) -> str:
     """The time of a line of a history, UTC."""
     seconds = line.get("time")
-    return "-" if seconds is None else f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M}"
+    if not isinstance(seconds, int | float):
+        return "-"
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M}"
 
 
 def check_plot(path: Path) -> None:

@@ -9,7 +9,7 @@ import os
 import re
 import tomllib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -91,15 +91,13 @@ class Device:
             InputError: A line is broken, other than by a crash that cut it off.
         """
         lines = []
-        for number, line in enumerate(_read(self.lines_path).splitlines(), 1):
-            if line.rstrip().endswith(b"}"):
-                where = f"{self.lines_path}: line {number}"
-                try:
-                    lines.append(json.loads(line))
-                except ValueError as error:
-                    text = f"{where}: expected JSON, but: {error}; correct it, or remove the line"
-                    raise InputError(text) from error
-                _checked(lines[-1], where)
+        for number, text in enumerate(_read(self.lines_path).splitlines(), 1):
+            if text.rstrip().endswith(b"}"):
+                line: Any = text
+                with suppress(ValueError):
+                    line = json.loads(text)
+                _checked(line, f"{self.lines_path}: line {number}")
+                lines.append(line)
         return lines
 
     def calibrations(self) -> dict[str, Calibration]:
@@ -238,12 +236,11 @@ def _settings(text: str, where: str | Path) -> Settings:
 
 def _checked(line: Any, where: str) -> Any:
     """The event in a line of the history."""
-    line = line if isinstance(line, dict) else {"event": line}
-    event = str(line.get("event"))
-    if isinstance(line.get(_KEYS.get(event, "")), str):
+    event = str(line.get("event")) if isinstance(line, dict) else None
+    if event in _KEYS and isinstance(line.get(_KEYS[event]), str):
         return line
     if event not in ("calibration", SET):
-        text = f"expected a calibration, a note with text, or forget with of, got {line}"
+        text = f"expected JSON of a calibration, a note with text, or forget with of, got {line}"
         raise InputError(f"{where}: {text:.200}; correct it, or remove the line")
     calibration = validated(Calibration, line, where)
     if min(calibration.variance_dps2 or [0]) < 0:

@@ -143,7 +143,8 @@ class Parser:
                 break
             rows += more
             self._heard += len(more)
-        self._compare_rate(self._times(rows))
+        if self.rate_hz is None:
+            self._compare_rate(self._times(rows))
         step = max(round(self.rate_hz or 1), 1)
         for ready in chain([rows], batches):
             for start in range(0, len(ready), step):
@@ -162,11 +163,7 @@ class Parser:
         return [times, rates, *others]
 
     def check_rate(self) -> None:
-        """Compare the rate with the times of the last seconds, if they last long enough.
-
-        Raises:
-            InputError: They contradict a rate that was inferred.
-        """
+        """Compare the rate with the times of the last seconds, as :meth:`seconds` does at times."""
         if _ptp(stamps := np.array(self._stamps)) > _LEAST_S:
             self._compare_rate(stamps)
 
