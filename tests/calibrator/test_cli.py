@@ -292,6 +292,20 @@ def test_a_first_line_that_may_lack_its_beginning_is_left_out():
         assert sum(len(rates) for _, rates, *_ in parser.seconds([header + lines])) == count
 
 
+@pytest.mark.parametrize("rows", [1, 10, 40])
+def test_a_rate_is_inferred_across_bursts_or_a_gap_however_lines_arrive(rows):
+    options = ReaderOptions(columns=(0, 1, 2), units="deg/s", time_column=3, time_units="s")
+    for burst, gap in ((1, 500), (40, 0)):
+        number = np.arange(2000) + gap * (np.arange(2000) > 1000)
+        times = (number // burst * burst) / RATE + number % burst * 1e-4
+        lines = [f"0.1,0.2,0.3,{time:.4f}" for time in times]
+        parser = Parser(options, None)
+        batches = (lines[start : start + rows] for start in range(0, len(lines), rows))
+        assert sum(len(samples) for _, samples, *_ in parser.seconds(batches)) == len(lines)
+        parser.check_rate()
+        assert parser.rate_hz == pytest.approx(RATE, rel=0.05)
+
+
 def test_a_rate_that_changes_is_refused_and_nothing_is_stored():
     times = np.cumsum(np.where(np.arange(1000) < 300, 0.02, 0.01))
     rows = np.column_stack([times, rates(10)]).tolist()

@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 from gyro_pipeline.conventions import InputError
 
 _HEADER_LINES = 20  # that columns and units are inferred from
-_LEAST_S = 1.0  # of times that the rate is inferred from
+_LEAST_S = 2.0  # of times that the rate is inferred from
 _MOST_S = 10.0  # of times that the rate is compared with at once
 _MOST_OFF = 1.1  # factor between the rate that is used and that of the times
+_MOST_ROWS = 1000  # with one time, after which no other is awaited
+_MOST_MISSING = 1.5  # factor between a rate and the mean one, from which it is that within bursts
 _OF_FILES = {"increments", "repeats", "row", "rows", "signed_bits", "time_is"}  # options
 _COMMENT = "#%/ "  # before a header
 _SIGNALS = signal.SIGINT, signal.SIGTERM
@@ -138,7 +140,7 @@ class Parser:
         if not first:
             return
         rows, batches = self._start(first), map(self._rows, lines)
-        while self.rate_hz is None and 0 < _ptp(self._times(rows)) < _LEAST_S:
+        while self.rate_hz is None and self._awaits_times(rows):
             if (more := next(batches, None)) is None:
                 break
             rows += more
@@ -228,21 +230,43 @@ class Parser:
         times = _columns(np.array(rows), *self._parts[0])
         return np.empty(0) if times is None else times[np.isfinite(times)]
 
+    def _awaits_times(self, rows: list[list[float]]) -> bool:
+        """Whether more times are needed to infer the rate: of a second, or of several bursts."""
+        stamps = self._times(rows)
+        lasts_s = _ptp(stamps)
+        if not lasts_s:
+            return 0 < stamps.size < _MOST_ROWS
+        return lasts_s < _LEAST_S or (lasts_s < _MOST_S and not _is_even(*_rates_of(stamps)))
+
     def _compare_rate(self, stamps: NDArray[np.float64]) -> None:
         """Compare the rate with that of times, by the rule for files, or infer it from them."""
-        from gyro_pipeline.readers.clock import from_stamps  # noqa: PLC0415
-
-        measured = float(f"{from_stamps(stamps, 1.0).rate_hz or 0:.4g}") if len(stamps) > 1 else 0.0
-        if self.rate_hz is None and not measured:
-            text = "expected times that increase, in a column with a unit, or the rate, got neither"
+        measured, mean = _rates_of(stamps)
+        if self.rate_hz is None and not _is_even(measured, mean):
+            text = "expected times at even steps, in a column with a unit, or the rate, got neither"
             raise InputError(f"stream: {text}; give --rate, or --time-column and --time-units")
         self.rate_hz = used = self.rate_hz or measured
-        if not measured or 1 / _MOST_OFF < used / measured < _MOST_OFF:
+        if any(1 / _MOST_OFF < used / rate < _MOST_OFF for rate in (measured, mean) if rate):
             return
+        got = f"{measured or mean:g} samples a second"
         if not self._given:
-            text = f"expected times at one rate, got {used:g} samples a second, then {measured:g}"
+            text = f"expected times at one rate, got {got} after {used:g}"
             raise InputError(f"stream: {text}; give --rate, or send at one rate")
-        self.doubt = f"--rate {used:g}: the times show {measured:g} samples a second"
+        self.doubt = f"--rate {used:g}: the times show {got}"
+
+
+def _rates_of(stamps: NDArray[np.float64]) -> tuple[float, float]:
+    """The rate by the rule for files, without gaps, and the mean rate; 0 where unknown."""
+    from gyro_pipeline.readers.clock import from_stamps  # noqa: PLC0415
+
+    if not _ptp(stamps):
+        return 0.0, 0.0
+    rate, mean = from_stamps(stamps, 1.0).rate_hz or 0.0, (stamps.size - 1) / _ptp(stamps)
+    return float(f"{rate:.4g}"), float(f"{mean:.4g}")
+
+
+def _is_even(rate: float, mean: float) -> bool:
+    """Whether a rate is not that within bursts."""
+    return 0 < rate < _MOST_MISSING * mean
 
 
 def _time_column(file: Any) -> tuple[list[int], float, float]:
