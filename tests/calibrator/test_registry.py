@@ -11,6 +11,7 @@ from dataclasses import asdict
 import pytest
 
 from gyro_pipeline.calibrator import Calibration, Calibrator, registry
+from gyro_pipeline.calibrator.device_types import type_of
 from gyro_pipeline.calibrator.registry import Device, RegistryError, Settings
 from gyro_pipeline.conventions import InputError
 
@@ -106,9 +107,37 @@ def test_a_device_moves_in_one_file_and_is_not_doubled(device, tmp_path):
     content = json.loads(json.dumps(device.content()))
     other = Device(tmp_path / "elsewhere", "B18")
     for _ in range(2):
-        other.restore(content)
+        other.restore(content, "B17.json")
     assert other.lines() == device.lines()
     assert other.settings() == Settings("dot")
+
+
+def test_lines_and_saved_devices_that_are_invalid_are_refused(device, tmp_path):
+    device.append(line(1))
+    before, content = device.lines_path.read_bytes(), device.content()
+    for text, words in {
+        '{"event": "calibration", "hash": }': "expected JSON of a calibration",
+        '{"hash": "0002"}': "expected JSON of a calibration",
+        '{"event": "forget", "time": 0.0}': "expected JSON .* forget with of, got",
+        '{"event": "note", "time": 0.0}': "expected JSON .* note with text",
+        json.dumps(line(2, variance_dps2=(-1e-6, 1e-6, 1e-6))): "variance_dps2: expected 0 or more",
+    }.items():
+        device.lines_path.write_bytes(before + text.encode() + b"\n")
+        with pytest.raises(InputError, match=f"line 2: {words}"):
+            device.lines()
+    other = Device(tmp_path, "B18")
+    for bad in ({"device_toml": "type = 5.5.5"}, {"lines": [line(1), {"event": "forget"}]}):
+        with pytest.raises(InputError, match=r"b17\.json: (device_toml|line 2): "):
+            other.restore({**content, **bad}, "b17.json")
+    assert not other.folder.exists()
+
+
+@pytest.mark.parametrize("name", ["turn_on_mdps", "flicker_mdps", "noise_spread", "conflict_mdps"])
+def test_figures_of_a_type_that_are_negative_are_refused(name):
+    with pytest.raises(InputError, match=f"t.json: {name}: expected 0 or more, got -1"):
+        type_of({name: -1.0}, "t.json")
+    with pytest.raises(InputError, match="warm_up: time_constant_s: expected more than 0"):
+        type_of({"warm_up": {"amplitude_mdps": -3, "spread_mdps": 1, "time_constant_s": 0}}, "t")
 
 
 def test_names_that_are_no_folder_and_settings_that_cannot_be_read_are_refused(device, tmp_path):

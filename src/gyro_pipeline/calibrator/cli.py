@@ -4,6 +4,7 @@ The exit code is the highest of all files: 0 done; 2 usage; 3 target not reached
 5 history not used, with --require-history; 6 data unusable; 7 nothing can be stored.
 """
 
+import errno
 import hashlib
 import json
 import re
@@ -27,12 +28,16 @@ from gyro_pipeline.calibrator import output
 from gyro_pipeline.calibrator.calibrator import Calibrator, State
 from gyro_pipeline.calibrator.device_types import type_names
 from gyro_pipeline.calibrator.history import STILL, USED, Calibration
-from gyro_pipeline.calibrator.reasons import UNUSABLE_CODES
+from gyro_pipeline.calibrator.reasons import UNUSABLE_CODES, Reason
 from gyro_pipeline.calibrator.registry import SET, Device, RegistryError, registry_folder
 from gyro_pipeline.calibrator.stretch import BLOCK_S
-from gyro_pipeline.conventions import IN_READER, MDPS, InputError
+from gyro_pipeline.conventions import AXES, IN_READER, MDPS, InputError
 from gyro_pipeline.parameters import ReaderOptions
 
+_ARGUMENT = r"^(rate_hz|target|latitude|since_power_on|type)(?=:)"  # of Calibrator.open
+_LONGEST_S = 86400.0  # of silence
+_UNKNOWN_HZ = 100.0  # stands for the rate before samples show it
+_COLUMN = "a name, or a number from 0"
 DONE, USAGE, NOT_REACHED, NOT_AT_REST, NO_HISTORY, UNUSABLE, NOT_STORED = 0, 2, 3, 4, 5, 6, 7
 
 
@@ -45,6 +50,16 @@ def _posix_seconds(_: click.Context, __: click.Parameter, text: str | None) -> f
 
 def _flag(name: str) -> str:
     return "--scale" if name == "scale_dps" else "--" + name.replace("_", "-")
+
+
+def _typed(advice: str, end: str = r"\b(?!-):?") -> str:
+    """Advice about catalog keys, with options and values as they are typed."""
+    advice = re.sub(r"(the sensor's )?\brate_hz(, or samples and recording_s)?", "--rate", advice)
+    advice = advice.replace("scale_dps", "--scale")
+    for name in sorted(ReaderOptions.model_fields, key=len, reverse=True):
+        advice = re.sub(rf"(?<![\w-]){name}{end}", _flag(name), advice)
+    advice = re.sub(r"\[([^\]]*)\]", lambda match: match[1].replace(", ", ","), advice)
+    return re.sub(r"\{(\w+): (\w+)\}", r"\1=\2", advice).replace("`", "")
 
 
 def _existing_device(context: click.Context, _: click.Parameter, name: str) -> Device:
@@ -82,7 +97,7 @@ _MEASURING = (  # of log and stream; the first three are arguments of Calibrator
     _JSON,
 )
 _READING = tuple(
-    option(_flag(name), name, metavar="VALUE", help=f.description or "a name, or a number from 0")
+    option(_flag(name), name, metavar="VALUE", help=_typed(f.description or _COLUMN, ":"))
     for name, f in ReaderOptions.model_fields.items()
 )
 
@@ -108,8 +123,10 @@ def _read_reader_options(texts: dict[str, str]) -> Any:
         first = error.errors()[0]
         text = first["msg"].removeprefix("Value error, ")
         name, _, rest = text.partition(": ")
-        name, rest = (str(first["loc"][0]), text) if first["loc"] else (name, rest)
-        raise InputError(f"{_flag(name)}: {rest}") from error
+        if first["loc"]:
+            name = str(first["loc"][0])
+            rest = text.removeprefix(f"{name}: ")
+        raise InputError(f"{_flag(name)}: {_typed(rest, ':')}") from error
 
 
 def _parse(text: str) -> Any:
@@ -121,13 +138,13 @@ def _parse(text: str) -> Any:
 
 
 def _name_options(message: str) -> str:
-    """A message of a reader, with options of the command line in place of catalog keys."""
+    """A message, with options of the command line in place of catalog keys and arguments."""
+    message = re.sub(_ARGUMENT, lambda match: _flag(match[1].removesuffix("_hz")), message)
     if IN_READER not in message:
         return message
-    text, _, advice = message.replace(f" {IN_READER}", "").partition("; ")
-    for name in sorted(ReaderOptions.model_fields, key=len, reverse=True):
-        advice = re.sub(rf"(?<![\w-])`?{name}\b(?!-):?`?", _flag(name), advice)
-    return f"{text}; {advice}"
+    text, *advice = message.replace(f" {IN_READER}", "").split("; ", 1)
+    named = re.sub(r"`(\w+)\b[^`]*`", lambda match: _typed(match[0]), text)
+    return "; ".join([named, *map(_typed, advice)])
 
 
 def _remark(text: str, colour: str = "yellow") -> None:
@@ -135,16 +152,32 @@ def _remark(text: str, colour: str = "yellow") -> None:
 
 
 def _print(as_json: bool, result: Any, lines: Iterable[str]) -> None:
-    click.echo(json.dumps(result, allow_nan=False) if as_json else "\n".join(lines))
+    """Print a result; nothing more is printed where standard output is full or closed."""
+    try:
+        click.echo(json.dumps(result, allow_nan=False) if as_json else "\n".join(lines))
+    except OSError:
+        sys.stdout = None  # which Python would flush again at the exit
+        raise
 
 
-def _code_of(command: Callable[..., Any], *arguments: Any) -> Any:
+def _changed(as_json: bool, device: Device, **what: Any) -> None:
+    if as_json:
+        _print(True, {"device": device.name, **what}, ())
+
+
+def _code_of(command: Callable[..., Any], *arguments: Any) -> int:
     """The exit code that a command returns, or that of the error it raises, which is shown."""
     try:
-        return command(*arguments)
+        return command(*arguments) or DONE
     except (InputError, RegistryError) as error:
         _remark(_name_options(str(error)), "red")
         return USAGE if isinstance(error, InputError) else NOT_STORED
+    except OSError as error:
+        if error.errno == errno.EPIPE:  # the reader of the results has seen enough
+            return DONE
+        where = error.filename or "standard output"
+        _remark(f"{where}: not read or written: {error.strerror}; give another file", "red")
+        return USAGE
 
 
 class Commands(click.Group):
@@ -152,7 +185,7 @@ class Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> None:
         """Run a command and exit with its code."""
-        ctx.exit(_code_of(super().invoke, ctx) or DONE)
+        ctx.exit(_code_of(super().invoke, ctx))
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
@@ -171,7 +204,7 @@ def _job(store: bool, **values: Any) -> SimpleNamespace:
     job = SimpleNamespace(reader=reader, device=None, **{name: values.pop(name) for name in names})
     if job.plot:
         output.check_plot(job.plot)
-    Calibrator.open(rate_hz=100.0, **values)
+    Calibrator.open(rate_hz=_UNKNOWN_HZ if job.rate_hz is None else job.rate_hz, **values)
     if values["device"] is not None and store:
         job.device = Device(values["registry"], values["device"])
         job.device.create(values["device_type"])
@@ -180,28 +213,44 @@ def _job(store: bool, **values: Any) -> SimpleNamespace:
 
 
 @main.command()
-@argument("files", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
 @_with(*_OPENING, *_MEASURING, *_READING)
 def log(files: tuple[Path, ...], **values: Any) -> int:
     """Calibrate from log files, one after the other."""
+    for name in ("plot", "started_at", "since_power_on"):  # of one log
+        if values.get(name, values.get(f"{name}_s")) is not None and len(files) > 1:
+            text = f"expected one log, got {len(files)}; calibrate them one by one"
+            raise InputError(f"{_flag(name)}: {text}")
     job = _job(**values)
-    if job.plot and len(files) > 1:
-        raise InputError(f"--plot: expected one log, got {len(files)}; plot them one by one")
-    return max(_code_of(_calibrate, path, job) for path in files)
+    return max(_answer(job, path.name, _calibrate, path, job) for path in files)
+
+
+def _answer(job: SimpleNamespace, name: str, command: Callable[..., int], *arguments: Any) -> int:
+    """The exit code of a calibration; with --json, a refusal is an object as well.
+
+    A refusal is a matter of usage where an option would help, and else, or where the data
+    contradict the options, of data that cannot be used.
+    """
+    try:
+        return command(*arguments)
+    except InputError as error:
+        sentence = _name_options(str(error))
+        _remark(sentence, "red")
+        if job.as_json:
+            _code_of(_print, True, output.refused(sentence, job.opening["device"], name), ())
+        lacking = IN_READER in str(error) and "trust: options" not in str(error)
+        missing = isinstance(error.__cause__, FileNotFoundError)
+        return USAGE if missing or lacking or "; give --" in str(error) else UNUSABLE
 
 
 def _calibrate(path: Path, job: SimpleNamespace) -> int:
     from gyro_pipeline.readers import read_log  # noqa: PLC0415
 
-    try:
-        recording = read_log(path, job.reader, job.rate_hz)
-    except InputError as error:
-        _remark(_name_options(str(error)), "red")
-        return USAGE if IN_READER in str(error) else UNUSABLE
+    recording = read_log(path, job.reader, job.rate_hz)
     for finding in recording.findings:
         if finding.outcome == "rejected":
-            _remark(_name_options(f"{path}: {finding.check}: {finding.detail}"), "red")
-            return UNUSABLE
+            text = f"{path}: {finding.check}: {finding.detail} {IN_READER}"
+            raise InputError(_name_options(text))
     rate_hz = recording.rate_hz or job.rate_hz
     if rate_hz is None:
         raise InputError(f"{path}: expected times that show the rate, got none; give --rate")
@@ -227,20 +276,21 @@ def _feed(calibrator: Calibrator, recording: Any, chunk_s: float) -> list[State]
 def _report(
     calibrator: Calibrator, job: SimpleNamespace, states: Sequence[State], source: str, name: str
 ) -> int:
-    """Print, store and plot the result; returns the exit code."""
+    """Store, print and plot the result; returns the exit code."""
     state = calibrator.finish()
-    code = _exit_code(state, job.require_history)
-    if job.as_json or code != UNUSABLE:
-        result = output.as_json(state, job.opening["device"], source=name)
-        _print(job.as_json, result, output.as_text(state))
+    result = _exit_code(state, job.require_history)
+    codes = [result]
+    if job.device is not None and result != UNUSABLE:
+        codes.append(_code_of(_store, calibrator, job, source, name))
+    if job.as_json or result != UNUSABLE:
+        content = output.as_json(state, job.opening["device"], source=name)
+        codes.append(_code_of(_print, job.as_json, content, output.as_text(state)))
     if not job.as_json:
         for sentence in output.notes(state):
-            _remark(sentence, "red" if code in {UNUSABLE, NOT_AT_REST} else "yellow")
-    if job.device is not None and code != UNUSABLE:
-        _store(calibrator, job, source, name)
+            _remark(sentence, "red" if result in {UNUSABLE, NOT_AT_REST} else "yellow")
     if job.plot:
-        output.plot(job.plot, [*states, state])
-    return code
+        codes.append(_code_of(output.plot, job.plot, [*states, state]))
+    return max(codes)
 
 
 def _store(calibrator: Calibrator, job: SimpleNamespace, source: str, name: str) -> None:
@@ -274,34 +324,43 @@ def stream(port: str | None, baud: int, timeout: float, **values: Any) -> int:
     """Calibrate from a live stream until the target is reached; prints a JSON line a second."""
     from gyro_pipeline.calibrator import stream as lines  # noqa: PLC0415
 
-    job = _job(**values)
-    parser, name = lines.Parser(job.reader, job.rate_hz), port or "standard input"
+    if not 0 < timeout <= _LONGEST_S:
+        raise InputError(f"--timeout: expected more than 0 and at most a day, got {timeout:g} s")
+    job, name = _job(**values), port or "standard input"
     job.opening["started_at"] = job.opening["started_at"] or time.time()
-    calibrator, states = None, list[State]()
+    parser = lines.Parser(job.reader, job.rate_hz, port is not None)
+    with lines.interruption() as interrupted, lines.source(port, baud) as descriptor:
+        received = parser.lines_of([descriptor, interrupted], timeout, _remark)
+        return _answer(job, name, _follow, parser, parser.seconds(received), job, name)
 
-    def show(state: State) -> None:
-        click.echo(json.dumps(output.as_json(state, job.opening["device"]), allow_nan=False))
-        states.append(state)
 
-    with lines.source(port, baud) as descriptor:
-        for samples in parser.seconds(lines.lines_of(descriptor, timeout, _remark)):
-            if calibrator is None:  # the first result is that of the history
-                calibrator = Calibrator.open(rate_hz=parser.rate_hz or 0.0, **job.opening)
-                show(calibrator.state())
-            state = calibrator.update(*samples)
-            if int(state.time_s) > int(states[-1].time_s):
-                show(state)
-            if state.done and job.opening["target_mdps"] is not None:
-                break
-    if calibrator is None:
-        text = "expected lines of samples, got none; check the program that sends them"
-        raise InputError(f"stream: {text}")
+def _follow(parser: Any, seconds: Iterable[Any], job: SimpleNamespace, name: str) -> int:
+    """Calibrate until the target is reached, or the samples or standard output end."""
+    calibrator = Calibrator.open(rate_hz=job.rate_hz or _UNKNOWN_HZ, **job.opening)
+    states, target, out = [calibrator.state()], job.opening["target_mdps"], sys.stdout
+
+    def show(state: State) -> int:
+        return _code_of(_print, True, output.as_json(state, job.opening["device"]), ())
+
+    code = show(states[0])  # the history's, before any sample
+    for samples in seconds:
+        if calibrator.setup.rate_hz != parser.rate_hz:
+            calibrator = Calibrator.open(rate_hz=parser.rate_hz, **job.opening)
+        state = calibrator.update(*samples)
+        if int(state.time_s) > int(states[-1].time_s):
+            code = max(code, show(state))
+            states.append(state)
+        if (state.done and target is not None) or sys.stdout is not out:
+            break
+    if not calibrator.counts["samples"]:
+        raise InputError("stream: expected samples, got none; check the program that sends them")
+    parser.check_rate()
     if parser.doubt:
         _remark(parser.doubt)
     if parser.bad:
         _remark(f"{parser.bad} lines were of another shape and were left out")
     source = hashlib.sha256(f"{name} {job.opening['started_at']}".encode()).hexdigest()
-    return _report(calibrator, job, states, source, name)
+    return max(code, _report(calibrator, job, states, source, name))
 
 
 @main.command()
@@ -320,8 +379,9 @@ def plan(heading: str | None, as_json: bool, **opening: Any) -> int:
         text = f"expected a device of known noise; give --type ({listed})"
         raise InputError(f"plan: {text} or a --device with history")
     state = calibrator.state()
-    result = {"target_mdps": target_mdps, "seconds": output.numbers(state.seconds_left)}
-    _print(as_json, result, output.planned(state))
+    lines, seconds = list(output.planned(state)), output.numbers(state.seconds_left)
+    why = [vars(Reason("unreached", lines[n], AXES[n])) for n in range(3) if seconds[n] is None]
+    _print(as_json, {"target_mdps": target_mdps, "seconds": seconds, "reasons": why}, lines)
     return DONE if np.isfinite(state.seconds_left).all() else NOT_REACHED
 
 
@@ -343,13 +403,17 @@ def devices() -> None:
 
 @devices.command("list")
 @_with(_REGISTRY, _JSON)
-def list_devices(registry: Path, as_json: bool) -> None:
+def list_devices(registry: Path, as_json: bool) -> int:
     """List devices, their types and the number of calibrations that count."""
-    rows = [
-        {"device": d.name, "type": d.settings().type, "calibrations": len(d.history())}
-        for d in Device.all(registry)
-    ]
+    rows, codes = [], [DONE]
+
+    def add(device: Device) -> None:
+        counts = {"type": device.settings().type, "calibrations": len(device.history())}
+        rows.append({"device": device.name, **counts})
+
+    codes += [_code_of(add, device) for device in Device.all(registry)]
     _print(as_json, rows, output.device_list(rows, type_names(registry)))
+    return max(codes)
 
 
 @devices.command()
@@ -364,41 +428,43 @@ def show(device: Device, as_json: bool, **_: Any) -> None:
 @_DEVICE
 @argument("text")
 @option("--knocked", is_flag=True, help="it was knocked or dropped: what came before counts less")
-@_REGISTRY
-def note(device: Device, text: str, knocked: bool, **_: Any) -> None:
+@_with(_REGISTRY, _JSON)
+def note(device: Device, text: str, knocked: bool, as_json: bool, **_: Any) -> None:
     """Append a note to the history of a device."""
     device.append({"event": "note", "time": time.time(), "text": text, "knocked": knocked})
+    _changed(as_json, device, noted=text)
 
 
 @devices.command("set", context_settings={"ignore_unknown_options": True})  # -0.1 is a number
 @argument("name")
 @argument("bias_dps", nargs=3, type=float)
-@option("--sigma", type=float, default=0.0, show_default=True, help="its standard deviation, mdps")
-@_with(_REGISTRY, _TYPE)
+@option("--sigma", type=float, required=True, help="its standard deviation, mdps")
+@_with(_REGISTRY, _TYPE, _JSON)
 def set_bias(
     name: str, bias_dps: tuple[float, float, float], sigma: float, registry: Path,
-    device_type: str | None,
+    device_type: str | None, as_json: bool,
 ) -> None:  # fmt: skip
     """Set a bias, deg/s about x, y and z, which replaces the history until it is forgotten."""
-    if not (np.isfinite(bias_dps).all() and 0 <= sigma < np.inf):
+    if not (np.isfinite(bias_dps).all() and 0 < sigma < np.inf):
         text = f"{' '.join(map(str, bias_dps))} --sigma {sigma:g}"
-        raise InputError(f"set: expected three rates in deg/s, and a sigma from 0, got {text}")
+        raise InputError(f"set: expected three rates in deg/s, and a sigma above 0, got {text}")
     device, variance = Device(registry, name), (sigma * MDPS) ** 2
     device.create(device_type)
     typed: Any = {"time": time.time(), "hash": SET, "source": SET, "event": SET}
     device.append(Calibration(bias_dps, (variance,) * 3, knocks=device.knocks(), **typed))
+    _changed(as_json, device, bias_dps=bias_dps)
 
 
 @devices.command()
 @_DEVICE
 @argument("source", required=False)
 @option("--all", "everything", is_flag=True, help="remove the device's folder")
-@_REGISTRY
-def forget(device: Device, source: str | None, everything: bool, **_: Any) -> None:
+@_with(_REGISTRY, _JSON)
+def forget(device: Device, source: str | None, everything: bool, as_json: bool, **_: Any) -> None:
     """Withdraw a calibration by the name or hash of its file; it stays stored without counting."""
     if everything:
         shutil.rmtree(device.folder)
-        return
+        return _changed(as_json, device, forgotten="all")
     stored = device.calibrations()
     by_name = [key for key, c in stored.items() if c.source == source]
     hashes = by_name or [key for key in stored if source and key.startswith(source)]
@@ -407,30 +473,32 @@ def forget(device: Device, source: str | None, everything: bool, **_: Any) -> No
         raise InputError(f"forget: expected one of {listed}, or a hash, got {source!r}; or --all")
     for withdrawn in hashes:
         device.append({"event": "forget", "time": time.time(), "of": withdrawn})
+    _changed(as_json, device, forgotten=hashes)
 
 
 @devices.command()
 @_DEVICE
 @argument("file", type=click.Path(dir_okay=False, path_type=Path))
-@_REGISTRY
-def save(device: Device, file: Path, **_: Any) -> None:
+@_with(_REGISTRY, _JSON)
+def save(device: Device, file: Path, as_json: bool, **_: Any) -> None:
     """Write a device to a file."""
     file.write_text(json.dumps(device.content(), indent=1) + "\n", "utf-8")
+    _changed(as_json, device, saved=str(file))
 
 
 @devices.command()
 @argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @option("--as", "name", help="new name of the device")
-@_REGISTRY
-def load(file: Path, name: str | None, registry: Path) -> None:
+@_with(_REGISTRY, _JSON)
+def load(file: Path, name: str | None, registry: Path, as_json: bool) -> None:
     """Read a device from a file that ``devices save`` wrote; stored lines are kept, once each."""
     try:
         content = json.loads(file.read_text("utf-8"))
-        Device(registry, name or content["device"]).restore(content)
-    except InputError:
-        raise
-    except (ValueError, KeyError, TypeError) as error:
+        device = Device(registry, name or content["device"])
+        device.restore(content, str(file))
+    except (AttributeError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{file}: expected a file from devices save, but: {error!r}") from error
+    _changed(as_json, device, loaded=len(content["lines"]))
 
 
 if __name__ == "__main__":

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 Axes = float | tuple[float, float, float]  # for all axes, or for x, y and z
 
 
-_POSITIVE = "noise_mdps_rts", "turn_on_factor", "walk_factor"
+_POSITIVE = {"noise_mdps_rts", "turn_on_factor", "walk_factor", "warm_up: time_constant_s"}
+_OF_ANY_SIGN = {"temperature_slope_mdps_per_c", "warm_up: amplitude_mdps"}
 
 
 @dataclass(frozen=True)
@@ -125,12 +126,14 @@ def _folders(registry: Path | None) -> list[Any]:
 def type_of(content: Mapping[str, Any], where: str) -> DeviceType:
     """The device type that the content of a file describes."""
     device_type: DeviceType = validated(DeviceType, content, where)
-    positive = {name: getattr(device_type, name) for name in _POSITIVE}
-    if device_type.warm_up is not None:
-        positive["warm_up: time_constant_s"] = device_type.warm_up.time_constant_s
-    for name, value in positive.items():
-        if value is not None and not np.all(np.greater(value, 0)):
-            raise InputError(f"{where}: {name}: expected more than 0, got {value}; correct it")
+    warm_up = vars(device_type.warm_up) if device_type.warm_up else {}
+    figures = {f"warm_up: {name}": value for name, value in warm_up.items()}
+    for name, value in {**vars(device_type), **figures}.items():
+        if not isinstance(value, float | tuple) or name in _OF_ANY_SIGN:
+            continue
+        least = "more than 0" if name in _POSITIVE else "0 or more"
+        if not (np.min(value) > 0 or (np.min(value) == 0 and name not in _POSITIVE)):
+            raise InputError(f"{where}: {name}: expected {least}, got {value}; correct it")
     return device_type
 
 

@@ -3,6 +3,7 @@
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from gyro_pipeline.calibrator.calibrator import State
 from gyro_pipeline.calibrator.filter import Array
 from gyro_pipeline.calibrator.history import DROPPED, NONE, STILL, USED
+from gyro_pipeline.calibrator.reasons import Reason
 from gyro_pipeline.calibrator.registry import SET, Device
 from gyro_pipeline.conventions import AXES, MDPS, InputError
 
@@ -32,6 +34,13 @@ def as_json(state: State, device: str | None, **more: Any) -> dict[str, Any]:
         "reasons": [vars(reason) for reason in state.reasons],
         **more,
     }
+
+
+def refused(sentence: str, device: str | None, source: str) -> dict[str, Any]:
+    """A refusal as an object with the keys of a result."""
+    result = dict.fromkeys(("bias_dps", "sigma_dps", "seconds_left"), [None] * len(AXES))
+    rest = {"rest": None, "seconds_at_rest": 0.0, "history": [NONE] * len(AXES), "source": source}
+    return {"device": device, **result, **rest, "reasons": [vars(Reason("refused", sentence))]}
 
 
 def numbers(values: Array) -> list[float | None]:
@@ -136,13 +145,20 @@ def device_list(rows: Sequence[Mapping[str, Any]], types: Sequence[str]) -> Iter
 
 def device_table(device: Device) -> Iterator[str]:
     """The history of a device, its fitted model, and how often it was not at rest."""
-    yield f"{'source':<24}{'rest':>8}{'s':>8}  {'bias, deg/s':^36}{'σ, mdps':^20}  history"
+    yield (
+        f"{'time, UTC':<17}{'source':<24}{'rest':>7}{'s':>7}{'°C':>6}  {'bias, deg/s':^36}"
+        f"{'σ, mdps':^20}  history"
+    )
     stored, counting = device.calibrations(), device.history()
     for line in device.lines():
         if line["event"] == "note":
-            yield f"note{' of a knock' * bool(line.get('knocked'))}: {line['text']}"
+            what = "note of a knock" if line.get("knocked") else "note"
+            yield f"{_date(line):<17}{what}: {line['text']}"
         elif line["event"] != "forget":
-            head = f"{line['source'][:23]:<24}{line['rest']:>8}{line['seconds']:8.1f}"
+            celsius = (line.get("temperature_c") or [math.nan])[0]
+            celsius = "-" if math.isnan(celsius) else f"{celsius:.1f}"
+            head = f"{_date(line):<17}{line['source'][:23]:<24}{line['rest']:>7}"
+            head += f"{line['seconds']:7.1f}{celsius:>6}"
             mean = "".join(f"{m:+12.6f}" for m in line["mean_dps"] or [])
             sigma = "".join(f"{v**0.5 / MDPS:7.2f}" for v in line["variance_dps2"] or [])
             out = "" if stored.get(line["hash"]) in counting else "  (does not count)"
@@ -155,6 +171,14 @@ def device_table(device: Device) -> Iterator[str]:
     dropped = sum(DROPPED in c.outcome for c in attempts)
     failed = sum(c.rest != STILL for c in attempts)
     yield f"{len(attempts)} attempts: {failed} not at rest, {dropped} dropped the history"
+
+
+def _date(line: Mapping[str, Any]) -> str:
+    """The time of a line of a history, UTC."""
+    seconds = line.get("time")
+    if not isinstance(seconds, int | float):
+        return "-"
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M}"
 
 
 def check_plot(path: Path) -> None:

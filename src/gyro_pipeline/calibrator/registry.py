@@ -10,7 +10,7 @@ import re
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ _TEMPLATE = """{type}
 # latitude = 32.1    # degrees
 # notes = ""
 """
+_KEYS = {"note": "text", "forget": "of"}  # that these events need
 _TYPE_FIGURES = ("flicker_mdps", "random_walk_mdps_per_rts")
 
 Line = dict[str, Any]
@@ -81,35 +82,35 @@ class Device:
 
     def settings(self) -> Settings:
         """The settings in ``device.toml``; the defaults where there is none."""
-        where, keys = str(self.settings_path), sorted(field.name for field in fields(Settings))
-        try:
-            content = tomllib.loads(_read(self.settings_path).decode())
-        except ValueError as error:
-            raise InputError(f"{where}: expected TOML, but: {error}; correct it") from error
-        if extra := sorted(content.keys() - keys):
-            raise InputError(f"{where}: expected {', '.join(keys)}, got {extra}; correct it")
-        settings: Settings = validated(Settings, content, where)
-        return settings
+        return _settings(_read(self.settings_path).decode("utf-8", "replace"), self.settings_path)
 
     def lines(self) -> list[Line]:
-        """All complete lines of the history, the oldest first."""
+        """All complete lines of the history, the oldest first.
+
+        Raises:
+            InputError: A line is broken, other than by a crash that cut it off.
+        """
         lines = []
-        for line in _read(self.lines_path).split(b"\n"):
-            with suppress(ValueError):
-                lines.append(json.loads(line))
-        return [line for line in lines if isinstance(line, dict) and "event" in line]
+        for number, text in enumerate(_read(self.lines_path).splitlines(), 1):
+            if text.rstrip().endswith(b"}"):
+                line: Any = text
+                with suppress(ValueError):
+                    line = json.loads(text)
+                _checked(line, f"{self.lines_path}: line {number}")
+                lines.append(line)
+        return lines
 
     def calibrations(self) -> dict[str, Calibration]:
         """Calibrations and failed attempts that were not withdrawn, by hash."""
         stored: dict[str, Calibration] = {}
-        for number, line in enumerate(self.lines(), 1):
-            if line["event"] in ("calibration", SET):
-                calibration = validated(Calibration, line, f"{self.lines_path}: line {number}")
+        for line in self.lines():
+            if line["event"] == "forget":
+                stored.pop(line["of"], None)
+            elif line["event"] != "note":
+                calibration = _checked(line, str(self.lines_path))
                 if calibration.event == SET:
                     stored.pop(SET, None)
                 stored.setdefault(calibration.hash, calibration)
-            elif line["event"] == "forget":
-                stored.pop(line["of"], None)
         return stored
 
     def knocks(self) -> int:
@@ -164,8 +165,15 @@ class Device:
             os.replace(temporary, self.model_path)
 
     def model(self) -> dict[str, Any]:
-        """The content of ``model.json``; empty where there is none."""
-        return dict(json.loads(_read(self.model_path) or "{}"))
+        """The figures in ``model.json`` of each axis, with their σ; empty where there is none."""
+        try:
+            content = json.loads(_read(self.model_path) or "{}")
+            for axis in content.keys() & set(AXES):
+                np.reshape([*content[axis].values()], (-1, 2)).astype(float)
+            return dict(content)
+        except (AttributeError, TypeError, ValueError) as error:
+            text = f"{self.model_path}: expected figures, each with its σ, but: {error}"
+            raise InputError(f"{text}; remove it, the next calibration writes it") from error
 
     def create(self, device_type: str | None = None, settings: str = "") -> None:
         """Create the folder and ``device.toml`` where they are missing; check that a line fits.
@@ -185,9 +193,16 @@ class Device:
         settings = _read(self.settings_path).decode()
         return {"device": self.name, "device_toml": settings, "lines": self.lines()}
 
-    def restore(self, content: Mapping[str, Any]) -> None:
-        """Add the lines of a saved device that are not stored yet, and its settings if missing."""
+    def restore(self, content: Mapping[str, Any], where: str) -> None:
+        """Add the lines of a saved device that are not stored yet, and its settings if missing.
+
+        Raises:
+            InputError: A line or the settings are invalid; then nothing is added.
+        """
         lines, stored = list(content["lines"]), self.lines()
+        _settings(content["device_toml"], f"{where}: device_toml")
+        for number, line in enumerate(lines, 1):
+            _checked(line, f"{where}: line {number}")
         self.create(settings=content["device_toml"])
         for line in lines:
             if line not in stored:
@@ -205,6 +220,33 @@ class Device:
         except OSError as error:
             text = f"{self.folder}: nothing can be stored: {error.strerror or error}"
             raise RegistryError(f"{text}; give another --registry, or --no-store") from error
+
+
+def _settings(text: str, where: str | Path) -> Settings:
+    """The settings in the text of ``device.toml``."""
+    try:
+        content = tomllib.loads(text)
+    except ValueError as error:
+        raise InputError(f"{where}: expected TOML, but: {error}; correct it") from error
+    if extra := sorted(content.keys() - (keys := Settings.__dataclass_fields__.keys())):
+        raise InputError(f"{where}: expected {', '.join(sorted(keys))}, got {extra}; correct it")
+    settings: Settings = validated(Settings, content, str(where))
+    return settings
+
+
+def _checked(line: Any, where: str) -> Any:
+    """The event in a line of the history."""
+    event = str(line.get("event")) if isinstance(line, dict) else None
+    if event in _KEYS and isinstance(line.get(_KEYS[event]), str):
+        return line
+    if event not in ("calibration", SET):
+        text = f"expected JSON of a calibration, a note with text, or forget with of, got {line}"
+        raise InputError(f"{where}: {text:.200}; correct it, or remove the line")
+    calibration = validated(Calibration, line, where)
+    if min(calibration.variance_dps2 or [0]) < 0:
+        text = f"variance_dps2: expected 0 or more, got {calibration.variance_dps2}; correct it"
+        raise InputError(f"{where}: {text}")
+    return calibration
 
 
 def _read(path: Path) -> bytes:
