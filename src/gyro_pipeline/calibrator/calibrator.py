@@ -18,13 +18,7 @@ from numpy.typing import ArrayLike
 from gyro_pipeline.calibrator.device_types import DeviceType, read_type
 from gyro_pipeline.calibrator.filter import Array
 from gyro_pipeline.calibrator.history import MOVING, STILL, UNSURE, Calibration, Circumstances
-from gyro_pipeline.calibrator.reasons import (
-    UNUSABLE_CODES,
-    Reason,
-    reason,
-    reasons_of,
-    unit_reason,
-)
+from gyro_pipeline.calibrator.reasons import UNUSABLE_CODES, Reason, reason, reasons_of, unit_reason
 from gyro_pipeline.calibrator.rest import ATTITUDE, MOTION, NOISE, Alarm, Blocks
 from gyro_pipeline.calibrator.stretch import BLOCK_S, LEAST_S, Setup, Stretch
 from gyro_pipeline.conventions import MDPS, InputError

@@ -17,8 +17,7 @@ is 4.18 sin(phi) u plus, on axis i, a horizontal part of variance (4.18 cos phi)
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -36,10 +35,7 @@ _DAY_S = 86400.0
 _GRID = (11, 9)  # points of tau and of the walk, over 2.5 standard deviations on both sides
 _MAX_CALIBRATIONS = 100  # the latest ones are used
 _MIN_DPS = 1e-3 * MDPS
-_COUNTS_LESS = "which counts less"  # the history, for a temperature
-_NO_EFFECT = (
-    "but σ leaves this out: the type does not give temperature_spread_mdps_per_c for all axes"
-)
+_LEFT_OUT = "but σ leaves this out; give the type temperature_spread_mdps_per_c, for all axes"
 _MIN_UNKNOWN_C = 5.0  # the least distance of an unknown temperature from those of the history
 
 Triple = tuple[float, float, float]
@@ -184,21 +180,19 @@ def level_members(past: Sequence[Calibration], axis: int, turn_on: float) -> lis
 def _days(past: Sequence[Calibration], now: Circumstances) -> Array:
     """Days at which the n calibrations and the present one begin, (n + 1,), in any order.
 
-    An unknown one is a day after the one before it, but not after the next known one, so that its
-    age is at least what is known. Before the first known one, they are a day apart; an unknown
-    present is a day after the latest.
+    An unknown one is a day after the one before it, but not later than a known one after it, so
+    that its age is at least what is known. An unknown present is a day after the latest.
     """
     days = np.array([*(c.time for c in past), now.time], np.float64) / _DAY_S  # NaN for None
+    if np.isnan(days).all():
+        days[0] = 0.0
     number, known = np.arange(len(days)), np.flatnonzero(np.isfinite(days))
-    if not known.size:
-        return number.astype(np.float64)
     before = known[np.maximum(np.searchsorted(known, number, "right") - 1, 0)]
-    filled = days[before] + number - before
-    for first, last in pairwise(known):
-        filled[first + 1 : last] = np.minimum(filled[first + 1 : last], days[last])
+    later = np.fmin.accumulate(days[::-1])[::-1]  # the earliest known one after it
+    days = np.where(np.isnan(days), np.fmin(days[before] + number - before, later), days)
     if now.time is None:
-        filled[-1] = filled[:-1].max() + 1
-    return np.asarray(filled)
+        days[-1] = days[:-1].max() + 1
+    return days
 
 
 def _agree(first: Calibration, second: Calibration, axis: int, turn_on: float) -> bool:
@@ -320,9 +314,8 @@ def _temperature_variance(
         added = np.maximum(spread**2 - sigma**2, 0)
     if not distance:
         return np.zeros(3), []
-    effect = _COUNTS_LESS if np.all(spread + added) else _NO_EFFECT
-    words: dict[str, Any] = {"least": least, "most": most, "effect": effect}
-    return added * distance**2, [reason(key, value, distance, **words)]
+    how = "which counts less" if np.all(spread + added) else _LEFT_OUT
+    return added * distance**2, [reason(key, value, distance, least=least, most=most, how=how)]
 
 
 def _earth_rate_variance(

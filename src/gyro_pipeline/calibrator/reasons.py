@@ -40,9 +40,9 @@ _SENTENCES = {  # by code, followed by a word where a code has several sentences
     "axes; declare it with --same-heading, or mounted = true in device.toml",
     "knocked": "a knock was noted after the last calibration of the history, which counts less",
     "temperature unknown": "the temperature is not known, unlike the {least:.1f} to {most:.1f} °C "
-    "of the history, {effect}",
+    "of the history, {how}",
     "temperature beyond": "{value:.1f} °C is beyond the {least:.1f} to {most:.1f} °C of the "
-    "history, {effect}",
+    "history, {how}",
     "temperature missing": "the temperature is missing in {value:.0f} of {limit} blocks",
     "temperature moved": "the temperature moved by {value:.1f} °C; the bias may have moved with it",
     "conflict": "the history is {away:.1f} mdps away (1 in {chance:,.0f}) and was dropped",

@@ -7,7 +7,7 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from gyro_pipeline.calibrator.device_types import DeviceType
 from gyro_pipeline.calibrator.filter import Array, Estimate, Filter
@@ -87,14 +87,14 @@ class Temperature(NamedTuple):
         return Temperature(self.blocks + 1, mean, least, most, value, steps)
 
     @property
-    def rise(self) -> tuple[float, float]:
-        """The last block minus the mean, less its part by chance, and the square of that part.
+    def rise(self) -> tuple[float, float, float]:
+        """The last block minus the mean, as far as it exceeds chance, its square, and chance's.
 
         Chance is seen in changes from block to block, as by a thermometer of whole degrees.
         """
         rise = _temperature_rise(self.mean, self.last)
         chance = min(self.steps / 2 / max(self.blocks - 1, 1), rise**2)
-        return rise - chance / rise if rise else 0.0, chance
+        return rise - chance / rise if rise else 0.0, rise**2 - chance, chance
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,13 +296,9 @@ class Stretch:
 
     @property
     def _warmth(self) -> Array:
-        """Variance of the bias in the last block due to its temperature, (3,).
-
-        The square of a change is the unbiased one; an error of the change moves the bias as well.
-        """
-        rise, chance = self.temperature.rise
-        away = _temperature_rise(self.temperature.mean, self.temperature.last)
-        return self.prior.slope_sigma**2 * rise * away + self.prior.slope**2 * chance
+        """Variance of the bias in the last block due to its temperature, (3,), (deg/s)^2."""
+        _, square, chance = self.temperature.rise
+        return self.prior.slope_sigma**2 * square + self.prior.slope**2 * chance
 
     @property
     def _prior_mean(self) -> Array:
@@ -364,13 +360,15 @@ class Stretch:
         if np.isinf(setup.target_dps):
             return np.full(3, np.nan)
         (scale, freedom), following, count = self.noise_scale, self.filter, 0
+        measured = self.temperature.blocks
         open_axes = ~self.below_floor
         while np.any(np.isinf(seconds) & open_axes) and count * setup.block_s < _LONGEST_S:
             following, stack = following.ahead(_LOOKAHEAD_BLOCKS)
             number = count + 1 + np.arange(_LOOKAHEAD_BLOCKS)[:, None]
             later = self._scaled(stack.estimate(), (scale, freedom + number))
             later = later._replace(start=self._expected_start(later.start_variance))
-            reached = self._later_variance(later, number) <= setup.target_dps**2
+            warmth = self._warmth * (measured / (measured + number)) ** 2
+            reached = self._posterior(later)[1] + warmth <= setup.target_dps**2
             first = np.where(reached.any(axis=0), count + 1 + reached.argmax(axis=0), np.inf)
             seconds = np.minimum(seconds, first * setup.block_s)
             count += _LOOKAHEAD_BLOCKS
@@ -379,15 +377,9 @@ class Stretch:
 
     def _expected_start(self, variance: Array) -> Array:
         """The expected estimate of the bias at the start once it has a variance, (n, 3)."""
-        expected, now = self._start_posterior(self.estimate).mean, self.estimate
-        known = np.isfinite(now.start_variance)
-        share = np.where(known, variance, 0.0) / np.where(known, now.start_variance, 1.0)
-        return expected + share * (np.where(known, now.start, expected) - expected)
-
-    def _later_variance(self, later: Estimate, blocks: NDArray[np.integer]) -> Array:
-        """The variance of the bias after more blocks at the last temperature, (n, 3)."""
-        measured = self.temperature.blocks
-        return self._posterior(later)[1] + self._warmth * (measured / (measured + blocks)) ** 2
+        now, expected = self.estimate, self._start_posterior(self.estimate).mean
+        away = np.nan_to_num(now.start - expected)  # NaN before the first block
+        return expected + variance / now.start_variance * away
 
 
 def _gravity_sum(before: Array, gravity: Array) -> Array:

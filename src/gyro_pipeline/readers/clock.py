@@ -78,10 +78,8 @@ def from_stamps(stamps: Floats, unit_s: float | None, numbers: Rows | None = Non
         *_change(even, rows[last]),
     ]
     lost = np.zeros(len(stamps))
-    lost[rows[back]] = np.nan
-    lost[gaps] = losses[losses > 0]
-    rate_hz = unit_s and 1 / (step * unit_s)
-    return Timing(rate_hz, np.union1d(gaps, rows[back]), (*findings,), lost)
+    lost[rows[back]], lost[gaps] = np.nan, losses[losses > 0]
+    return Timing(unit_s and 1 / (step * unit_s), np.union1d(gaps, rows[back]), (*findings,), lost)
 
 
 def _fit(
