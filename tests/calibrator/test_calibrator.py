@@ -341,7 +341,7 @@ def test_a_thermometer_of_whole_degrees_does_not_move_the_bias():
     for end in range(3000, 4001, 50):
         state = finished(samples[:end], kind=kind, warmth=warmth[:end])
         error = state.bias_dps - samples[:end].mean(axis=0)
-        assert np.all(np.abs(error) < 4e-3)  # half a degree is 10 mdps
+        assert np.all(np.abs(error) < 6e-3)  # half a degree is 10 mdps
         assert np.all(np.abs(error) < state.sigma_dps)
         assert np.all(state.sigma_dps > noise)
 

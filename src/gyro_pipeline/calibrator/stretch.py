@@ -75,25 +75,27 @@ class Temperature(NamedTuple):
     least: float = np.inf
     most: float = -np.inf
     last: float = np.nan
-    steps: float = 0.0  # sum of the squared changes from block to block
+    step: float = np.nan  # from the last block but one to the last
+    bends: float = 0.0  # sum of the squared changes of the step
 
     def add(self, value: float) -> "Temperature":
         """The temperature after one more block."""
         if np.isnan(value):
-            return self._replace(last=value)
+            return self._replace(last=value, step=value)
         mean = value if not self.blocks else self.mean + (value - self.mean) / (self.blocks + 1)
         least, most = min(self.least, value), max(self.most, value)
-        steps = self.steps + _temperature_rise(self.last, value) ** 2
-        return Temperature(self.blocks + 1, mean, least, most, value, steps)
+        step = value - self.last
+        bends = self.bends + _temperature_rise(self.step, step) ** 2
+        return Temperature(self.blocks + 1, mean, least, most, value, step, bends)
 
     @property
     def rise(self) -> tuple[float, float, float]:
         """The last block minus the mean, as far as it exceeds chance, its square, and chance's.
 
-        Chance is seen in changes from block to block, as by a thermometer of whole degrees.
+        Chance shows where steps from block to block differ, as by a thermometer of whole degrees.
         """
         rise = _temperature_rise(self.mean, self.last)
-        chance = min(self.steps / 2 / max(self.blocks - 1, 1), rise**2)
+        chance = min(self.bends / 6 / max(self.blocks - 2, 1), rise**2)
         return rise - chance / rise if rise else 0.0, rise**2 - chance, chance
 
 
