@@ -43,6 +43,8 @@ class Log:
         rate_hz: Sample rate measured from timestamps; None without timestamps.
         gap_rows: Rows before which samples are missing or out of order, increasing; a stretch
             between two of them is gap-free. Findings give the reasons.
+        lost: (n,), about how many samples are missing before each row; NaN where that is not known,
+            as where time goes back. None without stamps.
         temperature_c: (n,), degrees Celsius; None if the file has none.
         acceleration_g: (n, 3), g; None if the file has none.
         rows: (n,), the row of the file of each sample, increasing; None if every row is a sample.
@@ -56,6 +58,7 @@ class Log:
     acceleration_g: NDArray[np.float64] | None = None
     rows: NDArray[np.integer] | None = None
     findings: tuple[Finding, ...] = ()
+    lost: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)

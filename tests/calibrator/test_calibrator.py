@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 from gyro_pipeline.calibrator import Calibration, Calibrator, Circumstances
+from gyro_pipeline.calibrator.cli import _feed
 from gyro_pipeline.calibrator.device_types import read_type, type_of
 from gyro_pipeline.conventions import InputError
+from gyro_pipeline.parameters import ReaderOptions
+from gyro_pipeline.readers import read_log
 
 RATE = 100.0
 BIAS = np.array([0.412, -0.104, 0.087])  # three different axes
@@ -139,12 +142,30 @@ def test_seconds_left_are_the_ones_it_takes():
     assert calibrator.update(None, samples[2450:2500]).done
 
 
+def test_seconds_left_expect_a_history_that_is_away_to_come_nearer():
+    kind, late = type_of({"noise_mdps_rts": 3.3, "turn_on_mdps": 0.31}, "here"), []
+    for seed in range(6):
+        samples, options = still(200, seed), {"history": history(seed=seed), "now": DECLARED}
+        calibrator = fed(samples[:150], kind, target_dps=0.28e-3, **options)
+        expected, took = calibrator.state().seconds_left, np.zeros(3)
+        for block in samples[150:].reshape(-1, 50, 3):
+            took += 0.5 * ~calibrator.state().stretch.reached
+            calibrator.update(None, block)
+        late += (took - expected).tolist()
+    assert np.median(np.abs(late)) == 0
+    assert np.mean(np.abs(late) <= 1) > 0.8
+
+
 def test_a_target_below_the_floor_is_not_offered():
     kind = type_of({"noise_mdps_rts": 3, "flicker_mdps": [3, 0, 0]}, "here")
     state = finished(still(5), kind=kind, target_dps=1.5e-3)
     assert np.isinf(state.seconds_left).tolist() == [True, False, False]
     (floor,) = [reason for reason in state.reasons if reason.code == "floor"]
     assert (floor.axis, floor.value) == ("x", pytest.approx(0.664 * 3, rel=1e-3))
+    assert "below 1.99 mdps" in floor.sentence
+    kind = replace(KIND, flicker_mdps=3.0)  # a target that a history reaches counts
+    known = finished(still(5), kind=kind, target_dps=1.5e-3, history=history(), now=DECLARED)
+    assert (known.done, "floor" in codes(known)) == (True, False)
 
 
 def test_noise_that_is_not_known_makes_students_intervals_and_a_least_time():
@@ -224,6 +245,53 @@ def test_a_gap_before_the_first_block_of_a_stretch_makes_it_start_later():
     assert (stretch.start_s, stretch.filter.age_s, stretch.filter.time_s) == (5.0, 8.0, 0.0)
 
 
+@pytest.mark.parametrize(
+    "samples",
+    [
+        np.tile([0.1, 0.2, 0.3], (1000, 1)),  # whose block means are rounded
+        np.r_[still(8), np.tile(BIAS + 1e-3, (600, 1))],
+        (still(10) - BIAS) / np.degrees(1) + BIAS,
+    ],
+    ids=["constant", "frozen", "rad/s"],
+)
+def test_data_that_cannot_be_used_are_never_done_and_no_evidence(samples):
+    calibrator = Calibrator(KIND, RATE, target_dps=1.7e-3)  # 8.7 s
+    states = [calibrator.update(None, block) for block in samples.reshape(-1, 50, 3)]
+    assert not any(state.done for state in states)
+    assert (states[-1].reached, states[-1].unusable) == (True, True)
+    assert calibrator.calibration().mean_dps is None
+    past = [replace(c, mean_dps=(0.1, 0.2, 0.3)) for c in history()]
+    assert not fed(np.tile([0.1, 0.2, 0.3], (100, 1)), history=past, target_dps=9e-3).state().done
+
+
+def test_a_gap_is_no_motion_and_in_a_file_it_is_as_long_as_in_a_stream(tmp_path):
+    samples, time_s = still(20), np.arange(2000) / RATE
+    cases = {"gap": np.where(time_s >= 10, time_s + 30, time_s), "clock": time_s % 10}
+    for code, stamps in cases.items():
+        np.savetxt(
+            tmp_path / "still.csv",
+            np.c_[stamps, samples],
+            delimiter=",",
+            header="time (s),gyro_x (deg/s),gyro_y (deg/s),gyro_z (deg/s)",
+            comments="",
+        )
+        from_file = Calibrator(KIND, RATE)
+        _feed(from_file, read_log(tmp_path / "still.csv", ReaderOptions()), np.inf)
+        for state in (from_file.finish(), finished(samples, time_s=stamps)):
+            assert (state.rest, state.seconds_at_rest) == ("still", 20)
+            told = {r.code: r.value for r in state.reasons}
+            assert told.get(code) == {"gap": pytest.approx(30), "clock": 1}[code]
+
+
+def test_an_attempt_in_motion_is_stored_as_it_is_reported():
+    past = [replace(c, mean_dps=tuple(c.mean + 0.05)) for c in history()]
+    moving = still(40) + 20 * np.sin(np.arange(4000) / 30)[:, None]
+    calibrator = fed(np.r_[still(10), moving], history=past, now=DECLARED)
+    state, stored = calibrator.finish(), calibrator.calibration()
+    assert calibrator.best.outcome == ("dropped",) * 3
+    assert (stored.rest, stored.outcome) == (state.rest, state.history) == ("moving", ("used",) * 3)
+
+
 def test_data_that_cannot_be_used_and_a_clock_that_jumps_are_told():
     for dead in (np.zeros((1000, 3)), np.full((1000, 3), np.nan)):
         assert "dead" in codes(finished(dead))
@@ -249,6 +317,33 @@ def test_arguments_that_do_not_fit_are_refused():
 def test_a_temperature_that_is_infinite_is_not_measured():
     state = finished(still(2), warmth=np.r_[np.inf, np.full(199, 25.0)])
     assert state.stretch.temperature[:4] == (3, 25.0, 25.0, 25.0)
+
+
+def test_seconds_left_are_those_at_the_last_temperature():
+    kind = type_of({"noise_mdps_rts": 3, "temperature_spread_mdps_per_c": 10}, "here")
+    samples = still(100)
+    warmth = np.r_[np.linspace(25, 26, 20), np.full(180, 26.0)].repeat(50)
+    calibrator = fed(samples[:1000], kind, warmth=warmth[:1000], target_dps=2e-3)
+    expected = round(float(calibrator.state().seconds_left.max()) * RATE)
+    assert expected > 1000
+    calibrator.update(None, samples[1000 : 900 + expected], None, warmth[1000 : 900 + expected])
+    assert not calibrator.state().reached
+    end = np.s_[900 + expected : 1000 + expected]
+    assert calibrator.update(None, samples[end], None, warmth[end]).reached
+
+
+def test_a_thermometer_of_whole_degrees_does_not_move_the_bias():
+    slope = {"temperature_slope_mdps_per_c": 20, "temperature_spread_mdps_per_c": 10}
+    kind = type_of({"noise_mdps_rts": [3, 4, 5], **slope}, "here")
+    samples = still(40)
+    warmth = np.random.default_rng(3).integers(25, 27, 80).repeat(50)
+    noise = np.array([3, 4, 5]) * 1e-3 / np.sqrt(40)
+    for end in range(3000, 4001, 50):
+        state = finished(samples[:end], kind=kind, warmth=warmth[:end])
+        error = state.bias_dps - samples[:end].mean(axis=0)
+        assert np.all(np.abs(error) < 6e-3)  # half a degree is 10 mdps
+        assert np.all(np.abs(error) < state.sigma_dps)
+        assert np.all(state.sigma_dps > noise)
 
 
 def test_a_temperature_that_moves_makes_the_bias_now_less_certain():

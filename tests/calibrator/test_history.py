@@ -12,6 +12,7 @@ from gyro_pipeline.calibrator.history import (
     EARTH_DPS,
     Calibration,
     Circumstances,
+    _days,
     level_members,
     noise_of,
     prior_of,
@@ -66,6 +67,33 @@ def test_a_walk_follows_the_latest_and_grows_with_age_of_a_day_where_it_is_not_k
     np.testing.assert_allclose(prior.narrow, 1e-6, rtol=1e-2)
 
 
+@pytest.mark.parametrize(
+    ("days", "now", "filled"),
+    [
+        ((None, None), None, [0, 1, 2]),
+        ((0, None), 400, [0, 1, 400]),
+        ((0, None, 0.5), None, [0, 0.5, 0.5, 1.5]),
+        ((None, None, 10, None, None), 30, [8, 9, 10, 11, 12, 30]),
+        ((10, 0, None, 0.5), None, [10, 0, 0.5, 0.5, 11]),
+    ],
+)
+def test_a_time_that_is_not_known_lies_between_those_that_are(days, now, filled):
+    seconds = [None if day is None else day * 86400.0 for day in (*days, now)]
+    made = [past(0.0, variance=1e-14, time=time)[0] for time in seconds[:-1]]
+    found = _days(made, Circumstances(time=seconds[-1]))
+    np.testing.assert_allclose(found - found[1], np.array(filled) - filled[1])
+
+
+def test_the_order_in_which_calibrations_were_stored_does_not_change_their_ages():
+    kinds = kind(turn_on_mdps=0.001, walk_mdps_per_rtday=1.0)
+    made = [past(t, variance=1e-14, time=t * 86400.0)[0] for t in (0, 3, 9)]
+    now = replace(DECLARED, time=13 * 86400.0)
+    for order in (made, made[::-1]):
+        prior = prior_of(order, kinds, now)
+        np.testing.assert_allclose(prior.mean, 9e-3, rtol=0.01)
+        np.testing.assert_allclose(prior.narrow, 4e-6, rtol=0.01)
+
+
 def test_the_fitted_tau_lies_between_the_types_and_the_scatter():
     made = past(*np.random.default_rng(1).normal(0, 4, 30), variance=1e-8)
     tau, sigma = prior_of(made, kind(turn_on_factor=3.0), DECLARED).fitted[0]["tau"]
@@ -84,6 +112,15 @@ def test_temperature_follows_a_slope_and_widens_beyond_the_range():
     assert {reason.code for reason in beyond.reasons} == {"temperature"}
     unknown = prior_of(warmed(20.0, range(0, 9, 2)), WARM, DECLARED)  # the slope costs as well
     np.testing.assert_allclose(np.sqrt(unknown.narrow), 8e-3 * np.hypot(10, 20), rtol=1e-2)
+
+
+@pytest.mark.parametrize("celsius", [None, 65.0])
+def test_a_type_that_leaves_the_temperature_out_says_so(celsius):
+    made, now = warmed(0.0, range(5)), replace(DECLARED, temperature_c=celsius)
+    prior = prior_of(made, kind(turn_on_mdps=0.01), now)
+    assert ["σ leaves this out" in reason.sentence for reason in prior.reasons] == [True]
+    assert "σ leaves this out" not in prior_of(made, WARM, now).reasons[0].sentence
+    assert not prior_of(made, kind(), replace(DECLARED, temperature_c=22.0)).reasons
 
 
 @pytest.mark.parametrize(("celsius", "degrees"), [(20.0, 0), (23.0, 3), (None, 5)])

@@ -80,6 +80,7 @@ def test_lost_samples_are_gaps_and_do_not_change_the_rate(lost):
         timing = from_stamps(stamps[kept], 1.0)
         np.testing.assert_array_equal(timing.gap_rows, np.flatnonzero(np.diff(kept) > 1) + 1)
         assert timing.rate_hz == pytest.approx(120, rel=1e-4)
+        np.testing.assert_allclose(timing.lost, np.diff(kept, prepend=-1) - 1, atol=0.2)
         gaps = next(finding for finding in timing.findings if finding.check == "gaps")
         assert gaps.outcome == REPAIRED
         assert f"samples are missing, about {len(lost)}: " in gaps.detail
@@ -102,6 +103,8 @@ def test_gaps_and_findings_of_odd_stamps(stamps, unit_s, rate, gaps, findings):
     timing = from_stamps(stamps, unit_s)
     assert timing.rate_hz == (rate and pytest.approx(rate, rel=1e-3))
     assert timing.gap_rows.tolist() == gaps
+    back = [] if timing.lost is None else np.flatnonzero(np.isnan(timing.lost)).tolist()
+    assert bool(back) == (BACK in findings)
     assert [finding.check for finding in timing.findings] == findings
 
 

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from gyro_pipeline.calibrator.device_types import DeviceType, read_type
 from gyro_pipeline.calibrator.filter import Array
 from gyro_pipeline.calibrator.history import MOVING, STILL, UNSURE, Calibration, Circumstances
-from gyro_pipeline.calibrator.reasons import Reason, reason, reasons_of, unit_reason
+from gyro_pipeline.calibrator.reasons import UNUSABLE_CODES, Reason, reason, reasons_of, unit_reason
 from gyro_pipeline.calibrator.rest import ATTITUDE, MOTION, NOISE, Alarm, Blocks
 from gyro_pipeline.calibrator.stretch import BLOCK_S, LEAST_S, Setup, Stretch
 from gyro_pipeline.conventions import MDPS, InputError
@@ -39,7 +39,8 @@ class State:
     stretch: Stretch  # that the result is from
     counts: Counter[str]  # samples, gaps, jumps of the clock, samples left out
     ended: dict[str, Reason]  # why stretches ended, the last reason of each code
-    dead: Mask  # whether an axis has not changed for a while, (3,)
+    constant: Mask  # whether an axis did not change in the last block, (3,)
+    dead: Mask  # whether an axis did not change for a while, (3,)
     rest: str  # STILL, MOVING or UNSURE
     time_s: float  # since the first sample
 
@@ -71,8 +72,14 @@ class State:
 
     @property
     def done(self) -> bool:
-        """Whether the device is at rest and the target is reached."""
-        return self.rest == STILL and self.reached
+        """Whether the device is at rest, the target is reached, and the data can be used."""
+        at_target = self.rest == STILL and self.reached and not self.constant.any()
+        return at_target and not self.unusable
+
+    @property
+    def unusable(self) -> bool:
+        """Whether the data cannot be used: a dead sensor, or a wrong unit."""
+        return any(reason.code in UNUSABLE_CODES for reason in self.reasons)
 
     @property
     def seconds_left(self) -> Array:
@@ -124,7 +131,7 @@ class Calibrator:
         self._start_stretch()
 
     def _start_stretch(self) -> None:
-        self.stretch = Stretch.start(self.setup, self.time_s)
+        self.stretch, self._first_block = Stretch.start(self.setup, self.time_s), self._block_count
         # the stretch before its last update, and the blocks of this update
         self._previous: tuple[Stretch, Blocks] | None = None
         self._motion_blocks = 0  # of the motion that is going on
@@ -213,7 +220,8 @@ class Calibrator:
         rest = self._rest(stretch, finished)
         if finished and rest == MOVING:
             stretch = Stretch.start(self.setup, self.time_s)
-        return State(stretch, self.counts.copy(), self.ended, self._dead, rest, self.time_s)
+        constant, counts = self._constant > 0, self.counts.copy()
+        return State(stretch, counts, self.ended, constant, self._dead, rest, self.time_s)
 
     @property
     def best(self) -> Stretch:
@@ -225,11 +233,13 @@ class Calibrator:
 
     def calibration(self) -> Calibration:
         """The calibration to store: evidence from its own data alone, without the history."""
-        state, stretch, now = self.finish(), self.best, self.setup.now
-        estimate, temperature = stretch.estimate, stretch.temperature
+        state, now = self.finish(), self.setup.now
+        stretch, temperature = state.stretch, state.stretch.temperature
+        estimate = stretch.estimate
         temperature_c = temperature.mean, temperature.least, temperature.most
         noise, freedom = stretch.log_noise()
         usable = state.rest == STILL and bool(np.isfinite(estimate.variance).all())
+        usable = usable and not state.unusable
         gravity = stretch.gravity[:3] / max(stretch.gravity[3], 1)
         return Calibration(
             mean_dps=tuple(estimate.bias.tolist()) if usable else None,
@@ -246,7 +256,7 @@ class Calibrator:
             same_heading=now.same_heading,
             known_still=now.known_still,
             knocks=now.knocks,
-            reached=state.done,
+            reached=usable and state.reached,
             attempt=now.attempt,
             reasons=tuple(reason.sentence for reason in state.reasons),
         )
@@ -284,7 +294,7 @@ class Calibrator:
         self._cross_gap(rows[0, 0])
         if used:
             blocks = _blocks(rows[:, :used].reshape(_COLUMNS, -1, size))
-            self._find_dead_axes(blocks.variance == 0)
+            self._find_dead_axes(np.ptp(rows[1:4, :used].reshape(3, -1, size), axis=2).T == 0)
             while len(blocks.mean):
                 blocks = blocks.part(self._process(blocks))
             self._end = rows[0, used - 1] + 1 / self.setup.rate_hz
@@ -363,7 +373,8 @@ class Calibrator:
             self._ended_rest_s += self.stretch.seconds
             self._ended_best = self.best
         else:
-            self._min_rest_s = max(self._min_rest_s, self.time_s - self.stretch.start_s)
+            blocks = self._block_count - self._first_block
+            self._min_rest_s = max(self._min_rest_s, blocks * self.setup.block_s)
         self._start_stretch()
 
     def _rest(self, stretch: Stretch, finished: bool) -> str:
@@ -373,7 +384,7 @@ class Calibrator:
         enough = stretch.seconds >= max(min(self.setup.least_s, 2 * LEAST_S), self._min_rest_s)
         ended = bool(self.ended.keys() - {ATTITUDE})
         if finished:
-            half = self._ended_rest_s + self.stretch.seconds >= self.time_s / 2
+            half = self._ended_rest_s + self.stretch.seconds >= (self.time_s - self._gaps_s) / 2
             cut = any(note.code == "cut" for note in stretch.notes)
             return STILL if enough and half else MOVING if ended or cut else UNSURE
         if self._motion_blocks or (ended and not enough):

@@ -263,8 +263,9 @@ def _calibrate(path: Path, job: SimpleNamespace) -> int:
 def _feed(calibrator: Calibrator, recording: Any, chunk_s: float) -> list[State]:
     count, rate_hz = len(recording.samples), calibrator.setup.rate_hz
     times = np.arange(count) / rate_hz
-    for row in recording.gap_rows:  # a log does not say how long a gap is
-        times[row:] += 2 * BLOCK_S
+    for row in recording.gap_rows:  # one of unknown length becomes a jump of the clock
+        lost = 0.0 if recording.lost is None else recording.lost[row]
+        times[row:] += lost / rate_hz if lost > 0 else -2 * BLOCK_S
     columns = times, recording.samples, recording.acceleration_g, recording.temperature_c
     step, states = max(round(min(chunk_s * rate_hz, count)), 1), []
     for row in range(0, count, step):

@@ -35,6 +35,7 @@ _DAY_S = 86400.0
 _GRID = (11, 9)  # points of tau and of the walk, over 2.5 standard deviations on both sides
 _MAX_CALIBRATIONS = 100  # the latest ones are used
 _MIN_DPS = 1e-3 * MDPS
+_LEFT_OUT = "but σ leaves this out; give the type temperature_spread_mdps_per_c, for all axes"
 _MIN_UNKNOWN_C = 5.0  # the least distance of an unknown temperature from those of the history
 
 Triple = tuple[float, float, float]
@@ -138,10 +139,7 @@ def prior_of(
         spread = device_type.dps("temperature_spread_mdps_per_c")
         slope = device_type.dps("temperature_slope_mdps_per_c")
         return Prior(unknown, infinite, infinite, slope, spread)
-    times = np.array([*(c.time for c in past), now.time], np.float64) / _DAY_S  # NaN for None
-    days = np.nan_to_num(np.abs(np.diff(times)), nan=1.0)  # an unknown gap counts as one day
-    days = np.append(0.0, np.cumsum(days))
-    turn_on = device_type.dps("turn_on_mdps")
+    days, turn_on = _days(past, now), device_type.dps("turn_on_mdps")
     members = [level_members(past, axis, turn_on[axis]) for axis in range(3)]
     axes = [
         _axis_prior([past[i] for i in numbers], days[[*numbers, -1]], axis, device_type, now)
@@ -177,6 +175,24 @@ def level_members(past: Sequence[Calibration], axis: int, turn_on: float) -> lis
         else:
             outlier = number
     return members or [len(past) - 1]
+
+
+def _days(past: Sequence[Calibration], now: Circumstances) -> Array:
+    """Days at which the n calibrations and the present one begin, (n + 1,), in any order.
+
+    An unknown one is a day after the one before it, but not later than a known one after it, so
+    that its age is at least what is known. An unknown present is a day after the latest.
+    """
+    days = np.array([*(c.time for c in past), now.time], np.float64) / _DAY_S  # NaN for None
+    if np.isnan(days).all():
+        days[0] = 0.0
+    number, known = np.arange(len(days)), np.flatnonzero(np.isfinite(days))
+    before = known[np.maximum(np.searchsorted(known, number, "right") - 1, 0)]
+    later = np.fmin.accumulate(days[::-1])[::-1]  # the earliest known one after it
+    days = np.where(np.isnan(days), np.fmin(days[before] + number - before, later), days)
+    if now.time is None:
+        days[-1] = days[:-1].max() + 1
+    return days
 
 
 def _agree(first: Calibration, second: Calibration, axis: int, turn_on: float) -> bool:
@@ -222,7 +238,7 @@ def _axis_prior(
 
 def _level_covariance(days: Array, walk: Array, knocks: Array, step: float) -> Array:
     """Covariance of the level at each of n times, (g, n, n), which walks and moves at knocks."""
-    days, steps = days - days[0], (knocks - knocks.min()) * step**2
+    days, steps = days - days.min(), (knocks - knocks.min()) * step**2
     walked = walk[:, None, None] ** 2 * np.minimum(days[:, None], days)
     return np.asarray(walked + np.minimum(steps[:, None], steps))
 
@@ -296,9 +312,10 @@ def _temperature_variance(
     else:
         key, distance = "temperature beyond", max(value - most, least - value, 0.0)
         added = np.maximum(spread**2 - sigma**2, 0)
-    if not distance or not np.any(spread + added):
+    if not distance:
         return np.zeros(3), []
-    return added * distance**2, [reason(key, value, distance, least=least, most=most)]
+    how = "which counts less" if np.all(spread + added) else _LEFT_OUT
+    return added * distance**2, [reason(key, value, distance, least=least, most=most, how=how)]
 
 
 def _earth_rate_variance(
@@ -308,7 +325,8 @@ def _earth_rate_variance(
 
     Between two unknown headings it is (4.18 cos phi)^2 on a horizontal axis and 0 on a vertical
     one. It is 0 where the heading is declared to repeat and the attitude is that of the history.
-    Where past attitudes differ, tau already contains it.
+    Where past attitudes differ, tau already contains it. Past headings are not measured, and may
+    have been the same, so that tau does not contain it: without a declaration, the sum counts.
     """
     ups, up, latitude = [c.up for c in past if c.up is not None], now.up, now.latitude_deg
     before = unit(np.sum(ups, axis=0)) if ups else None

@@ -39,22 +39,23 @@ _SENTENCES = {  # by code, followed by a word where a code has several sentences
     "heading": "the heading is not declared to repeat, so the history counts less on horizontal "
     "axes; declare it with --same-heading, or mounted = true in device.toml",
     "knocked": "a knock was noted after the last calibration of the history, which counts less",
-    "temperature unknown": "the temperature is not known; the history, recorded at {least:.1f} to "
-    "{most:.1f} °C, counts less",
+    "temperature unknown": "the temperature is not known, unlike the {least:.1f} to {most:.1f} °C "
+    "of the history, {how}",
     "temperature beyond": "{value:.1f} °C is beyond the {least:.1f} to {most:.1f} °C of the "
-    "history, which counts less",
+    "history, {how}",
     "temperature missing": "the temperature is missing in {value:.0f} of {limit} blocks",
     "temperature moved": "the temperature moved by {value:.1f} °C; the bias may have moved with it",
     "conflict": "the history is {away:.1f} mdps away (1 in {chance:,.0f}) and was dropped",
     "attempt": "attempt {value}: earlier ones were not at rest or did not reach their target",
     "colour": "the colour of the noise is not known, and σ holds for white noise; give --type",
-    "floor": "the target is below {value:.2g} mdps, the floor of this sensor: a longer average "
-    "does not get below it",
+    "floor": "the target is below {value:.3g} mdps, the floor of this sensor: within minutes its "
+    "bias moves by about this much, though σ, which holds for this moment, may be smaller",
     "warm_up": "warming up, still {value:+.1f} mdps; the bias is what it settles to",
     "not_finite": "{value} of {limit} samples are not finite and were left out",
     "zero": "{value} of {limit} samples are zero on all axes and were left out",
     "gap": "samples are missing at {places} places, {value:.3g} s in all",
-    "clock": "the clock jumped {value} times; time continues from there",
+    "clock": "the clock jumped, or a gap has an unknown length, {value} times; time continues from "
+    "there",
     "rotation_bound": "A steady rotation about {about} below {value:.2g} mdps cannot be told from "
     "a bias.",
     "rotation_bound none": "A steady rotation about {about} cannot be told from a bias.",
@@ -136,7 +137,7 @@ def _noise_reasons(stretch: "Stretch") -> Iterator[Reason]:
     setup, floor = stretch.setup, stretch.floor_dps / MDPS
     if not setup.device_type.noise_freedom:
         yield reason("colour")
-    for axis in np.flatnonzero(stretch.floor_dps > setup.target_dps):
+    for axis in np.flatnonzero((stretch.floor_dps > setup.target_dps) & ~stretch.reached):
         yield reason("floor", float(floor[axis]), setup.target_dps / MDPS, axis)
     if setup.noise.warm_up is not None and stretch.blocks:
         left, sigma = stretch.filter.warm_up()

@@ -26,7 +26,7 @@ from gyro_pipeline.calibrator.history import (
 from gyro_pipeline.calibrator.reasons import VERTICAL, Reason, reason
 from gyro_pipeline.calibrator.rest import Alarm, Blocks, RestMonitor
 from gyro_pipeline.conventions import MDPS
-from gyro_pipeline.physics.mixture import log_e, log_ratios, mixture_posterior
+from gyro_pipeline.physics.mixture import Posterior, log_e, log_ratios, mixture_posterior
 from gyro_pipeline.quality.rest import Mask, student_limits
 
 BLOCK_S = 0.5
@@ -75,14 +75,28 @@ class Temperature(NamedTuple):
     least: float = np.inf
     most: float = -np.inf
     last: float = np.nan
+    step: float = np.nan  # from the last block but one to the last
+    bends: float = 0.0  # sum of the squared changes of the step
 
     def add(self, value: float) -> "Temperature":
         """The temperature after one more block."""
         if np.isnan(value):
-            return self._replace(last=value)
+            return self._replace(last=value, step=value)
         mean = value if not self.blocks else self.mean + (value - self.mean) / (self.blocks + 1)
         least, most = min(self.least, value), max(self.most, value)
-        return Temperature(self.blocks + 1, mean, least, most, value)
+        step = value - self.last
+        bends = self.bends + _temperature_rise(self.step, step) ** 2
+        return Temperature(self.blocks + 1, mean, least, most, value, step, bends)
+
+    @property
+    def rise(self) -> tuple[float, float, float]:
+        """The last block minus the mean, as far as it exceeds chance, its square, and chance's.
+
+        Chance shows where steps from block to block differ, as by a thermometer of whole degrees.
+        """
+        rise = _temperature_rise(self.mean, self.last)
+        chance = min(self.bends / 6 / max(self.blocks - 2, 1), rise**2)
+        return rise - chance / rise if rise else 0.0, rise**2 - chance, chance
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,8 +294,13 @@ class Stretch:
     def result(self) -> tuple[Array, Array]:
         """The bias in the last block and its variance, (3,), deg/s; settled, if warming up."""
         bias, variance = self._posterior(self.estimate)
-        rise_c = _temperature_rise(self.temperature.mean, self.temperature.last)
-        return bias + self.prior.slope * rise_c, variance + (self.prior.slope_sigma * rise_c) ** 2
+        return bias + self.prior.slope * self.temperature.rise[0], variance + self._warmth
+
+    @property
+    def _warmth(self) -> Array:
+        """Variance of the bias in the last block due to its temperature, (3,), (deg/s)^2."""
+        _, square, chance = self.temperature.rise
+        return self.prior.slope_sigma**2 * square + self.prior.slope**2 * chance
 
     @property
     def _prior_mean(self) -> Array:
@@ -294,10 +313,7 @@ class Stretch:
         usable, transfer = self.usable, estimate.transfer
         if not usable.any():
             return estimate.bias, estimate.variance
-        prior = self._prior_mean, self.prior.narrow, self.prior.wide
-        mean, narrow, wide = (np.where(usable, x, 1.0) for x in prior)
-        data = np.where(usable, estimate.start_variance, np.inf)
-        start = mixture_posterior(estimate.start, data, mean, narrow, wide)
+        start = self._start_posterior(estimate)
         unknown = np.isinf(estimate.variance)
         with np.errstate(invalid="ignore"):
             moved = estimate.bias + transfer * (start.mean - estimate.start)
@@ -305,6 +321,13 @@ class Stretch:
         bias = np.where(usable, np.where(unknown, start.mean, moved), estimate.bias)
         variance = np.where(unknown, 0.0, added) + transfer**2 * start.charged
         return bias, np.where(usable, variance, estimate.variance)
+
+    def _start_posterior(self, estimate: Estimate) -> Posterior:
+        """The posterior of the bias at the start, where the history is usable."""
+        prior = self._prior_mean, self.prior.narrow, self.prior.wide
+        mean, narrow, wide = (np.where(self.usable, x, 1.0) for x in prior)
+        data = np.where(self.usable, estimate.start_variance, np.inf)
+        return mixture_posterior(estimate.start, data, mean, narrow, wide)
 
     def log_noise(self) -> tuple[Array | None, float]:
         """N from this stretch alone, (3,), deg/s * sqrt(s), and its degrees of freedom."""
@@ -332,26 +355,33 @@ class Stretch:
     def seconds_left(self) -> Array:
         """Seconds at rest until the target, (3,); infinite beyond an hour, NaN without a target.
 
-        The variances of future blocks do not depend on the data. The distance from the history and
-        an unknown noise do, and are assumed to stay as they are now.
+        The variances of future blocks do not depend on the data. The distance from the history does
+        and is the expected one. Temperature and unknown noise are assumed to stay as they are now.
         """
         setup, seconds = self.setup, np.where(self.reached, 0.0, np.inf)
         if np.isinf(setup.target_dps):
             return np.full(3, np.nan)
-        start = self.estimate.start if self.blocks else np.where(self.usable, self.prior.mean, 0.0)
         (scale, freedom), following, count = self.noise_scale, self.filter, 0
+        measured = self.temperature.blocks
         open_axes = ~self.below_floor
         while np.any(np.isinf(seconds) & open_axes) and count * setup.block_s < _LONGEST_S:
             following, stack = following.ahead(_LOOKAHEAD_BLOCKS)
             number = count + 1 + np.arange(_LOOKAHEAD_BLOCKS)[:, None]
             later = self._scaled(stack.estimate(), (scale, freedom + number))
-            later = later._replace(start=np.broadcast_to(start, (_LOOKAHEAD_BLOCKS, 3)))
-            reached = self._posterior(later)[1] <= setup.target_dps**2
+            later = later._replace(start=self._expected_start(later.start_variance))
+            warmth = self._warmth * (measured / (measured + number)) ** 2
+            reached = self._posterior(later)[1] + warmth <= setup.target_dps**2
             first = np.where(reached.any(axis=0), count + 1 + reached.argmax(axis=0), np.inf)
             seconds = np.minimum(seconds, first * setup.block_s)
             count += _LOOKAHEAD_BLOCKS
         seconds = np.maximum(seconds, setup.least_s - self.seconds)
         return np.where(open_axes, seconds, np.inf)
+
+    def _expected_start(self, variance: Array) -> Array:
+        """The expected estimate of the bias at the start once it has a variance, (n, 3)."""
+        now, expected = self.estimate, self._start_posterior(self.estimate).mean
+        away = np.nan_to_num(now.start - expected)  # NaN before the first block
+        return expected + variance / now.start_variance * away
 
 
 def _gravity_sum(before: Array, gravity: Array) -> Array:

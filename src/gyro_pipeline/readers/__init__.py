@@ -88,6 +88,7 @@ def log_of(
         acceleration_g=_auxiliary_values(file, acceleration, keep),
         rows=None if keep.all() else np.flatnonzero(keep),
         findings=(*table.findings, *file.findings),
+        lost=timing.lost,
     )
 
 

@@ -27,11 +27,15 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Timing:
-    """Sample rate in Hz, the first rows after gaps, and findings, from stamps or a counter."""
+    """Sample rate in Hz, the first rows after gaps, and findings, from stamps or a counter.
+
+    ``lost`` (n,) is about how many samples are missing before each row, NaN where time goes back.
+    """
 
     rate_hz: float | None = None
     gap_rows: Rows = field(default_factory=lambda: np.empty(0, np.intp))
     findings: tuple[Finding, ...] = ()
+    lost: Floats | None = None
 
 
 def from_stamps(stamps: Floats, unit_s: float | None, numbers: Rows | None = None) -> Timing:
@@ -73,7 +77,9 @@ def from_stamps(stamps: Floats, unit_s: float | None, numbers: Rows | None = Non
         *_at("timestamps", numbers[rows[~first]], text),
         *_change(even, rows[last]),
     ]
-    return Timing(unit_s and 1 / (step * unit_s), np.union1d(gaps, rows[back]), (*findings,))
+    lost = np.zeros(len(stamps))
+    lost[rows[back]], lost[gaps] = np.nan, losses[losses > 0]
+    return Timing(unit_s and 1 / (step * unit_s), np.union1d(gaps, rows[back]), (*findings,), lost)
 
 
 def _fit(
