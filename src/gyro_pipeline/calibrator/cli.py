@@ -28,7 +28,7 @@ from gyro_pipeline.calibrator import output
 from gyro_pipeline.calibrator.calibrator import Calibrator, State
 from gyro_pipeline.calibrator.device_types import type_names
 from gyro_pipeline.calibrator.history import STILL, USED, Calibration
-from gyro_pipeline.calibrator.reasons import UNUSABLE_CODES, Reason
+from gyro_pipeline.calibrator.reasons import Reason
 from gyro_pipeline.calibrator.registry import SET, Device, RegistryError, registry_folder
 from gyro_pipeline.calibrator.stretch import BLOCK_S
 from gyro_pipeline.conventions import AXES, IN_READER, MDPS, InputError
@@ -307,7 +307,7 @@ def _store(calibrator: Calibrator, job: SimpleNamespace, source: str, name: str)
 
 
 def _exit_code(state: State, require_history: bool) -> int:
-    if any(reason.code in UNUSABLE_CODES for reason in state.reasons):
+    if state.unusable:
         return UNUSABLE
     if require_history and set(state.history) != {USED}:
         return NO_HISTORY

@@ -112,7 +112,7 @@ def _sources(state: State, axis: int) -> str:
 
 def _time_left(state: State) -> str:
     floors = [r for r in state.reasons if r.code == "floor"]
-    why = {floor.axis: f", below its floor of {floor.value:.2g}" for floor in floors}
+    why = {floor.axis: f", below its floor of {floor.value:.3g}" for floor in floors}
     target, parts = f"{target_mdps(state):g} mdps", []
     for name, seconds in zip(AXES, state.seconds_left, strict=True):
         if np.isinf(seconds):
@@ -131,7 +131,7 @@ def planned(state: State) -> Iterator[str]:
         if np.isfinite(needed):
             yield f"{name}: {needed:.1f} s at rest for {text}"
         elif floor > target:
-            yield f"{name}: not with this sensor: its floor is {floor:.2g} mdps"
+            yield f"{name}: not with this sensor: its floor is {floor:.3g} mdps"
         else:
             yield f"{name}: not within an hour"
 
