@@ -149,10 +149,11 @@ def test_the_leak_studys_windows_test_once_each(make, table_of, protocol):
 def test_a_copy_with_another_role_is_refused(make, table_of):
     recordings = make(100).copy(deep=True)
     rates = recordings.angular_rate.sel(imu=1, recording=90).to_numpy()
-    resampled = (rates + np.roll(rates, 1, axis=-1)) / 2
-    changed = rates + 0.1 + np.random.default_rng(3).normal(0, 1e-5, rates.shape)
+    shifted = np.roll(rates, 1, axis=-1)
+    resampled = (rates + shifted) / 2
+    noisy = rates + np.random.default_rng(3).normal(0, 1e-5, rates.shape)
     message = r"IMU 2 recording 3 \(train\) is a copy of IMU 1 recording 90 \(test\)"
-    for copied in (resampled, changed):  # an offset and a little noise
+    for copied in (noisy, rates + 0.1, shifted, resampled, rates * (1 + 1e-6)):
         recordings.angular_rate.loc[{"imu": 2, "recording": 3}] = copied
         with pytest.raises(InputError, match=message):
             table_of(recordings)
