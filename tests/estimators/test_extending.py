@@ -23,7 +23,7 @@ def test_the_estimator_is_halfway_between_window_and_training_recordings(
     (tmp_path / "my_estimators.py").write_text(example("An estimator", "python"))
     monkeypatch.syspath_prepend(tmp_path)
     studies = yaml.safe_load(example("An estimator", "yaml"))["studies"]
-    (_, name) = studies["augmentation"]["estimators"]
+    name = studies["augmentation"]["estimators"][-1]
     bias = np.full((1, 4, 3), [0.1, -0.2, 0.3])
     recordings = make_recordings(bias, samples=500, rate_hz=10.0, noise_dps_rts=1e-4)
     fitted = make_estimator(name, parameters().training, 0).fit(training_set(recordings))

@@ -161,8 +161,11 @@ def _files(material: Material) -> list[Exhibit | None]:
 
 
 def _comparisons(material: Material) -> list[tuple[str, str]]:
-    """Each study that compares estimators, with each of its sensors."""
-    rows = material.results[~material.results.study.isin(PAPER_STUDIES)]
+    """Each study that compares estimators, or has a user's, with each of its sensors."""
+    results = material.results
+    rows = results[
+        ~results.study.isin(PAPER_STUDIES) | ~results.estimator.isin([*ESTIMATORS, CNN_BEST])
+    ]
     return [*rows[["study", "sensor"]].drop_duplicates().itertuples(index=False, name=None)]
 
 
