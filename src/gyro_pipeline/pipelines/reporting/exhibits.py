@@ -184,7 +184,8 @@ def where(rows: pd.DataFrame, **columns: Any) -> pd.DataFrame:
 
 def label(estimator: str) -> str:
     """Name of an estimator for readers."""
-    return _LABELS.get(estimator, estimator.replace("_", " "))
+    path = ":" in estimator  # of a user's class
+    return _LABELS.get(estimator, estimator if path else estimator.replace("_", " "))
 
 
 def ends(row: pd.Series, name: str, windows: str = ALL) -> NDArray[np.float64]:

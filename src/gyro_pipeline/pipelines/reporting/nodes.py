@@ -130,8 +130,9 @@ def _figures(material: Material, ground_truth: GroundTruth) -> dict[str, list[Ex
     """The figures by their part of the page."""
     from gyro_pipeline.pipelines.reporting import figures, signals  # noqa: PLC0415
 
+    drawn = [pair for pair in _comparisons(material) if pair[0] not in PAPER_STUDIES]
     others = [
-        *(figures.estimators(material, study, sensor) for study, sensor in _comparisons(material)),
+        *(figures.estimators(material, study, sensor) for study, sensor in drawn),
         figures.saving_against_turn_on_spread(material),
         figures.input_channels(material),
         figures.training_data(material),

@@ -65,7 +65,7 @@ def panels(
         title: Title of the figure.
         size: Width and height, inches.
         shape: Rows and columns of panels.
-        columns: Columns of the legend, which has each label once.
+        columns: Most columns of the legend, which has each label once.
         **shared: ``sharex`` and ``sharey`` of ``Figure.subplots``.
     """
     with mpl.rc_context(PLOT_STYLE):
@@ -76,6 +76,8 @@ def panels(
         for ax in axes:
             for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
                 handles.setdefault(str(label), handle)
+        fitting = int(size[0] / (0.5 + 0.08 * max(map(len, handles), default=0)))  # by inches
+        columns = max(1, min(columns, fitting))
         layout: Any = {"loc": "outside upper center", "ncols": columns, "frameon": False}
         layout |= {"title": title, "title_fontsize": "large"}
         figure.legend(list(handles.values()), list(handles), **layout)
