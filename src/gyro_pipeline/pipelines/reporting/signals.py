@@ -55,20 +55,24 @@ def drift(material: Material) -> Exhibit | None:
         "its 95 % interval. A line at 0 is a bias that does not move; a line that starts off 0 is "
         "a warm-up, which any estimator that knows the device, even a constant, can correct. White "
         "noise without drift, the premise of the ceiling, means a line at 0. Dashed is a fitted "
-        "warm-up, if it is significant. The 95 % intervals allow an amplitude of at most "
-        f"{_bounds(material)}."
+        f"warm-up, if it is significant. {_bounds(material)}"
     )
     return Exhibit("drift", "Does the rate drift after power-on?", caption, figure)
 
 
 def _bounds(material: Material) -> str:
     """The largest warm-up amplitude that recordings allow, by sensor and time constant."""
+    if not material.warm_ups_allowed_mdps:
+        return "Single recordings do not bound the amplitude of a warm-up."
     times_s = "/".join(f"{time_s:g}" for time_s in WARM_UPS_S)
     sizes = ", ".join(
         "/".join(f"{bound:.2g}" for bound in bounds) + f" mdps ({name})"
         for name, bounds in material.warm_ups_allowed_mdps.items()
     )
-    return f"{sizes} for time constants of {times_s} s, on the worst axis"
+    return (
+        f"The 95 % intervals allow an amplitude of at most {sizes} for time constants of {times_s} "
+        "s, on the worst axis."
+    )
 
 
 def allan_deviation(material: Material) -> Exhibit | None:
