@@ -264,6 +264,13 @@ def test_data_that_cannot_be_used_are_never_done_and_no_evidence(samples):
     assert not fed(np.tile([0.1, 0.2, 0.3], (100, 1)), history=past, target_dps=9e-3).state().done
 
 
+def test_a_wrong_unit_is_not_done_before_block_means_can_tell_it_from_a_motion():
+    for factor, ends in ((1.0, True), (np.radians(1), False), (np.degrees(1), False)):
+        calibrator = Calibrator(KIND, RATE, target_dps=0.05)
+        states = [calibrator.update(None, b) for b in (factor * still(10)).reshape(-1, 50, 3)]
+        assert any(state.done for state in states) == ends
+
+
 def test_a_gap_is_no_motion_and_in_a_file_it_is_as_long_as_in_a_stream(tmp_path):
     samples, time_s = still(20), np.arange(2000) / RATE
     cases = {"gap": np.where(time_s >= 10, time_s + 30, time_s), "clock": time_s % 10}

@@ -18,7 +18,15 @@ from numpy.typing import ArrayLike
 from gyro_pipeline.calibrator.device_types import DeviceType, read_type
 from gyro_pipeline.calibrator.filter import Array
 from gyro_pipeline.calibrator.history import MOVING, STILL, UNSURE, Calibration, Circumstances
-from gyro_pipeline.calibrator.reasons import UNUSABLE_CODES, Reason, reason, reasons_of, unit_reason
+from gyro_pipeline.calibrator.reasons import (
+    MIN_FREEDOM,
+    UNIT_FACTOR,
+    UNUSABLE_CODES,
+    Reason,
+    reason,
+    reasons_of,
+    unit_reason,
+)
 from gyro_pipeline.calibrator.rest import ATTITUDE, MOTION, NOISE, Alarm, Blocks
 from gyro_pipeline.calibrator.stretch import BLOCK_S, LEAST_S, Setup, Stretch
 from gyro_pipeline.conventions import MDPS, InputError
@@ -40,6 +48,7 @@ class State:
     counts: Counter[str]  # samples, gaps, jumps of the clock, samples left out
     ended: dict[str, Reason]  # why stretches ended, the last reason of each code
     constant: Mask  # whether an axis did not change in the last block, (3,)
+    scatter: Array  # N by the samples of the last block, deg/s * sqrt(s); NaN before
     dead: Mask  # whether an axis did not change for a while, (3,)
     rest: str  # STILL, MOVING or UNSURE
     time_s: float  # since the first sample
@@ -74,12 +83,21 @@ class State:
     def done(self) -> bool:
         """Whether the device is at rest, the target is reached, and the data can be used."""
         at_target = self.rest == STILL and self.reached and not self.constant.any()
-        return at_target and not self.unusable
+        return at_target and not self.unusable and self._unit_is_plausible
 
     @property
     def unusable(self) -> bool:
         """Whether the data cannot be used: a dead sensor, or a wrong unit."""
         return any(reason.code in UNUSABLE_CODES for reason in self.reasons)
+
+    @property
+    def _unit_is_plausible(self) -> bool:
+        """Whether the last samples scatter as in the right unit, until block means can tell."""
+        setup, (_, freedom) = self.stretch.setup, self.stretch.log_noise()
+        if freedom >= MIN_FREEDOM or not setup.noise_known:
+            return True
+        factor = np.median(self.scatter / (setup.noise_factor * setup.noise.white))
+        return bool(1 / UNIT_FACTOR < factor < UNIT_FACTOR)
 
     @property
     def seconds_left(self) -> Array:
@@ -121,6 +139,7 @@ class Calibrator:
         self.setup = Setup(device_type, float(rate_hz), tuple(history), now, target_dps)
         self.counts, self.ended = Counter[str](), dict[str, Reason]()
         self._constant, self._dead = np.zeros(3), np.zeros(3, bool)  # blocks without any change
+        self._scatter = np.full(3, np.nan)  # of the last block
         self._pending = np.empty((_COLUMNS, 0))  # samples of an incomplete block
         self._last_time = -1 / rate_hz
         self._end: float | None = None  # end of the last block, on the clock of the samples
@@ -220,8 +239,8 @@ class Calibrator:
         rest = self._rest(stretch, finished)
         if finished and rest == MOVING:
             stretch = Stretch.start(self.setup, self.time_s)
-        constant, counts = self._constant > 0, self.counts.copy()
-        return State(stretch, counts, self.ended, constant, self._dead, rest, self.time_s)
+        last = self._constant > 0, self._scatter
+        return State(stretch, self.counts.copy(), self.ended, *last, self._dead, rest, self.time_s)
 
     @property
     def best(self) -> Stretch:
@@ -294,6 +313,7 @@ class Calibrator:
         self._cross_gap(rows[0, 0])
         if used:
             blocks = _blocks(rows[:, :used].reshape(_COLUMNS, -1, size))
+            self._scatter = np.sqrt(blocks.variance[-1] / self.setup.rate_hz)
             self._find_dead_axes(np.ptp(rows[1:4, :used].reshape(3, -1, size), axis=2).T == 0)
             while len(blocks.mean):
                 blocks = blocks.part(self._process(blocks))

@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
 UNUSABLE_CODES = {"dead", "unit"}  # of data that cannot be used at all
 VERTICAL = 0.9  # an axis with a larger cosine of its angle to the vertical counts as vertical
-_UNIT_FACTOR = 15.0  # on the noise; a larger one means a wrong unit, not another device
+UNIT_FACTOR = 15.0  # on the noise; a larger one means a wrong unit, not another device
 _WHITE = 4.0  # the noise of samples and of block means differs by a smaller factor at rest
 _WARMING_C = 1.0  # a larger change of temperature over a log is reported
-_MIN_FREEDOM = 6  # degrees of freedom of the noise, to recognise a unit by it
+MIN_FREEDOM = 6  # degrees of freedom of the noise, to recognise a unit by it
 _UNITS = {57.3: "rad/s", 1e3: "mdps", 3600.0: "deg/h", 6.0: "rpm"}
 
 _SENTENCES = {  # by code, followed by a word where a code has several sentences
@@ -90,7 +90,7 @@ def unit_reason(factor: float, name: str, inside: float | None = None) -> Reason
     Block means that scatter may be a motion; then ``inside`` is the factor of the samples. A wrong
     unit raises both alike, and by about a known factor.
     """
-    if not 0 < factor < np.inf or 1 / _UNIT_FACTOR < factor < _UNIT_FACTOR:
+    if not 0 < factor < np.inf or 1 / UNIT_FACTOR < factor < UNIT_FACTOR:
         return None
     ratio, way, motion = max(factor, 1 / factor), "below", ""
     if factor > 1:
@@ -101,7 +101,7 @@ def unit_reason(factor: float, name: str, inside: float | None = None) -> Reason
         if not (white and known):
             return None
     words: dict[str, Any] = {"ratio": ratio, "way": way, "name": name, "motion": motion}
-    return reason("unit", factor, _UNIT_FACTOR, **words, near=near, unit=_UNITS[near])
+    return reason("unit", factor, UNIT_FACTOR, **words, near=near, unit=_UNITS[near])
 
 
 def reasons_of(state: "State") -> Iterator[Reason]:
@@ -115,7 +115,7 @@ def reasons_of(state: "State") -> Iterator[Reason]:
         elif counts[code]:
             yield reason(f"dead {code}")
     setup, (noise, freedom) = stretch.setup, stretch.log_noise()
-    if noise is not None and freedom >= _MIN_FREEDOM and setup.noise_known:
+    if noise is not None and freedom >= MIN_FREEDOM and setup.noise_known:
         factors = noise / (setup.noise_factor * setup.noise.white)  # also too little noise
         if wrong_unit := unit_reason(sorted(factors.tolist())[1], setup.device_type.type):
             yield wrong_unit
