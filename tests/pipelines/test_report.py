@@ -143,12 +143,12 @@ def test_the_warm_up_that_a_published_gain_needs_is_in_the_answer(described, rep
     given = p.published, p.ground_truth, p.studies, {name: {} for name in p.sensors}
     page = write_report("test", Only(), *given, {"sparkfun/description": lambda: own})[2]
     # by hand: 0.52 of an amplitude of 30 s moves the mean of 10 s; 88 % needs it off by 3.4 mdps
-    assert "a warm-up (SparkFun 2.8 to 9.1 thousandths of a deg/s (mdps) at power-on, for" in page
+    assert "(needed at power-on: SparkFun 2.8 to 9.1 thousandths of a deg/s, mdps, for" in page
     assert re.search(r"allow a warm-up of at most .*\d mdps .SparkFun", page)
     simulated = own.assign(simulated=True)
     page = write_report("test", Only(), *given, {"sparkfun/description": lambda: simulated})[2]
     assert "on measured data, bounds a warm-up" in page
-    assert "a warm-up (SparkFun " in report[2] and "; NG " in report[2]
+    assert "(needed at power-on: SparkFun " in report[2] and "; NG " in report[2]
 
 
 def test_the_page_needs_no_other_file_and_a_list_links_to_all_reports(tmp_path):

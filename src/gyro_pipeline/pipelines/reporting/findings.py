@@ -121,13 +121,14 @@ def _explanations(material: Material, beyond: Sequence[PublishedResult]) -> str:
         name = material.sensor_name(claim.sensor)
         needed.setdefault(name, []).extend(material.warm_up_needed_mdps(claim))
     sizes = "; ".join(f"{name} {from_to(a)}" for name, a in needed.items() if a)
-    amount = (
-        f" ({sizes} thousandths of a deg/s (mdps) at power-on, for time constants of 5 to 60 s)"
-        if sizes
-        else ""
-    )
+    amount = ""
+    if sizes:
+        amount = (
+            f" (needed at power-on: {sizes} thousandths of a deg/s, mdps, for time constants of 5 "
+            "to 60 s)"
+        )
     return (
-        f"Possible explanations are a warm-up{amount}, which a constant could also correct; "
+        f"Possible explanations are a warm-up, which a constant could also correct{amount}; "
         "another truth than the mean of the recording; coloured noise; chance; or a leak between "
         f"training and test. {_test_of_warm_up(material, list(needed))}"
     )
@@ -142,7 +143,7 @@ def _test_of_warm_up(material: Material, names: Sequence[str]) -> str:
     if material.simulated or not sizes:
         return (
             "The mean rate against time after power-on, on measured data, bounds a warm-up, and so "
-            "can exclude the first."
+            "can exclude this explanation."
         )
     return f"These recordings allow a warm-up of at most {sizes}, by their 95 % intervals."
 
