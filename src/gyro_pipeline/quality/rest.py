@@ -31,19 +31,15 @@ class RestDetector:
         false_alarm: Probability of any alarm at rest, over all time.
         least_dps: Least change of the mean that is motion; the bias may change by less.
         least_rise: Least factor of the noise that is an alarm.
-        noise_dps: (axis,), standard deviation of a sample at rest, if known.
     """
 
     lags, reference = (1, 4, 16), 40  # numbers of tested blocks, and of blocks before them
 
     def __init__(
-        self, size: int, false_alarm: float, least_dps: float, *, least_rise: float = 1.5,
-        noise_dps: ArrayLike | None = None,
-    ) -> None:  # fmt: skip
+        self, size: int, false_alarm: float, least_dps: float, *, least_rise: float = 1.5
+    ) -> None:
         self.size, self.false_alarm, self.least_dps = size, false_alarm, least_dps
         self.growth = least_rise ** (2 / 3)  # of the cube root of the variance
-        self.prior_blocks = 0.0 if noise_dps is None else 1e9  # weight of a known noise, in blocks
-        self.prior_variance = np.square(np.c_[0.0 if noise_dps is None else noise_dps])
         self.blocks, self._last, self._sums = 0, np.empty((0, 0)), np.empty((0, 0))
 
     def update(self, means: Array, variances: Array) -> tuple[Mask, Mask]:
@@ -89,16 +85,14 @@ class RestDetector:
 
     def _limits(self, sums: Array, count: NDArray[np.integer]) -> tuple[Array, Array, Array, Mask]:
         """Limits of chance for both series, noise, its weight in blocks, and sways, per block."""
-        axes, prior = len(sums) // 5, self.prior_blocks
-        worth = np.maximum(count, 1) + prior
-        variance = (sums[4 * axes :] + prior * self.prior_variance) / worth
+        axes, worth = len(sums) // 5, np.maximum(count, 1)
+        variance = sums[4 * axes :] / worth
         relative = 2 / (9 * (self.size - 1))  # relative variance, and bias, of the cube root
-        noise = sums[axes : 2 * axes] + prior * np.cbrt(self.prior_variance) * (1 - relative)
-        noise /= worth
+        noise = sums[axes : 2 * axes] / worth
         white = np.vstack([variance / self.size, noise**2 * relative])
         coloured = variance / min(self.size, 8) + self.least_dps**2
         largest = np.vstack([coloured, white[axes:] + ((self.growth - 1) * noise) ** 2])
-        observed = (sums[2 * axes : 4 * axes] + prior * white) / np.maximum(worth - 1, 1)
+        observed = sums[2 * axes : 4 * axes] / np.maximum(worth - 1, 1)
         freedom = np.maximum(worth - 1, 1e-3) * 2 / 3  # of differences between neighbours
         tests = 8 * axes * len(self.lags)  # two sides of the mean, noise, sways; two limits each
         z = alpha_spending_limits(self.false_alarm / tests)[np.frexp(np.maximum(count, 1))[1] - 1]
